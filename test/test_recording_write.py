@@ -379,7 +379,7 @@ def test_arguments_that_do_not_fit(tmp_path: Path) -> None:
             bag.write_imu('a', [1], [[1.0, 2.0]], np.zeros(9))
         with pytest.raises(ValueError, match='`linear_acceleration_covariance` must have shape'):
             bag.write_imu('a', [1], [[1.0, 2.0, 3.0]], np.zeros((1, 3)))
-        with pytest.raises(ValueError, match=r'could not broadcast .* shape \(2,\)'):
+        with pytest.raises(ValueError, match='`log_ns` must have 2 values, got 1'):
             bag.write_bool('a', [1], [True, False])
         with pytest.raises(ValueError, match='`log_ns` must have 1 values, got 2'):
             bag.write_raw('a', 'std_msgs/msg/Bool', [1, 2], [b''])

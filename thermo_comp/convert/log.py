@@ -188,11 +188,9 @@ def write_log(
     newest = np.maximum.accumulate(stamp_ns)
     _write(log, Path(output), force, newest, progress)
     steps = np.diff(newest)
-    beyond: Bools = np.zeros(log.accel.shape, dtype=np.bool_)
-    if log.clip is not None:
-        beyond = (log.accel <= log.clip[0]) | (log.accel >= log.clip[1])
+    low, high = log.clip or (-np.inf, np.inf)
+    beyond = (log.accel <= low) | (log.accel >= high)
     counts = {name: len(one.stamp_ns) for name, one in log.temperatures.items()}
-    is_repeated = np.diff(stamp_ns, prepend=stamp_ns[0] - 1) == 0
     return ConversionReport(
         log,
         str(output),
@@ -206,7 +204,7 @@ def write_log(
             'out_of_range': out_of_range,
             'clipped': _finding(np.any(beyond, axis=1), line),
             'backwards': _finding(np.diff(stamp_ns, prepend=stamp_ns[0]) < 0, line),
-            'repeated': _finding(is_repeated, line),
+            'repeated': _finding(np.diff(stamp_ns, prepend=stamp_ns[0] - 1) == 0, line),
         },
         believed=believed_unit(stillness.magnitude)[1],
         stillness=stillness,

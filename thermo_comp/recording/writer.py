@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import OutputError, RecordingError
 from ..files import CSV, PARQUET, Draft, Kind, bag_kind, drafted
-from ..typing import Bytes, Ints
+from ..typing import Ints
 from .columns import ImuColumns, Messages
 from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
@@ -122,10 +122,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
     def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
         """Write std_msgs/Bool."""
-        times = _as_times('log_ns', log_ns)
-        rows = np.zeros((len(times), 5), np.uint8)
-        rows[:, 1], rows[:, 4] = 1, np.asarray(values, np.bool_)
-        self._add(topic, BOOL, _of_rows(rows, times))
+        rows = [b'\0\1\0\0' + bytes([one]) for one in np.asarray(values, np.bool_).tolist()]
+        self.write_raw(topic, BOOL, log_ns, rows)
 
     def write_raw(
         self,
@@ -143,10 +141,10 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
     def flush(self) -> None:
         """Merge what is buffered in log-time order and hand it to the file."""
-        if self._batches:
+        if self._batches and self._file is not None:
             batches, self._batches = self._batches, []
             with self._translated():
-                self._open_file().append(batches)
+                self._file.append(batches)
 
     def close(self) -> None:
         """Finish the bag and give it its name; where that fails nothing is left: OutputError."""
@@ -206,16 +204,21 @@ class BagWriter(AbstractContextManager['BagWriter']):
                 )
             pieces.append((at, numbers))
         rows = encode_stamped(stamps, frame_id, N_NUMBERS[kind], pieces)
-        self._add(topic, kind, _of_rows(rows, times))
+        size = np.full(len(rows), rows.shape[1])
+        channel = np.zeros(len(rows), np.uint16)
+        messages = Messages(rows.ravel(), np.cumsum(size) - size, size, channel, times)
+        self._add(topic, kind, messages)
 
     def _add(
         self, topic: str, kind: str, messages: Messages, definition: tuple[str, str] | None = None
     ) -> None:
         name = '/' + topic.strip('/')
+        if self._file is None:
+            raise RecordingError('the bag is closed', self._path)
         try:
             known = (*definition, '') if definition else known_definition(kind)
             with self._translated():
-                number = self._open_file().channel(name, kind, known)
+                number = self._file.channel(name, kind, known)
         except RecordingError as error:
             raise RecordingError(error.message, self._path, name) from error
         if len(messages):
@@ -223,11 +226,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
             self._batches.append(replace(messages, channel=channel))
             if sum(len(one.data) for one in self._batches) > _AUTO_FLUSH_BYTES:
                 self.flush()
-
-    def _open_file(self) -> McapOutput:
-        if self._file is None:
-            raise RecordingError('the bag is closed', self._path)
-        return self._file
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
@@ -239,12 +237,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise OutputError(
                 f'cannot be written: {error.strerror or error}{kept}', self._path
             ) from error
-
-
-def _of_rows(rows: Bytes, log_ns: Ints) -> Messages:
-    size = np.full(len(rows), rows.shape[1])
-    channel = np.zeros(len(rows), np.uint16)
-    return Messages(rows.ravel(), np.cumsum(size) - size, size, channel, log_ns)
 
 
 def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
