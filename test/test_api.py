@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -234,6 +235,13 @@ def test_a_further_thermometer_goes_in_by_its_name(arrays: dict[str, np.ndarray]
     out = unit.correct(**arrays, lid=arrays['case'] + 1.0)
     assert np.isfinite(out.specific_force).all()
     assert np.linalg.norm(out.specific_force.mean(axis=0)) == pytest.approx(GRAVITY, rel=1e-3)
+
+
+def test_a_bag_that_is_given_twice_is_refused(root: Path, tmp_path: Path) -> None:
+    bag = root / 'bags' / 'fit' / '01.mcap'
+    copy = shutil.copy(bag, tmp_path / 'copy.mcap')
+    with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: is .*01\.mcap once more'):
+        tc.fit([bag, copy], gravity=9.80665)
 
 
 def test_arrays_that_cannot_be_fitted_are_refused() -> None:

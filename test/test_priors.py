@@ -152,6 +152,12 @@ def test_prior_without_claim_is_refused():
         fit(few, replace(OPTIONS, serial='unit-9', prior=prior))
 
 
+def test_prior_of_the_other_input_is_refused():
+    # WHY: its scale factors of counts were once taken for those of m/s^2.
+    with pytest.raises(ValueError, match=r'`prior` is in counts, the samples are in m/s\^2'):
+        replace(OPTIONS, prior=fitted(1).calibration, input='m/s^2')
+
+
 def test_commands_make_a_prior_and_name_what_is_missing(tmp_path, capsys):
     files = []
     for one in siblings():

@@ -121,6 +121,9 @@ class FitOptions:
                 raise ValueError(f'`{name}` must be 0 or positive, got {getattr(self, name)}')
         if self.offset is not None and not math.isfinite(self.offset):
             raise ValueError(f'`offset` must be finite, got {self.offset}')
+        known = self.prior and self.prior.unit.input
+        if known and known != self.input:
+            raise ValueError(f'`prior` is in {known}, the samples are in {self.input}')
         for name, words in _WORDS.items():
             given = getattr(self, name)
             for word in given if isinstance(given, tuple) else (given,):

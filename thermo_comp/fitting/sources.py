@@ -55,15 +55,19 @@ def fit_sources(
     """
     Prepare recordings for a fit; each is opened once now, and streamed when the fit asks.
 
-    Raises RecordingError if one cannot be read or lacks a topic; FitError if some hold counts and
-    some Imu messages.
+    Raises RecordingError if one cannot be read or lacks a topic; FitError if one is given
+    twice, or some hold counts and some Imu messages.
     """
     sources: list[FitSource] = []
     kinds: dict[str, str] = {}
+    names: dict[str, str] = {}
     for path in map(Path, paths):
         source, info = recording_source(path, topics, input)
         kinds[info.input or 'counts'] = str(path)
         sources.append(replace(source, sha256=digest(path)))
+        twin = names.setdefault(str(sources[-1].sha256), str(path))
+        if len(names) < len(sources):
+            raise FitError(f'{path}: is {twin} once more, and nothing may count twice')
     if len(kinds) > 1:
         raise FitError(
             f'{kinds["counts"]} holds counts, {kinds["imu"]} Imu messages: leave one kind out, or '
