@@ -33,8 +33,7 @@ Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
 
 #: `Columns.start_ns` is a multiple of this, so that times count from a whole minute.
 _MINUTE_NS = 60_000_000_000
-#: Farther from their origin than this times are not in seconds [s].
-_LONGEST_S = 4e9
+_LONGEST_S = 4e9  # farther from their origin than this times are not in seconds [s]
 #: A thermometer that stands still is heard again after this, so that nobody takes it for lost.
 _REPEAT_NS = 10_000_000_000
 

@@ -24,10 +24,8 @@ from .files import read_bounded
 DEPTH_LIMIT = 12
 #: Keys, values, lists and mappings: some ten times those of the largest calibration.
 NODE_LIMIT = 20_000
-#: What a user writes by hand takes some kB.
-_FILE_LIMIT = 1 << 16
-#: Digits of the longest integer accepted; a float64 needs no more.
-_INTEGER_DIGITS = 20
+_FILE_LIMIT = 1 << 16  # what a user writes by hand takes some kB
+_INTEGER_DIGITS = 20  # digits of the longest integer accepted; a float64 needs no more
 _INTEGER = re.compile(r'[-+]?[0-9]+')
 _FLOAT = re.compile(r'[-+]?(?:(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf)|\.nan')
 _WORDS = {'': None, '~': None, 'null': None, 'true': True, 'false': False}
@@ -39,8 +37,7 @@ class PlainYamlError(ValueError):
 
     def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
         where = '' if line is None else f' (line {line})'
-        #: The same without the detail.
-        self.rule = f'{problem}{where}'
+        self.rule = f'{problem}{where}'  # the same without the detail
         super().__init__(f'{problem}: {detail}{where}' if detail else self.rule)
 
 

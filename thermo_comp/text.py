@@ -7,8 +7,7 @@ from __future__ import annotations
 import os
 import sys
 
-#: A serial stands in file names, parameter files and tables.
-LONGEST_SERIAL = 64
+LONGEST_SERIAL = 64  # a serial stands in file names, parameter files and tables
 
 
 def counted(n: int, noun: str, ending: str = 's') -> str:

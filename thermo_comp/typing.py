@@ -13,5 +13,4 @@ Floats: TypeAlias = npt.NDArray[np.float64]
 Ints: TypeAlias = npt.NDArray[np.int64]
 Bools: TypeAlias = npt.NDArray[np.bool_]
 Bytes: TypeAlias = npt.NDArray[np.uint8]
-#: Stamps [ns].
-Stamps: TypeAlias = npt.NDArray[np.int64]
+Stamps: TypeAlias = npt.NDArray[np.int64]  # stamps [ns]

@@ -23,8 +23,7 @@ from ..text import valid_serial
 from ..unit.gravity import parse_acceleration
 from .output import Output
 
-#: A mistake in the command line, to be raised: exit code 2.
-usage = typer.BadParameter
+usage = typer.BadParameter  # a mistake in the command line, to be raised: exit code 2
 
 
 def option(text: str, default: Any = None, *flags: str, **rules: Any) -> Any:

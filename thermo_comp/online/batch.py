@@ -26,8 +26,7 @@ _Arrivals: TypeAlias = list[tuple[int, str, int, float]]
 #: Why a sample does not go out, 0 where it does.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
 _TOO_FAST, _REFUTED = _REASONS['n_too_fast'], _REASONS['n_refuted']
-#: Samples corrected at a time: their columns stay in the cache.
-PIECE: Final = 4096
+PIECE: Final = 4096  # samples corrected at a time: their columns stay in the cache
 #: Values of `corrected` in the order of a block's columns: the covariance as a whole matrix.
 _COLUMNS: Final = (0, 1, 2, 3, 4, 5, 4, 6, 7, 5, 7, 8)
 #: Rows of these that are specific force x, y, z and covariance xx, xy, xz, yy, yz, zz.
@@ -38,13 +37,10 @@ _SAMPLE = [0, 1, 2, 3, 4, 5, 7, 8, 11]
 class CompensatedBlock:
     """The published samples of a block."""
 
-    #: Which samples of the block these are, shape (n,).
-    index: Ints
+    index: Ints  # which samples of the block these are, shape (n,)
     stamp_ns: Stamps
-    #: [m/s^2], shape (n, 3).
-    specific_force: Floats
-    #: Row-major 3x3 [m^2/s^4], shape (n, 9).
-    covariance: Floats
+    specific_force: Floats  # [m/s^2], shape (n, 3)
+    covariance: Floats  # row-major 3x3 [m^2/s^4], shape (n, 9)
     #: [rad/s], and variances [rad^2/s^2], shape (n, 3), where a rate is given and corrected.
     angular_rate: Floats | None = None
     angular_rate_variance: Floats | None = None

@@ -30,8 +30,7 @@ TIME_JUMP_NS: Final = 1_000_000_000
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]
-#: One sample's, or those of many.
-Number = TypeVar('Number', float, Floats)
+Number = TypeVar('Number', float, Floats)  # one sample's, or those of many
 
 
 class Compensator:

@@ -20,10 +20,8 @@ from .status import GravityResidual
 #: Shortest window; it is longer where samples are few, up to the second figure.
 WINDOW_NS: Final = 1_000_000_000
 LONGEST_WINDOW_NS: Final = 30_000_000_000
-#: Samples closer than this to the last one need not be added.
-PROBE_NS: Final = 90_000_000
-#: Fewer samples than this make no window.
-SMALLEST_WINDOW: Final = 5
+PROBE_NS: Final = 90_000_000  # samples closer than this to the last one need not be added
+SMALLEST_WINDOW: Final = 5  # fewer samples than this make no window
 #: A still window scatters by at most this many times the noise of its samples...
 SCATTER_FACTOR: Final = 3.0
 #: ... and its mean differs from the last one's by noise and this [m/s^2]: half a milli-g.

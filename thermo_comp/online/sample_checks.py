@@ -28,21 +28,17 @@ BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
 #: Samples this much faster than calibrated, relative, still have the calibrated noise.
 RATE_TOLERANCE: Final = 0.1
-#: A rate is measured over so many seconds.
-_WINDOW_S: Final = 1.0
+_WINDOW_S: Final = 1.0  # a rate is measured over so many seconds
 
 
 class StuckCheck:
     """Counts equal samples in a row; beyond the time-out [s], if any, they are not believed."""
 
     def __init__(self, timeout_s: float) -> None:
-        #: Whether anything is watched.
-        self.is_on = timeout_s > 0.0
+        self.is_on = timeout_s > 0.0  # whether anything is watched
         self.limit_ns = round(timeout_s * 1e9) if self.is_on else NEVER_NS
-        #: The sample that the run began with and its stamp.
-        self.run = (nan, nan, nan, 0)
-        #: How often it has come again.
-        self.n_same = 0
+        self.run = (nan, nan, nan, 0)  # the sample that the run began with and its stamp
+        self.n_same = 0  # how often it has come again
 
     def again(self, stamp_ns: int) -> bool:
         """Count one more equal sample; say whether it is too many."""
@@ -84,8 +80,7 @@ class RateCheck:
         self._allowance = max(BURST_SAMPLES, BURST_S / cycle_s)
         #: Whether more samples have come than conversions can make.
         self.is_too_fast = False
-        #: Samples per calibrated cycle over the last second or so.
-        self.ratio = 1.0
+        self.ratio = 1.0  # samples per calibrated cycle over the last second or so
         self._level = 0.0
         self._last: tuple[int, int] | None = None
         self._window = (0, 0)

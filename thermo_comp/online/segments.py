@@ -34,10 +34,8 @@ from .status import CompensatorConfig, Counters
 
 #: Longest time over which bias and scale are taken as linear in time.
 SEGMENT_NS: Final = 1_000_000_000
-#: How long what changes slowly is held.
-SLOW_NS: Final = 10_000_000_000
-#: Earlier than any stamp.
-EVER_NS: Final = -NEVER_NS
+SLOW_NS: Final = 10_000_000_000  # how long what changes slowly is held
+EVER_NS: Final = -NEVER_NS  # earlier than any stamp
 #: A unit that no thermometer watches is taken to be at the reference, within this sd [K].
 UNMEASURED_SD_K: Final = 10.0
 

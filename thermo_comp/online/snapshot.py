@@ -17,8 +17,7 @@ from .status import GravityResidual
 
 #: The board temperature is called stale beyond this many of its usual intervals.
 STALE_INTERVALS = 5.0
-#: ... but never sooner than this [s].
-SHORTEST_STALE_S = 0.5
+SHORTEST_STALE_S = 0.5  # ... but never sooner than this [s]
 
 _INSIDE = Excess(0.0, 0.0, 0.0, 0.0)
 
@@ -32,8 +31,7 @@ class CompensatorStatus:
     faults: Mapping[str, tuple[Fault, float]]
     #: How far the stamps of the readings that wait are ahead of the samples' [s].
     pending_ahead_s: float
-    #: None until there is a board temperature.
-    state: ThermalState | None = None
+    state: ThermalState | None = None  # None until there is a board temperature
     #: Ages of the last used readings at the last sample [s]; infinite when there was none.
     board_age_s: float = inf
     case_age_s: float = inf

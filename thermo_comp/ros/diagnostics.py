@@ -29,8 +29,7 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop, type_name
 
-#: After so long without samples [s] readings take effect without them.
-IDLE_S = 5.0
+IDLE_S = 5.0  # after so long without samples [s] readings take effect without them
 #: Readings stamped this much ahead of the samples wait too long to be of one clock with them [s].
 AHEAD_S = 5.0
 #: Samples that are late by so many cycles, and by so long [s], do not come any more.
@@ -62,8 +61,7 @@ _FAULTS = {
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
 }
 
-#: Level and text.
-Finding = tuple[int, str]
+Finding = tuple[int, str]  # level and text
 
 
 class Reporter:

@@ -39,8 +39,7 @@ from .waitloop import RawSubscription, WaitLoop, own_node, type_name
 OUTPUTS = {'imu/data_raw': Imu, 'regime/dynamic': Bool, STAMPED_TOPIC: DiagnosticArray}
 #: Time between two looks at what is published, and between two blocks [s].
 LOOK_S, BLOCK_S = 0.5, 1.0
-#: Time between two looks at what is waited for [s].
-WAIT_S = 0.02
+WAIT_S = 0.02  # time between two looks at what is waited for [s]
 
 _ALL = HistoryPolicy.KEEP_ALL
 _RELIABLE = QoSProfile(history=_ALL, reliability=ReliabilityPolicy.RELIABLE)
@@ -165,8 +164,7 @@ class LiveTopics(_Listener):
         super().__init__('thermo_comp_record', ros_args)
         self._topics, self._input = topics, input
         self._feeds: dict[Role, Topic] = {}
-        #: Why nothing comes, one sentence each.
-        self.problems: tuple[str, ...] = ()
+        self.problems: tuple[str, ...] = ()  # why nothing comes, one sentence each
 
     def _open(self) -> None:
         self._look()

@@ -34,10 +34,8 @@ from .waitloop import WaitLoop, overrides
 
 #: More requests than this that wait, or parameters in one of them, are refused.
 WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
-#: The longest name of a frame that may be set, in bytes.
-LONGEST_FRAME = 255
-#: Of a reason, which may repeat what came in.
-_LONGEST_REASON = 1000
+LONGEST_FRAME = 255  # the longest name of a frame that may be set, in bytes
+_LONGEST_REASON = 1000  # of a reason, which may repeat what came in
 
 _DEFAULTS = CompensatorConfig()
 

@@ -43,16 +43,13 @@ NODE_NAME = 'thermo_comp_player'
 
 #: Messages of a topic under way at most; so many are kept to be sent again.
 WINDOW: dict[Role, int] = defaultdict(lambda: 50, accel=200)
-#: Wall time between two messages on `/clock` [s].
-CLOCK_PERIOD = 0.01
-#: Time between two looks for subscribers [s].
-LOOK = 0.02
+CLOCK_PERIOD = 0.01  # wall time between two messages on `/clock` [s]
+LOOK = 0.02  # time between two looks for subscribers [s]
 #: Time between two looks at what is acknowledged; that takes Fast DDS some 5 ms [s].
 ACKNOWLEDGEMENT_NAP = 0.0005
 #: Time the subscribers are given to find the player too where nobody tells when they have [s].
 SETTLING = 0.3
-#: How long a subscriber may leave a window unacknowledged [s].
-PATIENCE = 30.0
+PATIENCE = 30.0  # how long a subscriber may leave a window unacknowledged [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +57,7 @@ class PlayReport:
     """What a player did; topics by their full names."""
 
     n_messages: dict[str, int]
-    #: Wall time from the first message to the last acknowledgement [s].
-    duration_s: float
+    duration_s: float  # wall time from the first message to the last acknowledgement [s]
     #: Topics to which nobody listened, and those with a best-effort subscriber, which can lose.
     unheard: list[str]
     lossy: list[str]

@@ -24,8 +24,7 @@ from ..files import read_bounded
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
 
-#: Added to the niceness of the process: the samples go first.
-NICENESS = 5
+NICENESS = 5  # added to the niceness of the process: the samples go first
 
 
 @dataclass(frozen=True, slots=True)

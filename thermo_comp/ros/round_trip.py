@@ -34,10 +34,8 @@ from .player import PlayReport, opened_player
 #: How long node and recorder may take to find each other, or to take what comes last: a message
 #: that Fast DDS has to repeat is 3 s late, on a busy machine several times [s].
 PATIENCE_S = 30.0
-#: How long the node may take to answer [s]; then it is asked again.
-ANSWER_S = 1.0
-#: How long the node may take to end [s].
-STOPPING_S = 10.0
+ANSWER_S = 1.0  # how long the node may take to answer [s]; then it is asked again
+STOPPING_S = 10.0  # how long the node may take to end [s]
 #: Samples that the node may be behind the player; its middleware holds 5000.
 IN_FLIGHT = 2000
 

@@ -107,8 +107,7 @@ class WaitLoop:
         #: What takes the requests of services in place of callbacks that have to answer at once.
         self.handlers: dict[Service, Serve] = {}
         self._soon: deque[Callable[[], None]] = deque()
-        #: Callbacks that ended in an exception.
-        self.n_failures = 0
+        self.n_failures = 0  # callbacks that ended in an exception
         self._logged_ns = -_LOG_PERIOD_NS
         self._is_stopping, self._is_stale = False, True
         self._period_ns = self._call_ns = _NEVER_NS
