@@ -331,6 +331,16 @@ class TestColumnMap:
                 None,
                 'a gyro travels in an Imu message',
             ),
+            (
+                {'accel': {'columns': ['x', 'x', 'z'], 'unit': 'g', 'output': 'imu'}},
+                None,
+                "column 'x' is given twice",
+            ),
+            (
+                {'board': {'column': 'b'}, 'case': {'column': 'b'}},
+                None,
+                "column 'b' is given twice",
+            ),
             ({'serial': ''}, 'serial', 'at least 1 character'),
         ],
     )
@@ -469,7 +479,7 @@ def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> 
     def written(stamps: list[int]) -> Path:
         path = tmp_path / f'log.{suffix}'
         if suffix == 'csv':
-            path.write_text('\n'.join(['t,x', *(f'{stamp},5.66' for stamp in stamps)]))
+            path.write_text('\n'.join(['t,x,y,z', *(f'{at},5.66,5.66,5.66' for at in stamps)]))
             return path
         pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
         import pyarrow as pa
@@ -477,7 +487,7 @@ def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> 
 
         kind = pa.int64() if min(stamps) < 0 else pa.uint64()
         stored = [min(stamp, 2**62) if min(stamps) < 0 else stamp for stamp in stamps]
-        columns = {'t': pa.array(stored, kind), 'x': [5.66] * len(stamps)}
+        columns = {'t': pa.array(stored, kind), **dict.fromkeys('xyz', [5.66] * len(stamps))}
         pq.write_table(pa.table(columns), path)
         return path
 
@@ -485,7 +495,7 @@ def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> 
         ColumnMap,
         {
             'stamp': {'column': 't', 'unit': unit},
-            'accel': {'columns': ['x', 'x', 'x'], 'unit': 'm/s^2', 'output': 'imu'},
+            'accel': {'columns': ['x', 'y', 'z'], 'unit': 'm/s^2', 'output': 'imu'},
         },
     )
     for stamps in (rows, good + bad[1:]):

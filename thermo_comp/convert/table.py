@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -188,6 +189,10 @@ def _collect(
     places = {name: _place(path, name, headings, width) for name in wanted}
     at = None if stamp.column is None else _place(path, stamp.column, headings, width)
     needed = 1 + max([*places.values(), -1 if at is None else at])
+    for name, place in places.items():
+        if re.fullmatch(r'\s*[+-]?[0-9]+,[0-9]+\s*', first[1][place]):
+            why = f'column {name!r} has decimal commas, as in {first[1][place]}: give it points'
+            raise RecordingError(why, path=path)
 
     line, stamps, n_short = array('q'), array('q'), 0
     values = {name: array('d') for name in places}
