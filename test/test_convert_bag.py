@@ -123,20 +123,19 @@ def present(imu, temperature=(), pressure=()):
 )  # fmt: skip
 def test_neighbours_tell_the_thermometers(temperature, pressure, board, case):
     imu = '/robot/imu/data' if temperature and temperature[0].startswith('/robot') else '/imu/data'
-    found = find_topics(Path('bag'), present([imu], temperature, pressure), None, None, None)
+    found = find_topics(present([imu], temperature, pressure), None, None, None)
     assert found == {'imu': imu, 'board': board, 'case': case}
 
 
 def test_what_neighbours_cannot_tell_is_asked():
-    path = Path('bag')
     with pytest.raises(RecordingError, match=r'several topics may be the Imu.*--topic imu='):
-        find_topics(path, present(['/a/data', '/b/data']), None, None, None)
+        find_topics(present(['/a/data', '/b/data']), None, None, None)
     with pytest.raises(RecordingError, match=r'several topics may be the board.*--topic board='):
-        find_topics(path, present(['/imu/data'], ['/imu/t1', '/imu/t2']), None, None, None)
+        find_topics(present(['/imu/data'], ['/imu/t1', '/imu/t2']), None, None, None)
     with pytest.raises(RecordingError, match='no Imu messages'):
-        find_topics(path, present([], ['/t']), None, None, None)
+        find_topics(present([], ['/t']), None, None, None)
     both = present(['/imu/data'], ['/imu/t1', '/imu/t2'])
-    chosen = find_topics(path, both, None, '/imu/t2', None)
+    chosen = find_topics(both, None, '/imu/t2', None)
     assert chosen['board'] == '/imu/t2'
     assert chosen['case'] == '/imu/t1'
 

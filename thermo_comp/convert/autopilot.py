@@ -56,16 +56,12 @@ _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 
 
 def read_autopilot(
-    path: str | Path,
-    imu: int | None = None,
-    baro: int | None = None,
-    allow_compensated: bool = False,
+    path: Path, imu: int | None = None, baro: int | None = None, allow_compensated: bool = False
 ) -> ForeignLog:
     """
     Read one IMU and one barometer of a PX4 (``.ulg``) or ArduPilot log, those of the lowest
     instance by default; ArduPilot's are counted from 0: the old type ``IMU2`` is 1.
     """
-    path = Path(path)
     read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
     imus, baros, compensated = read(path)
     why = compensated.get(min(imus, default=0) if imu is None else imu)
@@ -104,9 +100,6 @@ def _ulog(path: Path) -> _Held:
         for number, columns in by_topic[topic].items()
     }
     metadata = {}
-    if log.dropouts:
-        lost_ms = sum(int(dropout.duration) for dropout in log.dropouts)
-        metadata['px4_dropouts'] = f'{len(log.dropouts)}, {lost_ms} ms in all'
     if log.file_corruption:
         metadata['px4_corruption'] = 'parts of the file could not be read'
     accels, gyros, hint = by_topic['sensor_accel'], by_topic['sensor_gyro'], ''
@@ -114,7 +107,6 @@ def _ulog(path: Path) -> _Held:
     if not accels:
         both = {number: _combined(one) for number, one in by_topic['sensor_combined'].items()}
         accels, gyros = ({number: one[part] for number, one in both.items()} for part in (0, 1))
-        metadata['px4_topic'] = 'sensor_combined'
         hint = f'sensor_accel is missing, sensor_combined is after CAL_ACC*; {_PROFILE}'
         if log.initial_parameters.get('TC_A_ENABLE') == 1:
             said = (

@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from ..errors import RecordingError
+from ..recording.chunks import translated
 from ..recording.reader import inspect_recording, read_recording
 from ..recording.topics import IMU, TEMPERATURE, Present, Topics, said_choice
 from .log import ForeignLog, Readings
@@ -26,15 +27,16 @@ Unit = Literal['m/s^2', 'g', 'mg']
 
 
 def bag_log(
-    path: str | Path,
+    path: Path,
     imu: str | None = None,
     board: str | None = None,
     case: str | None = None,
     unit: Unit = 'm/s^2',
 ) -> ForeignLog:
     """Read a bag, with the topics that are None found; `unit` is what the driver publishes."""
-    path = Path(path)
-    found = find_topics(path, inspect_recording(path).topics, imu, board, case)
+    present = inspect_recording(path).topics
+    with translated(path):
+        found = find_topics(present, imu, board, case)
     chosen = []
     for (role, name), given in zip(found.items(), (imu, board, case), strict=True):
         among = 'only' if role == 'imu' else 'nearest'
@@ -66,12 +68,12 @@ def bag_log(
 
 
 def find_topics(
-    path: Path, present: Present, imu: str | None, board: str | None, case: str | None
+    present: Present, imu: str | None, board: str | None, case: str | None
 ) -> dict[str, str | None]:
     """Tell ``imu``, ``board`` and ``case`` apart, None for a thermometer that is not there."""
-    imu = imu or _most(path, _of_type(present, IMU), 'Imu')
+    imu = imu or _most(_of_type(present, IMU), 'Imu')
     if imu is None:
-        raise RecordingError('the bag holds no Imu messages', path=path)
+        raise RecordingError('the bag holds no Imu messages')
 
     def free() -> list[str]:
         return [name for name in _of_type(present, TEMPERATURE) if name not in (board, case)]
@@ -79,11 +81,11 @@ def find_topics(
     if case is None:
         baros = _of_type(present, _PRESSURE)
         nearer = [name for name in free() if _shared(name, baros) > _shared(name, [imu])]
-        case = _most(path, nearer, 'case')
+        case = _most(nearer, 'case')
     if board is None:
         beside = max((_shared(name, [imu]) for name in free()), default=0)
-        board = _most(path, [one for one in free() if _shared(one, [imu]) == beside], 'board')
-    case = case or _most(path, free(), 'case')
+        board = _most([one for one in free() if _shared(one, [imu]) == beside], 'board')
+    case = case or _most(free(), 'case')
     return {'imu': imu, 'board': board, 'case': case}
 
 
@@ -97,11 +99,10 @@ def _shared(name: str, others: list[str]) -> int:
     return max((len(own & one) for one in theirs), default=0)
 
 
-def _most(path: Path, names: list[str], what: str) -> str | None:
+def _most(names: list[str], what: str) -> str | None:
     if len(names) > 1:
         raise RecordingError(
             f'several topics may be the {what}: {", ".join(names)}; choose one with '
-            f'--topic {what.lower()}=TOPIC',
-            path=path,
+            f'--topic {what.lower()}=TOPIC'
         )
     return names[0] if names else None

@@ -124,7 +124,7 @@ class ColumnMap:
             raise ValueError('a gyro travels in an Imu message: accel output must be imu')
 
 
-def load_column_map(path: str | Path) -> ColumnMap:
+def load_column_map(path: Path) -> ColumnMap:
     """Read a column map; RecordingError, with the key, if it is none."""
     data = read_plain_yaml(path)
     try:
@@ -135,9 +135,8 @@ def load_column_map(path: str | Path) -> ColumnMap:
         raise RecordingError(failure.message, path, failure.key or None) from failure
 
 
-def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
+def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
     """Read all rows of a table as its column map says, with the temperatures thinned."""
-    path = Path(path)
     accel, gyro = columns.accel, columns.gyro
     thermometers = {'board': columns.board, 'case': columns.case}
     thermometers |= {one.name: one for one in columns.further}
@@ -174,9 +173,8 @@ def table_log(path: str | Path, columns: ColumnMap) -> ForeignLog:
     )
 
 
-def guess_columns(path: str | Path, rate_hz: float | None = None) -> ColumnMap:
+def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     """Tell the columns of a table without headings; `rate_hz` is for one without times."""
-    path = Path(path)
     table = read_text(path, None, Stamp(rate_hz=1.0))
     width = len(table.values)
     if table.has_headings or width not in (3, 4, 6, 7):
