@@ -61,8 +61,6 @@ _ENGINES: Mapping[str, Callable[[], Any]] = {
     'bz2': bz2.BZ2Decompressor,
 }
 
-#: Reads so many bytes at a place of the file, fewer only where it ends.
-ReadAt = Callable[[int, int], bytes]
 #: Is given opcode and content of every record that is no message.
 OnRecord = Callable[[int, bytes], None]
 
@@ -120,7 +118,7 @@ def parse_chunk_head(head: bytes, position: int) -> tuple[Span, str, int, int]:
     return span, name.decode('utf-8', 'replace'), data_at, checksum
 
 
-def load(read_at: ReadAt, span: Span, on_record: OnRecord) -> Messages:
+def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) -> Messages:
     """Read a stretch of the file and find its messages, in the order of their places."""
     n_bytes = span.length + span.index_length
     try:

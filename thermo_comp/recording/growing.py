@@ -10,7 +10,6 @@ a little late, so the newest messages are held back.
 
 from __future__ import annotations
 
-import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -28,7 +27,6 @@ from .writer import BagWriter
 _USUAL = Topics()
 # Little is lost with a process that is killed: half a minute at 100 Hz.
 _CHUNK_BYTES = 1 << 17
-_NAME = re.compile(r'(\d+)\.mcap')
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: A look may take this part of the time.
@@ -86,8 +84,8 @@ def _size(path: Path) -> int:
 
 def numbered_bags(folder: Path) -> list[Path]:
     """List the bags that a folder has, in the order of their numbers."""
-    found = [one for one in folder.glob('*.mcap') if _NAME.fullmatch(one.name)]
-    return sorted(found, key=lambda one: int(one.stem))
+    found = {int(one.stem): one for one in folder.glob('*.mcap') if one.stem.isdecimal()}
+    return [found[number] for number in sorted(found)]
 
 
 class PositionBags:
