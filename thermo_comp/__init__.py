@@ -84,7 +84,6 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name."""
     if name not in __all__:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     module, _, own = _HOMES.get(name, 'arrays').partition(':')

@@ -104,19 +104,13 @@ class Output:
         if self.quiet or not sys.stderr.isatty():
             yield lambda _done: None
             return
-        from rich import progress
         from rich.console import Console
+        from rich.markup import escape
+        from rich.progress import Progress, TimeElapsedColumn
 
-        with progress.Progress(
-            progress.TextColumn('{task.description}', markup=False),
-            progress.BarColumn(),
-            progress.TaskProgressColumn(show_speed=True),
-            progress.TimeElapsedColumn(),
-            progress.TimeRemainingColumn(),
-            console=Console(stderr=True),
-            transient=True,
-        ) as bar:
-            task = bar.add_task(_shown(what, sys.stderr), total=total)
+        columns = (*Progress.get_default_columns(), TimeElapsedColumn())
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task(escape(_shown(what, sys.stderr)), total=total)
             yield lambda done: bar.update(task, completed=done)
 
 
@@ -126,7 +120,6 @@ def error(message: str) -> None:
 
 
 def _print(text: str, stream: TextIO) -> None:
-    """Print one line."""
     print(_shown(text, stream), file=stream)
 
 

@@ -100,7 +100,6 @@ def _runs(last_ns: int, stamps: Stamps) -> list[Ints]:
 
 
 def _push(compensator: Compensator, arrivals: _Arrivals, place: int) -> None:
-    """Queue the readings that come before a sample."""
     while arrivals and arrivals[-1][0] <= place:
         compensator.thermal.push(*arrivals.pop()[1:])
 

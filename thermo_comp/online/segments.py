@@ -135,7 +135,6 @@ class ThermalSide:
             self._count_rejected(name, self.queue.push(name, stamp_ns, celsius))
 
     def _apply(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """Let a reading take effect now."""
         self._n_applied += 1
         tracker = self.tracker
         if not tracker.read(name, stamp_ns, celsius):

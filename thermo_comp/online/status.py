@@ -31,7 +31,6 @@ class CompensatorConfig(ThermalConfig):
     gravity_tolerance_m_s2: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing."""
         super().__post_init__()
         refuse_outside(
             self,

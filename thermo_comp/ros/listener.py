@@ -58,7 +58,6 @@ class _Listener:
         self._came: list[tuple[str, list[bytes], list[int]]] = []
 
     def __enter__(self) -> Any:
-        """Open the subscriptions and start the thread."""
         with ExitStack() as stack:
             self._node = stack.enter_context(own_node(self._name, self._ros_args))
             self._loop = WaitLoop(self._node)

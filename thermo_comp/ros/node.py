@@ -67,7 +67,6 @@ class CompensationNode:
         self._say_calibration()
 
     def _build(self) -> None:
-        """Make all that runs on the ROS node."""
         self._log, self._config = self.node.get_logger(), parameters.declare(self.node)
         config = self._config
         self._loaded = read(config.calibration_file, config.calibration_directory)

@@ -236,7 +236,6 @@ class ParameterRequests:
         self._beside.shutdown(cancel_futures=True)
 
     def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
-        """Let a request wait for its turn."""
         is_each, n, reason = kind is srv.SetParameters, len(request.parameters), ''
         groups = [[one] for one in request.parameters] if is_each else [request.parameters]
         results: list[SetParametersResult] = []

@@ -42,7 +42,6 @@ class SignalWatch:
         self._thread = threading.Thread(target=self._watch, name='signals', daemon=True)
 
     def __enter__(self) -> SignalWatch:
-        """Take the signals over."""
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._writer, False)
         # The interpreter has written the signal's number already.

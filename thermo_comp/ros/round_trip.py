@@ -49,7 +49,6 @@ class NodeProcess:
         self._ros_args = ros_args
 
     def __enter__(self) -> NodeProcess:
-        """Start the process."""
         self._log = tempfile.TemporaryFile()
         command = [sys.executable, '-m', 'thermo_comp.ros.node', '--ros-args', *self._ros_args]
         # The very package that runs here, wherever it lies.
