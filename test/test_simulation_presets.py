@@ -88,12 +88,11 @@ class _Campaign:
     """Minute means of runs in several positions, with the known forces."""
 
     def __init__(self, unit: UnitModel, program: Cyclogram, seed: int, ups: Floats) -> None:
-        self.unit, truth = unit, None
+        self.unit = unit
         self.columns: list[dict[str, Floats]] = []
         counts, force = [], []
         for k, up in enumerate(ups):
-            run = simulate(unit, program, up, rate_hz=RATE_HZ, seed=100 * seed + k, like=truth)
-            truth = run.truth
+            run = simulate(unit, program, up, rate_hz=RATE_HZ, seed=100 * seed + k)
             n = len(run.counts) // int(RATE_HZ * MINUTE)
             counts.append(_means(run.counts, int(RATE_HZ * MINUTE), n))
             force.append(np.tile(run.truth.specific_force, (n, 1)))

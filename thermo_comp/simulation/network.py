@@ -57,9 +57,9 @@ class Thermostat:
 class ThermalNetwork:
     """Parts with heat capacities [J/K], the paths between them, and the power [W] they spend."""
 
-    capacity: Mapping[str, float]
+    capacity: Mapping[str, float] = field(hash=False)
     links: tuple[Link, ...]
-    power: Mapping[str, float] = field(default_factory=dict)
+    power: Mapping[str, float] = field(default_factory=dict, hash=False)
     thermostat: Thermostat | None = None
 
     @property

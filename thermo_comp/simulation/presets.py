@@ -241,11 +241,10 @@ def _tempcos(draw: _Specimen, parts: list[str]) -> list[Effect]:
     }
     if len(parts) == 1:
         return [PartEffect(parts[0], **values)]
-    effects: list[Effect] = []
-    for i, part in enumerate(parts):
-        own: dict[str, Any] = {name: _only(i, value[i]) for name, value in values.items()}
-        effects.append(PartEffect(part, **own))
-    return effects
+    return [
+        PartEffect(part, **{name: _only(i, value[i]) for name, value in values.items()})  # type: ignore[arg-type]
+        for i, part in enumerate(parts)
+    ]
 
 
 def _slips(draw: _Specimen) -> list[Effect]:

@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -96,25 +97,14 @@ def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: An
 
 
 def arrays(
-    unit: UnitModel, stations: Iterable[Position], seed: int = 0, *, rate_hz: float = 4.0
+    unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
     """Run a unit through a test in memory; each position has a seed of its own, stamps from 0."""
-    solved: dict[Cyclogram, Truth] = {}
-    runs = []
-    for number, one in enumerate(stations):
-        run = simulate(
-            unit,
-            one.program,
-            one.up,
-            rate_hz=rate_hz,
-            seed=1000 * seed + number,
-            start_ns=0,
-            # A load is switched by the seed.
-            like=None if unit.load else solved.get(one.program),
-        )
-        solved[one.program] = run.truth
-        runs.append(replace(run, name=one.name))
-    return runs
+    runs = (
+        simulate(unit, one.program, one.up, rate_hz=rate_hz, seed=1000 * seed + k, start_ns=0)
+        for k, one in enumerate(stations)
+    )
+    return [replace(run, name=one.name) for run, one in zip(runs, stations, strict=True)]
 
 
 def simulate_blocks(
@@ -129,7 +119,6 @@ def simulate_blocks(
     start_ns: int = START_NS,
     gravity: float = STANDARD_GRAVITY,
     warm: bool = True,
-    like: Truth | None = None,
 ) -> Iterator[SimulatedRun]:
     """
     Run a unit through a program in bounded memory; blocks of any size have the same bits.
@@ -137,7 +126,7 @@ def simulate_blocks(
     A reading is in the block among whose cycles it falls, or in the last. `up` is the direction of
     the specific force; K in counts per cycle does not depend on `rate_hz`. `seed` is of all that
     is random in this run, the specimen has its own. Unless `warm`, the unit is switched on at the
-    start. `like` is the truth of another run of this unit through this program: its heat flow.
+    start.
     """
     readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz
     positive = {'rate_hz': rate_hz, 'temperature_rate_hz': readings_hz, 'gravity': gravity}
@@ -149,11 +138,11 @@ def simulate_blocks(
     if n_cycles < 1:
         raise ValueError(f'the program of {duration} s is shorter than one cycle')
     direction = np.asarray(up, dtype=float)
-    if like is None:
-        like = _heat_flow(unit, cyclogram, seed, warm)
+    # Only what switches a load is random in it.
+    truth = _heat_flow(unit, cyclogram, seed if unit.load else 0, warm)
     truth = replace(
-        like,
-        bias_grid=like.thermal_bias + _walk(unit, like.grid_s, seed),
+        truth,
+        bias_grid=truth.thermal_bias + _walk(unit, truth.grid_s, seed),
         specific_force=gravity * (direction / np.linalg.norm(direction)),
     )
     read = unit
@@ -201,8 +190,9 @@ def simulate_blocks(
     return blocks()
 
 
+@lru_cache(maxsize=1)
 def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int, warm: bool) -> Truth:
-    """Solve what temperature does over a program, whatever the attitude."""
+    """Solve what temperature does over a program, once for all attitudes."""
     knots, air, power = np.array(cyclogram.time_s), np.array(cyclogram.temperature_c), None
     if unit.load is not None:
         knots, is_on = _switched(unit.load, knots, seed)
