@@ -25,10 +25,9 @@ from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.judging.history import history_of
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.report.evidence import LEFT_OUT, Evidence, evidence_of_bags
-from thermo_comp.report.figures import drawn_figures, figures_of
 from thermo_comp.report.figures_unit import draw_history
 from thermo_comp.report.html import spelt
-from thermo_comp.report.page import render_report, write_report
+from thermo_comp.report.page import drawn_figures, figures_of, render_report, write_report
 from thermo_comp.report.style import drawing, svg
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.unit.calibration import Provenance

@@ -18,9 +18,8 @@ from report_helpers import evidence, fitted
 from thermo_comp.judging.history import history_of
 from thermo_comp.report import figures_bags as of_bags
 from thermo_comp.report import figures_unit as of_unit
-from thermo_comp.report.figures import figures_of
 from thermo_comp.report.html import label_text, number
-from thermo_comp.report.page import position_error, schuler_peak
+from thermo_comp.report.page import figures_of, position_error, schuler_peak
 from thermo_comp.report.style import drawing, svg
 from thermo_comp.report.trace import shown_bag
 from thermo_comp.thermal.regime import Regime

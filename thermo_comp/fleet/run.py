@@ -151,9 +151,9 @@ def render_fleet(
     rows: Sequence[Row], summary: Summary, certificate_of: Callable[[Row], str]
 ) -> str:
     """Write the page; `certificate_of` gives a certificate's path beside it, or nothing."""
-    from ..report.figures import ReportFigure, drawn_figures
-    from ..report.figures_fleet import draw_distances, draw_shares
+    from ..report.figures_unit import draw_distances, draw_shares
     from ..report.html import render
+    from ..report.page import ReportFigure, drawn_figures
 
     fitted = [row for row in rows if is_fitted(row)]
     curves = {

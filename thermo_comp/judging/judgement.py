@@ -22,8 +22,8 @@ from ..text import counted
 from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G, spoken
-from .rates import RateJudgement, judge_rates
-from .verdicts import LARGEST_RATIO, WIDE_PART, Section, Sections, Verdict, sections_of
+from . import verdicts
+from .verdicts import Section, Sections, Verdict
 from .windows import Windows, means_by
 
 # Nor does it promise much above 1 mg.
@@ -67,7 +67,7 @@ class Judgement:
     axis_rms: Floats
     n_positions: int
     windows: Windows
-    rate: RateJudgement | None
+    rate: verdicts.RateJudgement | None
 
     @property
     def is_valid(self) -> bool:
@@ -134,7 +134,7 @@ def judge(
         raise ValueError(f'`tolerance` must be positive, got {tolerance:g}')
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)
-    sections = sections_of(windows, windows.raw_residual, windows.residual, claimed)
+    sections = verdicts.sections_of(windows, windows.raw_residual, windows.residual, claimed)
     shifts = axis_shifts(windows.select(windows.is_inside), calibration.misalignment_sd)
     found = Judgement(
         kind=Verdict.OUTSIDE,
@@ -147,7 +147,7 @@ def judge(
         axis_rms=rms_by_axis(windows),
         n_positions=distinct_positions(windows),
         windows=windows,
-        rate=judge_rates(windows, calibration),
+        rate=verdicts.judge_rates(windows, calibration),
     )
     kind, reason = _verdict(found, claims, calibration.needs_temperature)
     return replace(found, kind=kind, reason=reason)
@@ -163,14 +163,14 @@ def _verdict(found: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict,
     worst = max([s.rms for s in sections.regimes or [one]] + [found.headline_rms])
     ratio = sections.worst_ratio
     # A NaN of no claim compares false.
-    is_wide = one.claimed_rms > (tolerance or min(WIDE_PART * one.raw_rms, _WIDE_CLAIM))
+    is_wide = one.claimed_rms > (tolerance or min(verdicts.WIDE_PART * one.raw_rms, _WIDE_CLAIM))
     if one.rms >= one.raw_rms and is_thermal:
         kind = Verdict.NO_BETTER
     elif tolerance is not None and worst > tolerance:
         kind = Verdict.RECALIBRATE
     elif tolerance is None and not claims:
         kind = Verdict.NO_CLAIM
-    elif tolerance is None and (ratio > LARGEST_RATIO or found.moved):
+    elif tolerance is None and (ratio > verdicts.LARGEST_RATIO or found.moved):
         kind = Verdict.RECALIBRATE
     else:
         kind = Verdict.WIDE if is_wide else Verdict.VALID
@@ -181,7 +181,7 @@ def _verdict(found: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict,
         where = 'on positions left out' if worst == left_out else 'in the worse regime'
         says.append(f'{spoken(worst)} {where}, {spoken(tolerance)} tolerated')
     elif claims:
-        says.append(f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}')
+        says.append(f'largest ratio of a regime {ratio:.2g}, limit {verdicts.LARGEST_RATIO:g}')
     else:
         says.append('the calibration says nothing of its uncertainty: give a tolerance')
     if found.moved:

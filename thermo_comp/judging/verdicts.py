@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the words of a judgement: the verdicts, the sections, and where the limits lie."""
+"""
+Owns the words of a judgement, verdicts, sections and where the limits lie; a gyroscope's verdict.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +10,16 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any
 
+import numpy as np
+
 from ..typing import Floats
+from ..unit.calibration import Calibration
+from ..unit.correction import Correction
+from ..unit.gyroscope import MILLIDEGREE
 from ..unit.metrics import residual_statistics
-from .windows import Windows
+from ..unit.rate_triad import rate_triad
+from ..unit.uncertainty import SlowUncertainty
+from .windows import Windows, means_by
 
 #: A calibration holds while its error is within this many times what it claims.
 LARGEST_RATIO = 2.0
@@ -93,3 +102,96 @@ def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats
             n, before.rms, before.peak, after.rms, after.mean, after.peak, claim.rms
         )
     return found
+
+
+@dataclass(frozen=True)
+class RateJudgement:
+    """What recordings tell of a gyroscope: sections of the changes of all axes, in rad/s."""
+
+    kind: Verdict
+    reason: str
+    sections: Sections
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the gyroscope was shown not to hold."""
+        return self.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
+
+    def __str__(self) -> str:
+        """Give the verdict with its numbers, as every command prints it."""
+        return f'angular rate: {self.kind.value}: {self.reason}'
+
+    def facts(self) -> dict[str, Any]:
+        """Give everything, as every command's JSON holds it."""
+        return {
+            'verdict': self.kind.value,
+            'reason': self.reason,
+            'is_valid': self.kind.is_valid,
+            'sections_rad_s': self.sections.facts(),
+        }
+
+
+def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | None:
+    """
+    Judge a gyroscope by the windows of bags; None without one, or without its rate.
+
+    At rest it reads the Earth's rate and what its turn-on has left, which nobody knows: judged are
+    the changes from the mean of each rest, by what is claimed for the very same changes.
+    """
+    windows = windows.select(np.asarray(np.isfinite(windows.gyro[:, :6]).all(axis=1)))
+    if not windows.gyro.size:
+        return None
+    raw, corrected, variance = (windows.gyro[:, k : k + 3] for k in (0, 3, 6))
+    # What lies outside the ranges is held against the rest's mean inside them, if there is one.
+    _, place = np.unique(windows.position, return_inverse=True)
+    has_inside = np.bincount(place, windows.is_inside) > 0.0
+    weight = np.where(has_inside[place], windows.is_inside, 1.0)
+    counts = np.bincount(place, weight).astype(np.float64)[place]
+
+    def mean_of(rows: Floats) -> Floats:
+        return means_by(place, rows, weight)[place]
+
+    triad = rate_triad(calibration)
+    claims, claimed = triad.has_uncertainty, np.full_like(corrected, np.nan)
+    if claims:
+        # What is claimed for the changes, from what is for the rate of one message.
+        correction = Correction(triad, Correction(calibration).memory)
+        whole, away = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
+        slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
+        # Of the thermometers' noise, and of lags that started unseen, a rest's mean has little.
+        rest = np.maximum(variance - np.array(correction.noise) - slow - whole, 0.0)
+        white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
+        noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
+        hours = counts[:, None] * windows.window_s / 3600.0
+        # A walk strays from its mean over a time by a sixth of what it gains in that time.
+        walk = np.square(triad.slow_noise_m_s2_sqrt_h) * hours / 6.0
+        claimed = np.sqrt(rest + away + noise + walk)
+    changes = np.stack((raw - mean_of(raw), corrected - mean_of(corrected), claimed))
+    is_judged = counts > 1
+    sections = sections_of(windows.select(is_judged), *changes[:, is_judged])
+    kind, reason = _verdict(sections, windows.window_s, claims)
+    return RateJudgement(kind, reason, sections)
+
+
+def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict, str]:
+    one, outside = sections['all'], sections['outside']
+    if not one.n:
+        return Verdict.OUTSIDE, f'{outside.n} windows of {window_s:g} s lie there'
+    said = f'{_mdeg(one.rms)} RMS of its changes at rest, {_mdeg(one.raw_rms)} raw'
+    over = f'over {one.n} windows of {window_s:g} s'
+    if not claims:
+        kind = Verdict.NO_BETTER if one.rms > one.raw_rms else Verdict.NO_CLAIM
+        return kind, f'{said} {over}; the calibration says nothing of its uncertainty'
+    ratio = sections.worst_ratio
+    said = (
+        f'{said}, {_mdeg(one.claimed_rms)} claimed {over}; '
+        f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
+    )
+    # Where no temperature changes, nothing is corrected: that is no fault.
+    if ratio > LARGEST_RATIO:
+        return Verdict.NO_BETTER if one.rms >= one.raw_rms else Verdict.RECALIBRATE, said
+    return Verdict.WIDE if one.claimed_rms > WIDE_PART * one.raw_rms else Verdict.VALID, said
+
+
+def _mdeg(rate: float) -> str:
+    return f'{rate / MILLIDEGREE:.3g} mdeg/s'

@@ -25,8 +25,7 @@ from ..judging.evaluation import open_bags
 from ..recording.columns import RecordingInfo
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence, evidence_of_bags
-from .figures import ReportFigure, drawn_figures, figures_of
-from .page import render_report
+from .page import ReportFigure, drawn_figures, figures_of, render_report
 
 _HOST = '127.0.0.1'
 # A client that keeps a connection open without a word is let go after this [s].
