@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from builders import GRAVITY
 
-from thermo_comp.online.gravity_check import GravityCheck
+from thermo_comp.online.checks import GravityCheck
 
 NOISE_SD = 2e-3
 BIAS_SD = 1e-4

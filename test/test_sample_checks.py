@@ -15,14 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermo_comp.online.batch import process_block
-from thermo_comp.online.compensator import Compensator, CompensatorConfig
-from thermo_comp.online.sample_checks import (
+from thermo_comp.online.checks import (
     BURST_SAMPLES,
     LARGEST_RATE,
     STUCK_SAMPLES,
     RateCheck,
     StuckCheck,
 )
+from thermo_comp.online.compensator import Compensator, CompensatorConfig
 from thermo_comp.online.snapshot import take_snapshot
 from thermo_comp.online.status import DROPPED, Counters
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit

@@ -16,13 +16,9 @@ from .text import one_line
 
 
 class ThermoCompError(Exception):
-    """
-    Any failure that a user can cause and mend; its text is one complete line: file, key, message.
+    """Any failure that a user can cause and mend; its text is one line: file, key, message."""
 
-    `rule` is what may be said to those who may not read the file, where message or key quote one
-    that is no calibration.
-    """
-
+    # `rule` is for those who may not read the file, where message or key quote one that is none.
     def __init__(
         self,
         message: str,

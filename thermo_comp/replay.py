@@ -103,13 +103,10 @@ def replay(
     progress: Callable[[float], None] | None = None,
 ) -> ReplayResult:
     """
-    Correct a recording and write what the node would publish.
+    Correct a recording and write what the node would publish: a bag, or by its suffix a table.
 
-    The output is a bag, ``*.mcap`` or a rosbag2 directory; or ``*.csv`` or ``*.parquet``, a table
-    of the corrected samples. An empty `frame_id` keeps the input's. `keep_inputs` copies the input
-    messages at their stamps; `all_topics` these and every other topic at their log times, but none
-    that bears an output's name. `progress` is called with the fraction done. Raises
-    RecordingError, OutputError, and CalibrationError if the calibration is for another unit.
+    `keep_inputs` copies the input messages at their stamps; `all_topics` these and every other
+    topic at their log times, but none that bears an output's name.
     """
     compensator = Compensator(calibration, config)
     wanted = input_for(calibration, input)

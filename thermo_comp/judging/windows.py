@@ -25,8 +25,8 @@ from ..fitting import reduction
 from ..fitting.priors import constants_of
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import readings_in_order
+from ..online.checks import variance_along
 from ..online.compensator import Compensator
-from ..online.gravity_check import variance_along
 from ..online.snapshot import take_snapshot
 from ..online.status import CompensatorConfig
 from ..thermal.state import Layout

@@ -20,8 +20,7 @@ from typing import Final, TypeVar
 
 from ..typing import Floats
 from ..unit.calibration import Calibration
-from .gravity_check import GravityCheck
-from .sample_checks import StuckCheck
+from .checks import GravityCheck, StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, ThermalSide
 from .status import CompensatorConfig, Counters
 
@@ -58,10 +57,7 @@ class Compensator:
         )
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """
-        Queue a reading [degC] of ``'board'`` or of a sensor of the calibration's, others are left
-        out; it takes effect at the first sample not before it.
-        """
+        """Queue a reading [degC] of ``'board'`` or another of the calibration's thermometers."""
         self.thermal.push(name, stamp_ns, celsius)
         self.event_ns = min(self.event_ns, stamp_ns)
 
@@ -102,11 +98,7 @@ class Compensator:
     def correct_rate(
         self, stamp_ns: int, x: float, y: float, z: float
     ) -> tuple[float, float, float, float, float, float]:
-        """
-        Correct the angular rate [rad/s] that came with the sample which `process` has just given.
-
-        Returns the rate and the variance of each axis [rad^2/s^2]; they have nothing in common.
-        """
+        """Correct the angular rate [rad/s] of the sample just processed; variances behind it."""
         return corrected_rate(self.rate_line, (stamp_ns - self._segment[0]) * 1e-9, x, y, z)
 
     def _count_bad(self, x: float, y: float, z: float) -> None:

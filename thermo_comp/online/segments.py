@@ -29,7 +29,7 @@ from ..unit.calibration import Calibration
 from ..unit.correction import Correction
 from ..unit.rate_triad import rate_triad
 from ..unit.uncertainty import SlowUncertainty
-from .sample_checks import RateCheck
+from .checks import RateCheck
 from .status import CompensatorConfig, Counters
 
 #: Longest time over which bias and scale are taken as linear in time.

@@ -19,8 +19,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.subscription import Subscription
 
+from ..online.checks import RATE_TOLERANCE
 from ..online.compensator import Compensator
-from ..online.sample_checks import RATE_TOLERANCE
 from ..online.snapshot import CompensatorStatus, take_snapshot
 from ..text import one_line
 from ..thermal.plausibility import Fault
