@@ -43,14 +43,12 @@ _Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, str
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
-#: No noise at all, but for the rounding of sums [parts of g].
-_NO_NOISE = 1e-6
+_NO_NOISE = 1e-6  # no noise at all, but for the rounding of sums [parts of g]
 _AXES = ('x', 'y', 'z')
 _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
 _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperature'}
 _TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_combined', *_BAROMETERS)
-#: `accelerometer_timestamp_relative` of a message without an accelerometer.
-_NOT_THERE = 2**31 - 1
+_NOT_THERE = 2**31 - 1  # `accelerometer_timestamp_relative` of a message without an accelerometer
 _HEADER_BYTES = 3
 _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 
@@ -91,8 +89,7 @@ def _ulog(path: Path) -> _Held:
         log = _read('pyulog', 'ULog', 'px4', 'a ULog file', path, file, list(_TOPICS))
     by_topic: dict[str, dict[int, _Columns]] = {topic: {} for topic in _TOPICS}
     for data in log.data_list:
-        # A damaged format may have lost its time stamp.
-        if len(data.data.get('timestamp', ())):
+        if len(data.data.get('timestamp', ())):  # a damaged format may have lost its time stamp
             by_topic[data.name][int(data.multi_id)] = data.data
     baros = {
         number: Readings(_stamps(columns), _column(columns, name))
@@ -229,8 +226,7 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     """Gather one message type: its columns, and how many of its messages were cut off."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
-    # numpy calls numbers as struct does.
-    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)
+    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # numpy calls numbers as struct does
     kinds = [f'S{size or 1}' if code == 's' else f'<{code}' for size, code in codes]
     if len({*layout.columns}) < len(layout.columns):
         raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)

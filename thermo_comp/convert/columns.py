@@ -30,8 +30,7 @@ Triple = tuple[Column, Column, Column]
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Between two samples lies more than the first [s], and less than the second: so times are told.
 _STEPS_S = (5e-5, 0.5)
-#: No gyroscope is turned by hand faster than this [rad/s].
-_FASTEST_RAD_S = 20.0
+_FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
 _GIVE_MAP = 'give a column map: --columns MAP'
 
 

@@ -43,18 +43,14 @@ _CELL_S, _MIN_SAMPLES = 0.5, 12
 # Noise this many times the quiet level is handling, not noise: the sd of 12 samples stays within
 # a factor of 2 of its mean.
 _MOVING_RATIO = 4.0
-# Two movements with less rest between them than this are one.
-_MERGE_NS = 10 * 10**9
+_MERGE_NS = 10 * 10**9  # two movements with less rest between them than this are one
 
-#: The stamp of a row that has none.
-NO_STAMP = np.iinfo(np.int64).min
+NO_STAMP = np.iinfo(np.int64).min  # the stamp of a row that has none
 # No sensor on a circuit board is read outside this range; kelvins and raw counts are.
 _PLAUSIBLE_CELSIUS = (-90.0, 200.0)
-# Rows are reduced and written in runs of so many: bounded memory.
-_RUN_ROWS = 100_000
+_RUN_ROWS = 100_000  # rows are reduced and written in runs of so many: bounded memory
 _EXAMPLES = 5
-#: Slower logs tell of soaks alone.
-SLOW_HZ = 5.0
+SLOW_HZ = 5.0  # slower logs tell of soaks alone
 
 
 class Readings(NamedTuple):

@@ -35,17 +35,14 @@ Column = str | int
 TimeUnit = Literal['s', 'ms', 'us', 'ns']
 
 _SNIFF_BYTES = 65536
-# A logger's preamble is no longer than this.
-_PREAMBLE_ROWS = 1000
-#: What packs numbers more tightly holds no measurement.
-_MOST_ROWS_PER_BYTE = 4
+_PREAMBLE_ROWS = 1000  # a logger's preamble is no longer than this
+_MOST_ROWS_PER_BYTE = 4  # what packs numbers more tightly holds no measurement
 #: Powers of ten from a unit of time to nanoseconds.
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 
 _DELIMITERS = {'tab': '\t', 'blank': ' '}
 
-#: Line number and cells of each row.
-_Rows = Iterator[tuple[int, list[str]]]
+_Rows = Iterator[tuple[int, list[str]]]  # line number and cells of each row
 
 
 @dataclass(frozen=True)

@@ -32,14 +32,11 @@ from ..files import open_regular
 from ..typing import Bytes, Ints
 from .columns import Messages, gather, number_at
 
-#: Opcode and length in front of each record.
-PREFIX = struct.Struct('<BQ')
-#: Enough of a chunk's record to hold its head.
-HEAD_BYTES = 160
+PREFIX = struct.Struct('<BQ')  # opcode and length in front of each record
+HEAD_BYTES = 160  # enough of a chunk's record to hold its head
 _CHUNK_HEAD = struct.Struct('<BQQQQII')
 _INDEX_HEAD = struct.Struct('<BQHI')
-#: Log time and offset of one message, 8 bytes each.
-_INDEX_ROW_BYTES = 16
+_INDEX_ROW_BYTES = 16  # log time and offset of one message, 8 bytes each
 #: Bytes of a message record before its serialized message; of these, after the prefix.
 MESSAGE_HEAD_BYTES = 31
 _MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size
@@ -48,14 +45,12 @@ MESSAGE = int(Opcode.MESSAGE)
 #: Why a walk stopped, besides damage that is said in other words.
 _ENDS_EARLY = 'a record ends too early'
 _ZERO_OPCODE = 'a record has the opcode 0'
-#: A chunk that claims to hold more is refused [bytes].
-MAX_CHUNK_BYTES = 1 << 26
+MAX_CHUNK_BYTES = 1 << 26  # a chunk that claims to hold more is refused [bytes]
 #: A file that grows by more than this, beyond so many bytes, is not believed.
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
-#: Up to so much before a damage is lost with it.
-_STEP_BYTES = 1 << 16
+_STEP_BYTES = 1 << 16  # up to so much before a damage is lost with it
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,
@@ -230,8 +225,7 @@ def _messages(data: Bytes, at: Ints, size: Ints, head: NDArray[np.void]) -> Mess
     log_ns = number_at(head, 15, '<i8').astype(np.int64)
     if len(log_ns) and int(np.min(log_ns)) < 0:
         raise DamagedError('a message has a log time beyond the year 2262')
-    # Copied: each role looks at all of them.
-    channel = number_at(head, 9, '<u2').astype(np.uint16)
+    channel = number_at(head, 9, '<u2').astype(np.uint16)  # copied: each role looks at all of them
     return Messages(data, at + MESSAGE_HEAD_BYTES, size, channel, log_ns)
 
 

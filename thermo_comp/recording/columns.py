@@ -22,8 +22,7 @@ from ..errors import RecordingError
 from ..typing import Bools, Bytes, Floats, Ints
 
 Input = Literal['auto', 'counts', 'imu']
-#: ``accel``, or the name of a thermometer.
-Role = str
+Role = str  # ``accel``, or the name of a thermometer
 
 ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 
@@ -31,8 +30,7 @@ ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 #: of usual size has more.
 BLOCK_MESSAGES = 1 << 13
 
-#: What a longer jump of the stamps becomes [ns].
-LONGEST_PAUSE_NS = 3600 * 10**9
+LONGEST_PAUSE_NS = 3600 * 10**9  # what a longer jump of the stamps becomes [ns]
 #: More jumps are no clock; and so many days need a message every so many seconds.
 _MOST_JUMPS = 100
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9

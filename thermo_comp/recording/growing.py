@@ -25,12 +25,10 @@ from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics
 from .writer import BagWriter
 
 _USUAL = Topics()
-# Little is lost with a process that is killed: half a minute at 100 Hz.
-_CHUNK_BYTES = 1 << 17
+_CHUNK_BYTES = 1 << 17  # little is lost with a process that is killed: half a minute at 100 Hz
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
-#: A look may take this part of the time.
-_SHARE = 0.2
+_SHARE = 0.2  # a look may take this part of the time
 
 #: What has come: a block with its serialized messages, and from which bag.
 News = tuple[Block, RecordingInfo | None]
@@ -97,8 +95,7 @@ class PositionBags:
         check_output(folder / f'{self._number:02d}.mcap', MCAP)
         self._writer: BagWriter | None = None
         self._held: list[Block] = []
-        #: Bags that were begun.
-        self.written: list[Path] = []
+        self.written: list[Path] = []  # bags that were begun
 
     def add(self, block: Block, info: RecordingInfo | None) -> None:
         """Take the serialized messages, and from where they come."""
@@ -121,8 +118,7 @@ class PositionBags:
             if self._writer is not None:
                 self._writer.flush()
         except OutputError:
-            # It is said once, and not tried again.
-            self._writer, self._held = None, []
+            self._writer, self._held = None, []  # it is said once, and not tried again
             raise
 
     def _write(self, block: Block) -> None:

@@ -45,8 +45,7 @@ _WINDOW_BYTES = 1 << 22
 #: Chunks under way: what two threads read while the caller works on one block.
 _N_AHEAD = 8
 _AHEAD_BYTES = 1 << 26
-#: Messages of overlapping chunks that are held back at most [bytes].
-_MAX_HELD_BYTES = 1 << 26
+_MAX_HELD_BYTES = 1 << 26  # messages of overlapping chunks that are held back at most [bytes]
 #: What ends inside a record, by its opcode, or -1 for the others.
 _CUTS = {
     0: 'it is unreadable from byte {at} on',
@@ -65,8 +64,7 @@ _SPAN_FIELDS = attrgetter(
     *('chunk_start_offset', 'chunk_length', 'message_index_length'),
     *('uncompressed_size', 'message_start_time', 'message_end_time'),
 )
-# Versions of mcap differ in what of it is typed.
-_new_stream: Any = ReadDataStream
+_new_stream: Any = ReadDataStream  # versions of mcap differ in what of it is typed
 
 
 class McapFile(BagFile):

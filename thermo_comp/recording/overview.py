@@ -19,11 +19,9 @@ from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
 from .topics import Topics
 
-# A ramp's rate is that of the board over so long.
-_RAMP_WINDOW_S = 120.0
+_RAMP_WINDOW_S = 120.0  # a ramp's rate is that of the board over so long
 _CELL_S, _MIN_REST_S = 0.5, 3.0
-# A pause of this many usual intervals is a gap.
-_GAP_INTERVALS = 5.0
+_GAP_INTERVALS = 5.0  # a pause of this many usual intervals is a gap
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name yours with '
     '--topic counts=TOPIC or --topic imu=TOPIC'

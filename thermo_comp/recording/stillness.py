@@ -29,17 +29,12 @@ _LEVEL_S = 120.0
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
-#: How many windows a cell lasts where the samples are slow.
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)
-# Stamps may lie anywhere; no unit rests in one cell for a day.
-_LONGEST_CELL_NS = 86400e9
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # how many windows a cell lasts where the samples are slow
+_LONGEST_CELL_NS = 86400e9  # stamps may lie anywhere; no unit rests in one cell for a day
 _MIN_SAMPLES = 30
-# A sample beyond has a square that is no number; it is none itself.
-_LARGEST = 1e100
-# The middle of words of 16 bits.
-_WORD = 32768.0
-# Noise below this many quanta leaves a sensor on one number for long.
-_STUCK = 0.3
+_LARGEST = 1e100  # a sample beyond has a square that is no number; it is none itself
+_WORD = 32768.0  # the middle of words of 16 bits
+_STUCK = 0.3  # noise below this many quanta leaves a sensor on one number for long
 
 
 @dataclass(frozen=True)
@@ -130,8 +125,7 @@ class CellAccumulator:
     def finish(self) -> Cells:
         """Return all cells so far, the last one as it is."""
         sums = np.concatenate(self._sums)
-        # Whoever asks again asks for little more.
-        self._sums = [sums]
+        self._sums = [sums]  # whoever asks again asks for little more
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:], 2, axis=1)
         mean = total / count[:, None]

@@ -22,16 +22,14 @@ TEMPERATURE = 'sensor_msgs/msg/Temperature'
 BOOL = 'std_msgs/msg/Bool'
 
 _TYPES = {'counts': VECTOR3_STAMPED, 'imu': IMU, 'board': TEMPERATURE, 'case': TEMPERATURE}
-#: What the node gives out is no input of it.
-_OUTPUT = '/imu/data_raw'
+_OUTPUT = '/imu/data_raw'  # what the node gives out is no input of it
 
 #: Names of further thermometers: those that a role has not.
 _NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
-# No bag lasts three years, and no clock that was set stands before 1973 [s].
-_FIRST_STAMP_S = 1e8
+_FIRST_STAMP_S = 1e8  # no bag lasts three years, and no clock that was set stands before 1973 [s]
 
 #: The topics of a bag with their type and number of messages.
 Present = Mapping[str, tuple[str, int]]
@@ -70,8 +68,7 @@ class Part:
         return '' if self == WHOLE else f'[{begin}:{end}]'
 
 
-#: All of a bag.
-WHOLE = Part()
+WHOLE = Part()  # all of a bag
 
 
 @dataclass(frozen=True, slots=True)

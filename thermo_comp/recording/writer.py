@@ -29,8 +29,7 @@ from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
 from .wire import N_NUMBERS, encode_stamped
 
-#: The first stamp that no ROS message can hold; none is before 0 [ns].
-STAMP_END_NS = 2**31 * 10**9
+STAMP_END_NS = 2**31 * 10**9  # the first stamp that no ROS message can hold; none is before 0 [ns]
 _AUTO_FLUSH_BYTES = 1 << 26
 #: What the suffix of a table stands for.
 TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}
