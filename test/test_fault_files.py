@@ -120,6 +120,7 @@ def hook(event, arguments):
     if event == 'os.rename' and str(arguments[1]).endswith(target) and point == 'before':
         os.kill(os.getpid(), signal.SIGKILL)
     if seen and point == 'writing' and event != 'os.kill':
+        seen.clear()
         os.kill(os.getpid(), signal.SIGKILL)
     if event == 'open' and isinstance(arguments[0], str):
         name = os.path.basename(arguments[0])
@@ -170,6 +171,23 @@ def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: st
             assert read_recording(rest, require=()).info.truncated is None
         else:
             assert rest.read_bytes().rstrip().endswith(b'</html>')
+
+
+@pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
+def test_a_command_that_is_asked_to_end_leaves_nothing(folder: Path, name: str) -> None:
+    # WHY: a hidden file as large as the bag stayed behind each time-out and each shutdown.
+    listed = set(folder.iterdir())
+    arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]
+    script = KILLED.replace('SIGKILL', 'SIGTERM')
+    ended = subprocess.run(
+        [sys.executable, '-c', script, 'writing', name, *arguments, name],
+        cwd=folder,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr) == (143, b'')
+    assert set(folder.iterdir()) == listed
 
 
 def rewritten(torn: Path, whole: Path) -> None:

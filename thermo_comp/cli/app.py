@@ -11,6 +11,7 @@ Heavy libraries are imported by the commands when they run, so that ``--help`` i
 
 import os
 import re
+import signal
 import sys
 from typing import Any
 
@@ -69,6 +70,7 @@ def main(arguments: list[str] | None = None) -> None:
     hold_standard_streams()
     # Threads over small matrices wait for each other: 16 times as long where the cores are busy.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what was begun is cleared away
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
