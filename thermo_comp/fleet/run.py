@@ -1,11 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a run over a fleet: find, do what is missing, learn the type, write the table and page.
-
-``OUT/units/NAME/`` holds calibration.yaml, certificate.html and, written last, result.json: a
-unit without it has not been done, whatever else lies there. What was fitted with a prior lies in
-``OUT/with_prior/NAME/``.
+Owns a run over a fleet: find, do what is missing, learn the type, write the table and page; a unit
+without a result.json, which is written last, has not been done.
 """
 
 from __future__ import annotations

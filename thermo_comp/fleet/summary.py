@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what a fleet table tells: spreads, units that stand out, drift.
-
-Spreads are robust (median and median absolute deviation), because the units that stand out are in
-them. Every limit is set so that a fleet without anything to find raises an alarm once in twenty.
-"""
+"""Owns what a fleet table tells: spreads that outliers do not widen, who stands out, drift."""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the one table of units: its columns, what a fit puts into them, and its files.
-
-Parquet is for programs, CSV for people. Texts that somebody else chose stand in a row as one line.
-"""
+"""Owns the one table of units: its columns, what a fit puts into them, and its files."""
 
 from __future__ import annotations
 

@@ -2,11 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns where a fleet's bags lie: on any file system that fsspec knows, which files make a bag, and
-which bags a unit.
-
-``DIR/[LOT/]UNIT/BAG``: the bags of one folder are one thermal test of one unit, so a unit that was
-tested twice has two folders and comes out twice. Bags that lie in DIR itself are sorted by the
-serial in their metadata.
+which bags a unit: those of one folder, or of one serial.
 """
 
 from __future__ import annotations

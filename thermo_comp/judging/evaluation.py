@@ -47,11 +47,9 @@ def open_bags(
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
     """
-    Read bags, in bounded memory, for windows of `window_s` seconds.
+    Read bags for windows of `window_s`, as the first calibration says, else as usual.
 
-    What is read, what is saturated and what a rest scatters by is as the first calibration says,
-    else the usual. Raises RecordingError if one cannot be read, or has no board temperature where
-    a calibration, or none, asks for one.
+    Raises RecordingError if one cannot be read, or has no board temperature where it needs one.
     """
     require: tuple[Role, ...] = ('board',)
     known: dict[str, Any] = {}

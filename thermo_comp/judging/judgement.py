@@ -1,12 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the judgement of a calibration on recordings: one verdict, with its numbers and exit code.
-
-At rest ``|f|`` is local gravity in any attitude, so no fixture is needed. Like is compared with
-like: the RMS of the residual with the RMS of what is claimed for the very same windows. What lies
-outside the calibrated ranges is told apart and decides nothing. What bias, scale and misalignment
-it takes to make ``|f| = g`` in all positions is what the axes have moved by.
+Owns the judgement of a calibration on recordings: one verdict, with its numbers and exit code;
+what it takes to make ``|f| = g`` in all positions is what the axes have moved by.
 """
 
 from __future__ import annotations

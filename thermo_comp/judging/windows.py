@@ -1,11 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the windows that a judgement rests on: means at rest of exactly the stated length.
-
-A window is a run of whole sums of one still interval. Its mean goes through the compensator as a
-sample does, with the readings that came before it, so that force, covariance and regime are the
-node's; what is kept of a bag of any length is a row per window.
+Owns the windows that a judgement rests on: means at rest of exactly the stated length, corrected
+as the node would correct a sample there; a row each is all that is kept of a bag.
 """
 
 from __future__ import annotations

@@ -114,9 +114,8 @@ class CertificateInfo:
 
 def load_certificate_info(path: str | Path, serial: str | None = None) -> CertificateInfo:
     """
-    Read a laboratory's statements on the unit with a serial from a YAML file.
-
-    Raises ThermoCompError, naming file and key, if one is wrong or of another unit.
+    Read a laboratory's statements on the unit with a serial; ThermoCompError, naming file and key,
+    if one is wrong or of another unit.
     """
     data = read_plain_yaml(path)
     try:

@@ -181,9 +181,8 @@ class Evidence:
 
     def axis_residuals(self) -> dict[str, Floats]:
         """
-        Give the residual of each axis over the windows, by rung, shape (n, 3) [m/s^2].
-
-        The mean direction that the judged rung sees in a position stands for its attitude.
+        Give the residual of each axis by rung, shape (n, 3) [m/s^2]; the mean direction that the
+        judged rung sees in a position stands for its attitude.
         """
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:

@@ -8,7 +8,7 @@ a fleet of them: what is left unit by unit, and who stands out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,6 +30,7 @@ from .html import label_text, minus, number
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
 _N_CURVE = 61
+_BOARD = 'T board, °C'
 #: From a few readings to where the longest lag of the bank has forgotten.
 _STEP_MINUTES = (0.2, 500.0)
 # Line, hatch and marker.
@@ -59,13 +60,10 @@ def draw_functions(evidence: Evidence) -> Figure:
         if np.isfinite(errors[:, k]).any():
             soak = np.interp(temperature, drawn[0].temperature, drawn[0].value[:, k])
             axes.plot(temperature, soak + level[:, k], 'o', label='measured in a soak', **_POINT)
-    for name, row in (
-        ('bias less the line, µg', panels[0]),
-        ('scale less the line, ppm', panels[1]),
-    ):
-        row[0].set_ylabel(name)
+    panels[0, 0].set_ylabel('bias less the line, µg')
+    panels[1, 0].set_ylabel('scale less the line, ppm')
     for axes in panels[1]:
-        axes.set_xlabel('T board, °C')
+        axes.set_xlabel(_BOARD)
     style.shared_legend(figure, panels[0, 0], 4)
     return figure
 
@@ -73,7 +71,8 @@ def draw_functions(evidence: Evidence) -> Figure:
 def draw_rates(evidence: Evidence) -> Figure:
     """Draw the bias of the angular rate over temperature, less a line, with bands."""
     triad = rate_triad(given(evidence.calibration))
-    figure, panels = _axis_panels('bias less the line, mdeg/s')
+    names = ('bias less the line, mdeg/s', '', '')
+    figure, panels = _panels(2.5, names, _BOARD, sharex=True)
     # What is said in m/s^2 of a triad is rad/s of this one.
     factor = MICRO_G / MILLIDEGREE
     drawn = [one._replace(value=factor * one.value, sd=factor * one.sd) for one in curves(triad)]
@@ -83,13 +82,12 @@ def draw_rates(evidence: Evidence) -> Figure:
     return figure
 
 
-def _axis_panels(name: str, *, sharey: bool = False) -> tuple[Figure, list[Axes]]:
-    """Make a panel for each axis, over the board temperature."""
-    figure = style.new_figure(2.5)
-    panels = list(figure.subplots(1, 3, sharex=True, sharey=sharey))
-    panels[0].set_ylabel(name)
-    for axes in panels:
-        axes.set_xlabel('T board, °C')
+def _panels(height: float, names: Sequence[str], xlabel: str = '', **shared: bool) -> Any:
+    """Make a figure of a panel beside another, as many as their names on the y axes."""
+    figure = style.new_figure(height)
+    panels = figure.subplots(1, len(names), **shared)
+    for axes, name in zip(panels, names, strict=True):
+        axes.set(xlabel=xlabel, ylabel=name)
     return figure, panels
 
 
@@ -187,12 +185,13 @@ def curves(calibration: Calibration) -> list[Curve]:
 def draw_step(evidence: Evidence) -> Figure:
     """Draw what a step of the temperature does to each axis over time."""
     minutes, *values = step_answer(given(evidence.calibration))
-    figure, panels = _bias_and_scale(2.5, 'still to come', '/K')
+    names = ('still to come, µg/K', 'still to come, ppm/K')
+    figure, panels = _panels(2.5, names, 'time since the step, min')
     for axes, name, value in zip(panels, ('bias', 'scale'), values, strict=True):
         axes.set_prop_cycle(style.AXIS_CYCLE)
         axes.plot(minutes, value, label=AXES)
         style.log_axis(axes, float(minutes[0]), float(minutes[-1]))
-        axes.set_xlabel('time since the step, min')
+        axes.axhline(0.0, color='black', linewidth=0.5)
         style.legend_above(axes, name, share=0.5)
     return figure
 
@@ -209,7 +208,7 @@ def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
 def draw_hysteresis(evidence: Evidence) -> Figure:
     """Draw the loop of each axis' bias in a slow run through the range and back."""
     temperature, heating, cooling = hysteresis_loop(given(evidence.calibration))
-    figure, panels = _axis_panels('loop, µg', sharey=True)
+    figure, panels = _panels(2.5, ('loop, µg', '', ''), _BOARD, sharex=True, sharey=True)
     for i, axes in enumerate(panels):
         middle = (heating[:, i] + cooling[:, i]) / 2.0
         for name, bias in (('heating', heating), ('cooling', cooling)):
@@ -239,7 +238,7 @@ def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
 def draw_history(evidence: Evidence) -> Figure:
     """Draw bias and scale of each calibration of the unit against the first one, by date."""
     history = evidence.history
-    figure, panels = _bias_and_scale(2.6, 'change')
+    figure, panels = _panels(2.6, ('change, µg', 'change, ppm'))
     places = np.arange(len(history))
     change = np.array([one.value - history[0].value for one in history])
     half = BAND_SDS * np.nan_to_num([one.sd for one in history])
@@ -250,19 +249,10 @@ def draw_history(evidence: Evidence) -> Figure:
             axes.errorbar(
                 at, change[:, first + i], half[:, first + i], label=axis, capsize=2.0, **look
             )
+        axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set_xticks(places, [label_text(one.created[:10]) for one in history])
         style.legend_above(axes, name, share=0.5)
     return figure
-
-
-def _bias_and_scale(height: float, what: str, per: str = '') -> tuple[Figure, list[Axes]]:
-    """Make a panel for the bias and one for the scale factor of all axes."""
-    figure = style.new_figure(height)
-    panels = list(figure.subplots(1, 2))
-    for axes, unit in zip(panels, ('µg', 'ppm'), strict=True):
-        axes.set_ylabel(f'{what}, {unit}{per}')
-        axes.axhline(0.0, color='black', linewidth=0.5)
-    return figure, panels
 
 
 def draw_shares(curves: Mapping[str, Floats]) -> Figure:

@@ -29,9 +29,8 @@ _LONGEST_MARGIN = 90
 
 def render(template: str, *, script: str = '', **context: Any) -> str:
     """
-    Fill a template that extends ``page.html``; `title` at least.
-
-    A viewer's page has a script, which runs by a nonce of this page alone.
+    Fill a template that extends ``page.html``, `title` at least; a viewer's script runs by a nonce
+    of this page alone.
     """
     nonce, policy = secrets.token_urlsafe(16), _POLICY
     if script:

@@ -1,11 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the live view: the certificate served on this machine, made anew when its files change.
-
-The page asks for the version of its files once a second. A file that cannot be read, as while it
-is being written, is said above the last good page. Served on the loopback interface and under its
-own names only, so that no other site's page can reach it through the browser.
+Owns the live view: the certificate, made anew when its files change, served on the loopback
+interface under its own names only, so that no other site's page can reach it through the browser.
 """
 
 from __future__ import annotations

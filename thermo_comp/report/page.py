@@ -74,9 +74,7 @@ def render_report(
     notice: str = '',
 ) -> str:
     """
-    Make the page, with figures that are drawn already if there are some.
-
-    `script` and `notice` are a viewer's.
+    Make the page, with figures that are drawn already, and a viewer's script and notice, if any.
     """
     if figures is None:
         figures = drawn_figures(figures_of(evidence))

@@ -1,11 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the look of the figures and their way out: SVG that can stand in a page, PNG files.
-
-Every line differs from its neighbours by its dashes as well as by its colour, because
-certificates are printed in black and white. Colours are those of Okabe and Ito, which colour-blind
-readers tell apart.
+Owns the look of the figures, SVG and PNG: for black and white every line differs from its
+neighbours by its dashes; the colours are those of Okabe and Ito.
 """
 
 from __future__ import annotations
@@ -87,9 +84,8 @@ def new_figure(height: float) -> Figure:
 
 def svg(figure: Figure, name: str, label: str) -> str:
     """
-    Write a figure as an SVG element of a page; `label` is for readers who do not see it.
-
-    The letters and digits of `name` make its ids unique.
+    Write a figure as an SVG element, whose ids the letters and digits of `name` make unique;
+    `label` is for readers who do not see it.
     """
     buffer = io.StringIO()
     nothing = {'Date': None, 'Creator': None, 'Format': None, 'Type': None}

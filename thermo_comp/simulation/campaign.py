@@ -66,15 +66,6 @@ class Cyclogram:
     time_s: tuple[float, ...]
     temperature_c: tuple[float, ...]
 
-    def __post_init__(self) -> None:
-        if len(self.time_s) != len(self.temperature_c) or len(self.time_s) < 2:
-            raise ValueError(
-                '`time_s` and `temperature_c` must have one length of at least 2, got '
-                f'{len(self.time_s)} and {len(self.temperature_c)}'
-            )
-        if not all(math.isfinite(v) for v in self.time_s + self.temperature_c):
-            raise ValueError('`time_s` and `temperature_c` must be finite')
-
     @property
     def duration_s(self) -> float:
         """Length of the program, s."""
@@ -117,6 +108,8 @@ def parse_cyclogram(text: str) -> Cyclogram:
             temperature.append(target)
     if not temperature:
         raise ValueError('cyclogram is empty')
+    if len(time) < 2 or not all(map(math.isfinite, time + temperature)):
+        raise ValueError('cyclogram must have a ramp or a soak, and finite numbers')
     return Cyclogram(tuple(time), tuple(temperature))
 
 

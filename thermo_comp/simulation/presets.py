@@ -1,12 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the ready-made units: three instruments, and triads with one kind of physics each.
-
-Every seed is another specimen: tempcos, heat paths, misalignment and constants are drawn around
-what such units show. The tables below are physics (watts, joules per kelvin, tempcos of parts);
-nothing in them knows how a compensator would describe the result.
-"""
+"""Owns the ready-made units: three instruments, and triads with one kind of physics each."""
 
 from __future__ import annotations
 

@@ -125,8 +125,7 @@ def simulate_blocks(
 
     A reading is in the block among whose cycles it falls, or in the last. `up` is the direction of
     the specific force; K in counts per cycle does not depend on `rate_hz`. `seed` is of all that
-    is random in this run, the specimen has its own. Unless `warm`, the unit is switched on at the
-    start.
+    is random in this run. Unless `warm`, the unit is switched on at the start.
     """
     readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz
     positive = {'rate_hz': rate_hz, 'temperature_rate_hz': readings_hz, 'gravity': gravity}
