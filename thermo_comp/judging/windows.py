@@ -80,11 +80,8 @@ class Windows:
 
     def select(self, rows: Bools) -> Windows:
         """Keep some of the windows."""
-        kept = {
-            one.name: getattr(self, one.name)[rows]
-            for one in fields(self)
-            if one.name not in ('window_s', 'gravity')
-        }
+        # All but the first two, length and gravity.
+        kept = {one.name: getattr(self, one.name)[rows] for one in fields(self)[2:]}
         return replace(self, **kept)
 
     @cached_property

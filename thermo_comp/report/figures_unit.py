@@ -82,7 +82,9 @@ def draw_rates(evidence: Evidence) -> Figure:
     return figure
 
 
-def _panels(height: float, names: Sequence[str], xlabel: str = '', **shared: bool) -> Any:
+def _panels(
+    height: float, names: Sequence[str], xlabel: str = '', **shared: Any
+) -> tuple[Figure, Any]:
     """Make a figure of a panel beside another, as many as their names on the y axes."""
     figure = style.new_figure(height)
     panels = figure.subplots(1, len(names), **shared)

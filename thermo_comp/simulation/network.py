@@ -22,7 +22,6 @@ from ..typing import Floats
 
 AIR = 'air'
 _STEP_S = 1.0  # of convection
-_CHUNK = 65536  # instants evaluated at once; bounds the memory of the mode table
 
 
 @dataclass(frozen=True)
@@ -211,13 +210,9 @@ class ThermalResponse:
         """Return the parts' temperatures, the thermostat's integral [W] and set point, (m, k)."""
         time = np.atleast_1d(np.asarray(time, dtype=float))
         k = np.clip(np.searchsorted(self._time, time, side='right') - 1, 0, len(self._time) - 2)
-        states = np.empty((len(time), len(self.network.system()[1])))
-        for first in range(0, len(time), _CHUNK):
-            piece = slice(first, first + _CHUNK)
-            at, since = k[piece], time[piece] - self._time[k[piece]]
-            decaying = np.exp(since[:, None] * self._rate) * self._amplitude[at]
-            straight = self._alpha[at] + self._beta[at] * since[:, None]
-            states[piece] = straight + (decaying @ self._modes.T).real
+        since = (time - self._time[k])[:, None]
+        decaying = np.exp(since * self._rate) * self._amplitude[k]
+        states: Floats = self._alpha[k] + self._beta[k] * since + (decaying @ self._modes.T).real
         return states
 
     def temperatures(self, time: ArrayLike) -> Floats:
