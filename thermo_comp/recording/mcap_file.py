@@ -79,13 +79,10 @@ class McapFile(BagFile):
         self._schemas: dict[int, Schema] = {}
         with translated(name), ExitStack() as opened:
             self._file = opened.enter_context(open_regular(path))
+            self.close = self._file.close
             self._size = os.fstat(self._file.fileno()).st_size
             self._map()
             opened.pop_all()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
 
     def read(self, channels: Collection[int], work: Work[Done]) -> Iterator[Done]:
         """Read the messages of channels in reading order, and do some work on them."""

@@ -24,23 +24,9 @@ from typing import Any
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import PlainYamlError, load_plain_yaml
+from . import columns
 from .chunks import MAX_CHUNK_BYTES, expand, inflate, inflate_ros1_chunk, translated
-from .columns import (
-    ROLES,
-    BagFile,
-    Block,
-    Done,
-    Input,
-    Messages,
-    Recording,
-    RecordingInfo,
-    Role,
-    Topic,
-    Work,
-    gathered,
-    joined,
-    without_jumps,
-)
+from .columns import ROLES, Block, Done, Input, Messages, RecordingInfo, Role, Topic, Work
 from .mcap_file import McapFile
 from .topics import WHOLE, Topics, select_topics, shown
 from .wire import decode_blocks
@@ -149,7 +135,7 @@ class RecordingReader(ExitStack):
             return decode_blocks(messages, feeds, self.topics, keep_raw=raw)
 
         n_read = dict.fromkeys(self.topics, 0)
-        for block in gathered(self._read(roles, {'cdr', 'ros1'}, decoded), n_messages):
+        for block in columns.gathered(self._read(roles, {'cdr', 'ros1'}, decoded), n_messages):
             for role in n_read:
                 n_read[role] += len(block.log_ns[role])
             if block.n_messages:
@@ -186,8 +172,8 @@ class RecordingReader(ExitStack):
     def blocks_on_one_clock(self) -> Iterator[Block]:
         """Read the bag for whoever walks its time: without the jumps of its clock."""
         if self._part.is_stamped:
-            return without_jumps(self.blocks(), self.info.path)
-        return self._cut(without_jumps(self._blocks(), self.info.path))
+            return columns.without_jumps(self.blocks(), self.info.path)
+        return self._cut(columns.without_jumps(self._blocks(), self.info.path))
 
     def _cut(self, blocks: Iterator[Block]) -> Iterator[Block]:
         """Leave out what is outside the part; RecordingError where no sample is left."""
@@ -226,12 +212,11 @@ def read_recording(
     input: Input = 'auto',  # noqa: A002 - the parameter's public name
     *,
     require: Collection[Role] = ROLES,
-) -> Recording:
+) -> columns.Recording:
     """Read a whole bag into memory; as `open_recording`, and RecordingError for damaged data."""
     with open_recording(path, topics, input, require=require) as reader:
-        blocks = list(reader.blocks())
-        nothing = Messages.of([], [], [])
-        return Recording(reader.info, joined(blocks or decode_blocks(nothing, {}, ROLES)))
+        blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), {}, ROLES)
+        return columns.Recording(reader.info, columns.joined(blocks))
 
 
 def inspect_recording(path: str | Path, topics: Topics | None = None) -> RecordingInfo:
@@ -328,7 +313,7 @@ def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
     return f'{shown(topic)}: {n_read} of the {n_promised} messages promised are there'
 
 
-class ForeignFile(BagFile):
+class ForeignFile(columns.BagFile):
     """
     A file that is not plain MCAP (sqlite3, ROS 1), read by `rosbags`, and decoded many messages
     at a time; `is_packed` where each message is compressed by itself.
@@ -345,7 +330,7 @@ class ForeignFile(BagFile):
         self.storage = {'.bag': 'ros1', '.mcap': 'mcap'}.get(path.suffix, 'sqlite3')
         with translated(name, is_foreign=True):
             reader: Any = Reader1(path) if is_ros1 else Reader2(path)
-            self._reader = reader
+            self._reader, self.close = reader, reader.close
             reader.open()
             for at, chunk in reader.chunks.items() if is_ros1 else ():
                 reader.chunks[at] = chunk._replace(decompressor=inflate_ros1_chunk)
@@ -383,7 +368,3 @@ class ForeignFile(BagFile):
                 batch, n_bytes = [], 0
         if batch:
             yield Messages.of(*zip(*batch, strict=True))
-
-    def close(self) -> None:
-        """Close the file."""
-        self._reader.close()
