@@ -252,10 +252,7 @@ def fit(
 
 
 def _block(
-    time_s: npt.ArrayLike,
-    counts: npt.ArrayLike,
-    readings: Mapping[str, Temperature],
-    start_ns: int,
+    time_s: npt.ArrayLike, counts: npt.ArrayLike, given: Mapping[str, Temperature], start_ns: int
 ) -> Block:
     """Check arrays of a caller's; a reading comes just before its sample."""
     stamps = _stamps('time_s', time_s)
@@ -266,7 +263,7 @@ def _block(
             f'got {samples.shape}'
         )
     found = {}
-    for name, value in readings.items():
+    for name, value in given.items():
         own, celsius = _readings(name, value, stamps, _is_date(time_s))
         found[name] = Readings(own + start_ns, celsius, np.searchsorted(stamps, own))
     return Block(stamps + start_ns, samples, '', None, found, {})

@@ -289,7 +289,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     if gyroscope is not None:
         out.table(
             ('section', 'windows', 'raw', 'fitted', 'left out'),
-            _steps(result.rates, ('raw', 'fitted', 'left_out'), millidegrees, n_axes=3),
+            _steps(result.rates, ('raw', 'fitted', 'left_out'), millidegrees, axes=3),
             title='angular rate at rest less the mean of each position, RMS of an axis in mdeg/s',
         )
         bias, white, walk = (
@@ -324,15 +324,12 @@ def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> s
 
 
 def _steps(
-    residuals: Iterable[Any],
-    steps: Iterable[str],
-    shown: Callable[[float], str | None],
-    n_axes: int = 1,
+    rows: Iterable[Any], steps: Iterable[str], shown: Callable[[float], str | None], axes: int = 1
 ) -> list[tuple[Cell, ...]]:
     """Give what each step of the model leaves in each section; the last is a new attitude's."""
     return [
-        (row.section, row.fitted.n // n_axes, *(shown(getattr(row, x).rms) for x in steps))
-        for row in residuals
+        (row.section, row.fitted.n // axes, *(shown(getattr(row, x).rms) for x in steps))
+        for row in rows
         if row.fitted.n
     ]
 

@@ -23,6 +23,8 @@ from .status import DROPPED
 
 #: Readings yet to come, the next one last: samples before it, thermometer, stamp, degC.
 _Arrivals: TypeAlias = list[tuple[int, str, int, float]]
+#: Each with the number of its samples.
+Segments: TypeAlias = list[tuple[Segment, int]]
 #: Why a sample does not go out, 0 where it does.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
 _TOO_FAST, _REFUTED = _REASONS['n_too_fast'], _REASONS['n_refuted']
@@ -106,11 +108,11 @@ def _push(compensator: Compensator, arrivals: _Arrivals, place: int) -> None:
 
 def _gather(
     compensator: Compensator, arrivals: _Arrivals, index: Ints, stamps: Stamps
-) -> tuple[list[tuple[Segment, int]], Ints]:
+) -> tuple[Segments, Ints]:
     """Cut into segments between readings, with their numbers of samples; and which those are."""
     thermal, counters = compensator.thermal, compensator.counters
     n_seen = counters.n_in - counters.n_out_of_order
-    segments: list[tuple[Segment, int]] = []
+    segments: Segments = []
     rows = [np.arange(0)]
     at = 0
     while at < len(stamps):
@@ -140,7 +142,7 @@ def _gather(
 
 def _apply(
     compensator: Compensator,
-    segments: list[tuple[Segment, int]],
+    segments: Segments,
     index: Ints,
     stamps: Stamps,
     samples: Floats,
@@ -154,10 +156,10 @@ def _apply(
     force = rate = np.empty((12, 0))
     has_rate = angular_rate is not None and of_rate is not None
     if segments:
-        force = _corrected(correction, segments, stamps, samples)
+        force = _corrected(correction, segments, stamps, samples, False)
         is_kept = _judge(compensator, segments, stamps, samples, force)
         if angular_rate is not None and of_rate is not None:
-            rate = _corrected(of_rate, segments, stamps, angular_rate, is_rate=True)[:, is_kept]
+            rate = _corrected(of_rate, segments, stamps, angular_rate, True)[:, is_kept]
         if not is_kept.all():
             index, stamps, force = index[is_kept], stamps[is_kept], force[:, is_kept]
     rates = (rate[:3].T, rate[3:6].T) if has_rate else ()
@@ -165,11 +167,7 @@ def _apply(
 
 
 def _corrected(
-    correction: Correction,
-    segments: list[tuple[Segment, int]],
-    stamps: Stamps,
-    samples: Floats,
-    is_rate: bool = False,
+    correction: Correction, segments: Segments, stamps: Stamps, samples: Floats, is_rate: bool
 ) -> Floats:
     """Give force and row-major covariance (12, n) of segments; or rates and variances (6, n)."""
     each = [segment for segment, _ in segments]
@@ -202,11 +200,7 @@ def _corrected(
 
 
 def _judge(
-    compensator: Compensator,
-    segments: list[tuple[Segment, int]],
-    stamps: Stamps,
-    samples: Floats,
-    force: Floats,
+    compensator: Compensator, segments: Segments, stamps: Stamps, samples: Floats, force: Floats
 ) -> Bools:
     """Leave out what the stream would not publish, and count why."""
     reasons = np.zeros(len(stamps), dtype=np.int8)

@@ -168,11 +168,7 @@ class GravityCheck:
         return not 0 <= stamp_ns - self._last_ns < PROBE_NS
 
     def add(
-        self,
-        stamp_ns: int,
-        force: Sequence[float],
-        covariance: Sequence[float],
-        noise_variance: float,
+        self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
         """Take a sample, its covariance xx .. zz, and the noise of one in the trace [m^2/s^4]."""
         if (
@@ -186,7 +182,7 @@ class GravityCheck:
         self._forces.append(force)
         is_long = stamp_ns - self._begin_ns >= 0.98 * WINDOW_NS
         if is_long and len(self._forces) >= SMALLEST_WINDOW:
-            self._close(covariance, noise_variance)
+            self._close(covariance, noise)
             self._forces = []
 
     def _close(self, covariance: Sequence[float], noise_variance: float) -> None:

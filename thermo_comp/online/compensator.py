@@ -29,7 +29,7 @@ TIME_JUMP_NS: Final = 1_000_000_000
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]
-Number = TypeVar('Number', float, Floats)  # one sample's, or those of many
+Real = TypeVar('Real', float, Floats)  # one sample's, or those of many
 
 
 class Compensator:
@@ -204,13 +204,8 @@ class Compensator:
 
 
 def corrected(
-    line: Iterable[Number],
-    misalignment: tuple[float, ...],
-    dt: Number,
-    x: Number,
-    y: Number,
-    z: Number,
-) -> tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]:
+    line: Iterable[Real], misalignment: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
+) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
     """Give specific force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s into a segment."""
     (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
      ax, lx, qx, ay, ly, qy, az, lz, qz) = line  # fmt: skip
@@ -239,8 +234,8 @@ def corrected(
 
 
 def corrected_rate(
-    line: Iterable[Number], dt: Number, x: Number, y: Number, z: Number
-) -> tuple[Number, Number, Number, Number, Number, Number]:
+    line: Iterable[Real], dt: Real, x: Real, y: Real, z: Real
+) -> tuple[Real, Real, Real, Real, Real, Real]:
     """Give the angular rate x, y, z and the variance of each axis, `dt` s into a segment."""
     bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = line
     return x - (bx + bx1 * dt), y - (by + by1 * dt), z - (bz + bz1 * dt), xx, yy, zz
