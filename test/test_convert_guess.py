@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from thermo_comp.convert.columns import guess_columns, spoken_columns, table_log
+from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
+from thermo_comp.recording.reader import read_recording
 
 UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], 400, axis=0)
 
@@ -35,7 +37,8 @@ def test_the_unit_is_that_of_gravity(
     assert spoken_columns(columns) == f'time [s], x y z [{said}]'
     log = table_log(path, columns)
     assert log.input == ('counts' if said == 'counts' else 'imu')
-    force = log.accel * log.factor
+    write_log(log, tmp_path / 'bag.mcap')
+    force = read_recording(tmp_path / 'bag.mcap', require=('accel',)).columns.accel
     expected = unit if said == 'counts' else 9.80665
     np.testing.assert_allclose(np.linalg.norm(force, axis=1), expected, rtol=0.02)
 

@@ -103,7 +103,7 @@ def record(
                     out.told([(info.path, chosen, None)])
                 bags.add(block, info)
                 for begin_ns in test.add(block):
-                    bags.cut(begin_ns)
+                    bags.close(begin_ns)
                 bags.release(test.settled_ns)
                 continue
             account = test.account()

@@ -86,12 +86,6 @@ class ForeignLog:
     chosen: str | None = None  # topics that were taken without being named
     hint: str = ''  # how its recorder would have logged more
 
-    @property
-    def factor(self) -> float:
-        """From the stated unit to the message's."""
-        per_g = PER_G.get(self.unit, self.counts_per_g or 1.0)
-        return STANDARD_GRAVITY / per_g if self.input == 'imu' else 1.0
-
 
 @dataclass(frozen=True)
 class Stillness:
@@ -241,6 +235,8 @@ def _write(
 ) -> None:
     """Write the messages; a stamp that goes back keeps its place through its log time."""
     topics, n = Topics(), len(log.stamp_ns)
+    per_g = PER_G.get(log.unit, log.counts_per_g or 1.0)
+    factor = STANDARD_GRAVITY / per_g if log.input == 'imu' else 1.0
     waiting = [
         (f'temperature/{name}', readings, np.maximum.accumulate(readings.stamp_ns))
         for name, readings in log.temperatures.items()
@@ -263,7 +259,7 @@ def _write(
                 stamp_ns, celsius = (column[run] for column in readings)
                 writer.write_temperature(topic, stamp_ns, celsius, log_ns[run], log.frame_id)
             since = until
-            stamp_ns, values = log.stamp_ns[rows], log.accel[rows] * log.factor
+            stamp_ns, values = log.stamp_ns[rows], log.accel[rows] * factor
             if log.input == 'counts':
                 writer.write_counts(topics.counts, stamp_ns, values, log.frame_id, newest[rows])
             else:

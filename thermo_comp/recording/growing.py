@@ -136,13 +136,9 @@ class PositionBags:
             if self._writer is not None and len(one):
                 self._writer.write_raw(topic, kind, one.log_ns, one)
 
-    def cut(self, stamp_ns: int) -> None:
-        """End the bag before a stamp."""
-        self.release(stamp_ns)
+    def close(self, before_ns: int = _NEVER_NS) -> None:
+        """End the bag before a stamp, or with all that is held."""
+        self.release(before_ns)
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.close()
-
-    def close(self) -> None:
-        """Write what is held and end the last bag."""
-        self.cut(_NEVER_NS)
