@@ -168,7 +168,6 @@ class BagFile:
 class RecordingInfo:
     """
     What a bag holds, known before its messages are read.
-
     `topics` have message type, two joined by `` | ``, and number of messages. Start and end are
     log times, or 0; `truncated` says what is missing, `metadata` what its writer left in it,
     `input` which accelerometer topic is read, `chosen` what was taken by its type.
@@ -229,7 +228,6 @@ class Readings(NamedTuple):
 class Block:
     """
     A run of messages in reading order, as columns, n samples; it ends where `frame_id` changes.
-
     `accel`, shape (n, 3), is in counts per cycle, or m/s^2 where the input is sensor_msgs/Imu;
     `imu` is the rest of that message. Temperatures are by thermometer, empty where the bag has
     none, `log_ns` by role, as are the serialized messages, where asked for.
@@ -329,7 +327,6 @@ def joined(blocks: Sequence[Block]) -> Block:
 def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Move stamps behind a jump, all by the same; RecordingError for stamps that are no clock.
-
     A clock that is set while it runs leaves a hole of years, and whatever walks a grid of time
     would walk it. After an hour without a reading nothing is known of a unit's thermal state, so
     a longer jump, either way, becomes an hour.

@@ -41,7 +41,6 @@ _STUCK = 0.3  # noise below this many quanta leaves a sensor on one number for l
 class Cells:
     """
     Sufficient statistics of short runs of samples, shape (n,) and (n, 3).
-
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
     Dropped are samples that are not finite or whose stamp does not rise. `quantum` is their step,
     0 without one; `middle` that of words of 16 bits without a sign, or 0; rates are in rad/s.

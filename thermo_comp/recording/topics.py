@@ -75,7 +75,6 @@ WHOLE = Part()  # all of a bag
 class Topics:
     """
     Where the inputs stand in a bag, and which part of it is read.
-
     A name matches with or without its leading slash and, where only one topic fits, with any
     namespace in front. Where a usual name is not there, the bag's only topic of the type is taken.
     Further thermometers are found beside the board's, ``temperature/<name>``, or named.

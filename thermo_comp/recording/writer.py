@@ -257,7 +257,6 @@ def table_writer(
 ) -> Iterator[WriteRows]:
     """
     Write a table, by its suffix one of `TABLES`; it takes its name when the block ends well.
-
     Yields what takes columns by name, shape (n,) each, the same ones every time; CSV has no place
     for the metadata. OutputError if it may not or cannot be written, or pyarrow is missing.
     """
