@@ -48,11 +48,6 @@ class FoundUnit:
     lot: str
     bags: Bags
 
-    @property
-    def n_bytes(self) -> int:
-        """Size of its bags."""
-        return sum(file.size for files in self.bags.values() for file in files)
-
 
 class Storage:
     """A folder here or at a URL like ``s3://bucket/bags``, of a known protocol."""

@@ -76,7 +76,7 @@ def _started_row(unit: FoundUnit, **known: Any) -> dict[str, Cell]:
         'serial': unit.name.rpartition('/')[2],
         'lot': unit.lot,
         'n_bags': len(unit.bags),
-        'n_bytes': unit.n_bytes,
+        'n_bytes': sum(file.size for files in unit.bags.values() for file in files),
         'tool_version': __version__,
     }
     return row_of(**(started | known))

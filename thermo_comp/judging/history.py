@@ -22,9 +22,8 @@ _SURE_SDS = 3.0
 @dataclass(frozen=True)
 class Epoch:
     """
-    One calibration of a history, in a soak at the reference temperature of the first.
-
-    Bias of x y z [ug], scale [ppm of the first one], shape (6,); an sd that nobody claims is NaN.
+    One calibration of a history, in a soak at the reference temperature of the first: bias of x y
+    z [ug], scale [ppm of the first one], shape (6,); an sd that nobody claims is NaN.
     """
 
     created: str
@@ -51,9 +50,8 @@ class Drift:
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
-    Put calibrations of the first one's unit in the order of their dates.
-
-    Of those that were fitted on the same bags the first counts: two models are no history.
+    Put calibrations of the first one's unit in the order of their dates; of those that were fitted
+    on the same bags the first counts: two models are no history.
     """
     known: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []

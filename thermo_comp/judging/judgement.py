@@ -120,9 +120,8 @@ def judge(
     is_seen: bool = False,
 ) -> Judgement:
     """
-    Judge a calibration by its windows; a `tolerance` on the RMS [m/s^2] decides where given.
-
-    Of windows that the fit has seen, what it left on positions left out stands for them.
+    Judge a calibration by its windows, those that its fit has seen by what it left on positions
+    left out; a `tolerance` on the RMS [m/s^2] decides where given.
     """
     if not len(windows):
         raise ValueError('`windows` must hold at least one')

@@ -116,9 +116,8 @@ def corrected_windows(
     window_s: float = WINDOW_S,
 ) -> Windows:
     """
-    Correct the windows of bags; RecordingError if the samples are too slow for such windows.
-
-    Without a calibration they stay as they are: static, inside any range, without a claim.
+    Correct the windows of bags, without a calibration not at all; RecordingError if the samples
+    are too slow for such windows.
     """
     table = _table(bags, calibration, window_s)
     raw, claimed_sd, noise_sd = table['mean'], *np.full((2, len(table)), np.nan)

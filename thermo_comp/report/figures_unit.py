@@ -39,11 +39,6 @@ _WAYS: dict[str, tuple[style.Line, str, str]] = {
     'heating': (style.DYNAMIC_LINE, '\\\\\\\\', '^'),
     'cooling': (style.AXIS_LINES[2], '....', 'v'),
 }
-_SECTION_LINES: dict[str, style.Line] = {
-    'raw': style.RUNG_LINES['raw'],
-    'static': style.STATIC_LINE,
-    'dynamic': style.DYNAMIC_LINE,
-}
 _POINT: style.Line = {'color': style.BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8}
 
 
@@ -263,9 +258,11 @@ def draw_shares(curves: Mapping[str, Floats]) -> Figure:
     axes = figure.subplots()
     drawn = {name: np.sort(values[values > 0.0]) for name, values in curves.items()}
     drawn = {name: values for name, values in drawn.items() if len(values)}
+    lines = {'raw': style.RUNG_LINES['raw'], 'static': style.STATIC_LINE}
     for name, values in drawn.items():
         share = np.arange(1, len(values) + 1) / len(values) * 100.0
-        axes.step(values, share, where='post', label=name, **_SECTION_LINES[name])
+        line = lines.get(name, style.DYNAMIC_LINE)
+        axes.step(values, share, where='post', label=name, **line)
     low = min((float(values[0]) for values in drawn.values()), default=1.0)
     high = max((float(values[-1]) for values in drawn.values()), default=1.0)
     style.log_axis(axes, low / 1.3, high * 1.3)

@@ -46,13 +46,14 @@ def _templates() -> Environment:
     made = Environment(
         loader=FileSystemLoader(Path(__file__).with_name('templates')),
         autoescape=True,
+        finalize=lambda value: '–' if value is None else value,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     made.filters |= {
         'number': number,
-        'cell': _cell,
+        'cell': lambda value: number(value) if isinstance(value, float) else value,
         'counted': counted,
         'spelt': spelt,
         'minus': minus,
@@ -63,12 +64,6 @@ def _templates() -> Environment:
         'css': _css_text,
     }
     return made
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return '–'
-    return number(value) if isinstance(value, float) else str(value)
 
 
 def utc(stamp_ns: int) -> dt.datetime:

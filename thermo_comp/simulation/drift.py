@@ -1,11 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the physics of the errors: bias and scale driven by the temperatures of physical parts.
-
-Each effect sits in the part where it arises. Deviations count from the still state in which the
-board's thermometer shows the reference temperature, so bias and scale there are the unit's
-constants.
+Owns the physics of the errors: each effect sits in the part where it arises, and counts from the
+still state in which the board's thermometer shows the reference temperature.
 """
 
 from __future__ import annotations
