@@ -22,6 +22,7 @@ import zstandard
 
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.online.compensator import Compensator
+from thermo_comp.online.segments import EVER_NS
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
@@ -124,7 +125,7 @@ def check_cdr(data: bytes) -> None:
     from thermo_comp.ros.relay import SampleConverter, read_temperature
 
     compensator = COMPENSATOR
-    compensator.reset()
+    compensator.jump_back(EVER_NS)
     compensator.push('board', 0, 20.0)
     converters = [SampleConverter(Vector3Stamped), SampleConverter(Imu, 'body')]
     at = n = 0
