@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import fcntl
 import gc
+import hashlib
 import json
 import logging
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -21,6 +23,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import FunctionType
 from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
@@ -224,32 +227,6 @@ def cli(program: Cli) -> Cli:
     return run
 
 
-@pytest.fixture(scope='session')
-def equal_fits_once() -> Iterator[None]:
-    """
-    Fit equal bags with equal options once: pages and examples have the same fit again and again.
-    """
-    from thermo_comp import fitting
-
-    known: dict[str, fitting.FitResult] = {}
-    fit = fitting.fit
-
-    def remembered(
-        sources: Sequence[fitting.FitSource], options: fitting.FitOptions, *progress: Any
-    ) -> fitting.FitResult:
-        hashes = [source.sha256 for source in sources]
-        key = repr((hashes, [source.name for source in sources], options))
-        if None in hashes or options.prior is not None:
-            return fit(sources, options, *progress)
-        if key not in known:
-            known[key] = fit(sources, options, *progress)
-        return known[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fitting, 'fit', remembered)
-        yield
-
-
 class Once(Protocol):
     """Make a folder once in a run of the tests, whichever worker asks for it first."""
 
@@ -275,3 +252,47 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
         return folder
 
     return get
+
+
+class _Pickler(pickle.Pickler):
+    """Leave out what reads the bags of a fit again: nobody does once it is fitted."""
+
+    def persistent_id(self, value: object) -> str | None:
+        is_local = isinstance(value, FunctionType) and '<' in value.__qualname__
+        return 'nothing' if is_local else None
+
+
+class _Unpickler(pickle.Unpickler):
+    def persistent_load(self, _: str) -> Callable[[], None]:
+        return lambda: None
+
+
+@pytest.fixture(scope='session')
+def equal_fits_once(once: Once) -> Iterator[None]:
+    """
+    Fit equal bags with equal options once: pages and examples have the same fit again and again.
+    """
+    from thermo_comp import fitting
+
+    fit = fitting.fit
+
+    def remembered(
+        sources: Sequence[fitting.FitSource], options: fitting.FitOptions, *progress: Any
+    ) -> fitting.FitResult:
+        hashes = [source.sha256 for source in sources]
+        key = repr((hashes, [source.name for source in sources], options))
+        if None in hashes or options.prior is not None:
+            return fit(sources, options, *progress)
+
+        def make(folder: Path) -> None:
+            with (folder / 'fit').open('wb') as file:
+                _Pickler(file).dump(fit(sources, options, *progress))
+
+        made = once(f'fit-{hashlib.sha256(key.encode()).hexdigest()[:16]}', make)
+        with (made / 'fit').open('rb') as file:
+            found: fitting.FitResult = _Unpickler(file).load()
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitting, 'fit', remembered)
+        yield
