@@ -11,9 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.convert.log import NO_STAMP
+from thermo_comp.convert.columns import ColumnMap, table_log
+from thermo_comp.convert.log import NO_STAMP, write_log
 from thermo_comp.convert.table import Format, Stamp, exact_ns, layout, read_parquet, read_text
 from thermo_comp.errors import RecordingError
+from thermo_comp.recording.reader import read_recording
+from thermo_comp.unit.schema import build
 
 ROWS_ALONE = Stamp(rate_hz=1.0)
 ROWS = [(1000, 0.5, -1.25), (1001, 0.25, 2e-3), (1003, -7.0, 1.5)]
@@ -174,3 +177,49 @@ class TestParquet:
         path.write_text('a,b\n')
         with pytest.raises(RecordingError, match='not a readable Parquet file'):
             read_parquet(path, ['a'], ROWS_ALONE)
+
+
+@pytest.mark.parametrize('suffix', ['csv', 'parquet'])
+@pytest.mark.parametrize('unit', ['s', 'ns'])
+def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> None:
+    """
+    WHY: an integer stamp of 2e10 s wrapped to 600 s, and 1e30 put all rows on one stamp.
+
+    WHAT: a row is in the bag at its own stamp, or it is left out and counted.
+    """
+    scale = 10**9 if unit == 's' else 1
+    good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]
+    bad = [-1, 2**31, 2 * 10**10, 2**62, 2**63] if unit == 's' else [-1, 2**31 * 10**9, 2**63]
+    rows = good + bad
+
+    def written(stamps: list[int]) -> Path:
+        path = tmp_path / f'log.{suffix}'
+        if suffix == 'csv':
+            path.write_text('\n'.join(['t,x,y,z', *(f'{at},5.66,5.66,5.66' for at in stamps)]))
+            return path
+        pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        kind = pa.int64() if min(stamps) < 0 else pa.uint64()
+        stored = [min(stamp, 2**62) if min(stamps) < 0 else stamp for stamp in stamps]
+        columns = {'t': pa.array(stored, kind), **dict.fromkeys('xyz', [5.66] * len(stamps))}
+        pq.write_table(pa.table(columns), path)
+        return path
+
+    chart = build(
+        ColumnMap,
+        {
+            'stamp': {'column': 't', 'unit': unit},
+            'accel': {'columns': ['x', 'y', 'z'], 'unit': 'm/s^2', 'output': 'imu'},
+        },
+    )
+    for stamps in (rows, good + bad[1:]):
+        report = write_log(table_log(written(stamps), chart), tmp_path / 'bag.mcap', force=True)
+        left_out = report.findings['out_of_range'].count + report.findings['non_numeric'].count
+        assert (report.messages['accel'], left_out) == (40, len(stamps) - 40)
+        bag = read_recording(tmp_path / 'bag.mcap', input='imu', require=('accel',))
+        found = bag.columns.accel_stamp_ns
+        assert found.tolist() == [stamp * scale for stamp in good]
+    with pytest.raises(RecordingError, match=r'before 1970 or after January 2038|holds numbers'):
+        write_log(table_log(written(bad[1:]), chart), tmp_path / 'none.mcap')
