@@ -315,7 +315,7 @@ TOLD = [
         'before 1970, after January 2038, beyond 64 bits; as CSV and Parquet',
         'those rows are left out and counted; refused where all are',
         'how many rows, and which lines',
-        'test_convert.py::test_stamps_that_ros_cannot_hold',
+        'test_convert_table.py::test_stamps_that_ros_cannot_hold',
     ),
     Told(
         'degenerate recordings',
