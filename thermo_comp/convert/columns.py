@@ -113,12 +113,10 @@ class ColumnMap:
     def __post_init__(self) -> None:
         if len({one.name for one in self.further}) < len(self.further):
             raise ValueError('`further` has two thermometers of one name')
-        thermometers = filter(None, (self.board, self.case, *self.further))
         given = [*self.accel.columns, *(self.gyro.columns if self.gyro else ())]
-        given += [one.column for one in thermometers]
-        for name in given:
-            if given.count(name) > 1:
-                raise ValueError(f'column {name!r} is given twice')
+        given += [one.column for one in (self.board, self.case, *self.further) if one]
+        if twice := {str(name) for name in given if given.count(name) > 1}:
+            raise ValueError(f'column {min(twice)!r} is given twice')
         if self.gyro is not None and self.accel.output == 'counts':
             raise ValueError('a gyro travels in an Imu message: accel output must be imu')
 

@@ -142,22 +142,14 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
         text = 'no temperature was recorded: the calibration holds at the temperature of the test'
         yield _advice('temperature', text)
         return
-    reference, n_used = windows.model.reference_temperature, windows.data.weight.sum()
     found = {id(bag): bag for bag, _ in windows.rests}.values()
     n_still = sum(one.count.sum() for bag in found for one in bag.intervals)
-    part = 1.0 - n_used * windows.typical_count / max(n_still, 1.0)
+    part = 1.0 - windows.data.weight.sum() * windows.typical_count / max(n_still, 1.0)
     if found and part > 0.1:
         yield _advice(
             'unmeasured',
             f'{100.0 * part:.0f} % of the time at rest lies before the first temperature of its '
             'bag and is left out: do the thermometers and the accelerometer share a clock?',
-        )
-    lowest, highest = float(windows.temperature.min()), float(windows.temperature.max())
-    if not lowest - ADVISED_SPAN_K < reference < highest + ADVISED_SPAN_K:
-        yield _advice(
-            'reference',
-            f'the board was at {lowest:.1f} .. {highest:.1f} degC, far from the reference of '
-            f'{reference:g}: see --reference-temperature; or are these no degC?',
         )
     span = float(np.ptp(windows.temperature))
     text = f'temperature span {span:.1f} degC'

@@ -161,10 +161,8 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
             numbers.append((np.full(n, len(rests)), np.full(n, bag)))
             rests.append((reduced, interval))
         if not rests or rests[-1][0] is not reduced:
-            raise FitError(
-                f'{reduced.source.name}: no temperature of the board is stamped before the end of '
-                'its last rest: do the thermometers and the accelerometer share a clock?'
-            )
+            said = 'no temperature of the board before the end of its last rest: two clocks?'
+            raise FitError(f'{reduced.source.name}: {said}')
     time, count, mean, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
     position, bag_of = (np.concatenate(part) for part in zip(*numbers, strict=True))
     k, m = len(columns), len(groups) + len(columns)

@@ -33,6 +33,8 @@ BLOCK_MESSAGES = 1 << 13
 LONGEST_PAUSE_NS = 3600 * 10**9  # what a longer jump of the stamps becomes [ns]
 #: More jumps are no clock; and so many days need a message every so many seconds.
 _MOST_JUMPS = 100
+# Of one clock are not so many readings that are stamped so far apart in the median [s].
+_FEWEST_READINGS, _APART_S = 10, 10.0
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 Done = TypeVar('Done')
@@ -324,6 +326,18 @@ def joined(blocks: Sequence[Block]) -> Block:
     )
 
 
+def clocks_apart(block: Block) -> str:
+    """Say which thermometer is stamped far from the samples that it came between."""
+    for name, one in block.temperatures.items():
+        inside = (one.after > 0) & (one.after < len(block))
+        stamp_ns, after = one.stamp_ns[inside], one.after[inside]
+        edges = block.accel_stamp_ns[after - 1], block.accel_stamp_ns[after]
+        apart_s = (stamp_ns - np.clip(stamp_ns, *edges)) * 1e-9
+        if len(apart_s) >= _FEWEST_READINGS and abs(middle := np.median(apart_s)) > _APART_S:
+            return f'{name} is stamped {middle:+.0f} s from the samples around it: two clocks?'
+    return ''
+
+
 def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Move stamps behind a jump, all by the same; RecordingError for stamps that are no clock.
@@ -351,16 +365,10 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
         n_jumps += int(np.count_nonzero(is_jump))
         n_messages += len(read)
         span_ns += int(np.sum(np.where(is_jump, LONGEST_PAUSE_NS, np.maximum(steps, 0))))
-        if n_jumps > _MOST_JUMPS:
-            raise RecordingError(
-                f'its stamps jump by more than an hour more than {_MOST_JUMPS} times', path
-            )
-        if span_ns > max(_SPARSE_NS, n_messages * _SPARSEST_NS):
-            raise RecordingError(
-                f'{n_messages} messages stamped over {span_ns * 1e-9 / 86400:.0f} days: '
-                'no recording of a thermal test',
-                path,
-            )
+        if n_jumps > _MOST_JUMPS or span_ns > max(_SPARSE_NS, n_messages * _SPARSEST_NS):
+            told = f'{n_messages} messages stamped over {span_ns / 86400e9:.0f} days, '
+            told += f'{n_jumps} jumps by more than an hour: no recording of a thermal test'
+            raise RecordingError(clocks_apart(block) or told, path)
         offsets = np.empty_like(moved)
         offsets[order] = moved
         parts = np.split(offsets, np.cumsum([len(one.after) for one in thermometers]))

@@ -127,6 +127,7 @@ def survey_recording(
     thermometers = {name: one for name, one in found if one is not None}
     findings = [
         (info.truncated, f'cut off: {info.truncated}'),
+        (reader.apart, 'a fit needs one clock for all'),
         (not n, _NO_SAMPLES),
         *((True, one) for one in thermal_findings(thermometers)),
         (n and not still, 'it never rests for 3 s: the fit works on positions at rest'),

@@ -76,6 +76,7 @@ class RecordingReader(ExitStack):
         self._part = topics.part
         #: Where the part that is read begins, since the bag's first sample [s]; known then.
         self.since_s = 0.0
+        self.apart = ''  # which thermometer has another clock, as far as is read
 
     def _open(self, path: Path) -> RecordingInfo:
         """Open the files; those that rosbag2 has compressed as a whole are expanded beside."""
@@ -136,10 +137,13 @@ class RecordingReader(ExitStack):
 
         n_read = dict.fromkeys(self.topics, 0)
         for block in columns.gathered(self._read(roles, {'cdr', 'ros1'}, decoded), n_messages):
+            self.apart = self.apart or columns.clocks_apart(block)
             for role in n_read:
                 n_read[role] += len(block.log_ns[role])
             if block.n_messages:
                 yield block
+        chosen = '; '.join(filter(None, (self.info.chosen, self.apart)))
+        self.info = replace(self.info, chosen=chosen or None)
         for role, topic in self.topics.items():
             loss = _loss(topic, n_read[role], self.info.topics[topic][1])
             if loss and loss not in (self.info.truncated or ''):
