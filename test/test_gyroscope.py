@@ -22,7 +22,7 @@ from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.snapshot import take_snapshot
 from thermo_comp.recording.columns import Block, ImuColumns, Readings
-from thermo_comp.simulation.campaign import plan
+from thermo_comp.simulation.campaign import parse_cyclogram, plan
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import arrays
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
@@ -116,7 +116,9 @@ def test_the_fit_tells_what_other_positions_see(fitted):
 
 
 def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
-    records = arrays(unit, plan('chamber-9', 2)[:2], 2, rate_hz=RATE_HZ)
+    program = parse_cyclogram('20 10min, 35@1.5 10min, 10@1.5 15min')
+    stations = [replace(one, program=program) for one in plan('chamber-9', 2)[:2]]
+    records = arrays(unit, stations, 2, rate_hz=RATE_HZ)
     options = replace(OPTIONS, groups=('curve', 'now', 'board'))
     with_rate = fit([source_of(one, unit.scale_factor) for one in records], options)
     silent = [np.zeros((len(one.counts), 3)) for one in records]
