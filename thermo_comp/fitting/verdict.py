@@ -196,12 +196,14 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             f'only {seen} was seen; errors in a ramp change sign with its direction, so record '
             f'{missing}, too',
         )
-    calm = float(np.mean(windows.weight <= 0.5))
-    if calm < 0.05:
+    calm = windows.weight <= 0.5
+    span = float(np.ptp(windows.temperature))
+    static = float(np.ptp(windows.temperature[calm])) if calm.any() else 0.0
+    if np.mean(calm) < 0.05 or static < 0.5 * span:
         yield _advice(
             'soak',
-            f'only {100.0 * calm:.0f} % of the windows are static: the soaks end before the unit '
-            'has settled; let some last several hours',
+            f'only {100.0 * np.mean(calm):.0f} % of the windows are static, over {static:.1f} of '
+            f'{span:.1f} K: the soaks end before the unit has settled; let some last for hours',
         )
 
 
