@@ -82,11 +82,8 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             'rest and was cut out',
         )
     if not any(interval.sample_sd.any() for bag in bags for interval in bag.intervals):
-        yield _advice(
-            'stuck',
-            'no sample at rest differs from the one before: a sensor that stands still, or is too '
-            'coarse to show its noise',
-        )
+        text = 'no sample at rest differs from the one before: does the sensor stand still?'
+        yield _advice('stuck', text)
     means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
     size = float(np.median(np.linalg.norm(means, axis=1)))
     if options.input == 'counts' and not all(bag.is_integer for bag in bags):
