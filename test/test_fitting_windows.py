@@ -12,7 +12,7 @@ from builders import ArrayBlock
 
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit_bags, reduce_bag
 from thermo_comp.fitting.options import sets_of
-from thermo_comp.fitting.reduction import ReducedBag
+from thermo_comp.fitting.reduction import Readings, ReducedBag
 from thermo_comp.fitting.windows import Model, ThermalWindows, thermal_windows
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset
@@ -144,6 +144,34 @@ def test_sets_and_start_states_by_hand(bags: list[ReducedBag]) -> None:
         if column.kind in ('board', 'neighbour') and column.power == 0:
             np.testing.assert_allclose(data.start[:, k], fades, atol=0.15)
         assert np.abs(data.start[-1, k]) <= np.abs(data.start[:, k]).max()
+
+
+@pytest.mark.parametrize('name', ['board', 'case'])
+@pytest.mark.parametrize('is_stuck', [False, True])
+def test_where_a_thermometer_is_lost_nothing_is_known(
+    bags: list[ReducedBag], name: str, is_stuck: bool
+) -> None:
+    # It falls silent in the first ramp, or says the same from then on, and comes back late in the
+    # second one.
+    bag, start, stop = bags[0], 900.0, 2200.0
+    readings = bag.temperatures[name]
+    age = (readings.stamp_ns - bag.start_ns) * 1e-9
+    lost = (age > start) & (age < stop)
+    if is_stuck:
+        value = np.where(lost, readings.value[np.argmax(lost)], readings.value)
+        readings = Readings(readings.stamp_ns, value)
+    else:
+        readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
+    told = replace(bag, temperatures={**bag.temperatures, name: readings})
+    windows = windows_of([told])
+    # Whoever stands still is found out when the other has moved.
+    seen_s = 600.0 if is_stuck else 120.0
+    assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
+    whole = windows_of([bag])
+    assert len(windows.data.time) > 0.4 * len(whole.data.time)
+    kept = np.isin(whole.data.time, windows.data.time) & (whole.data.time < start)
+    both = np.isin(windows.data.time, whole.data.time[kept])
+    np.testing.assert_array_equal(windows.data.columns[both], whole.data.columns[kept])
 
 
 def test_each_column_stands_without_the_others(bags: list[ReducedBag]) -> None:

@@ -261,8 +261,7 @@ def _triple(values: Floats) -> tuple[float, float, float]:
 def _column_range(column: Column, values: Floats) -> tuple[float, float]:
     if column.kind == 'even':
         return column.range
-    reach = _LINEAR_REACH ** {'square': 2, 'cube': 3}.get(column.kind, 1)
-    return _widened(values, reach, 0.01)
+    return _widened(values, _LINEAR_REACH**column.order, 0.01)
 
 
 def _widened(values: Floats, reach: float, margin: float) -> tuple[float, float]:

@@ -29,14 +29,13 @@ from .evidence import PositionReport, ResidualRow, position_reports, residual_ro
 from .gyroscope import RateRow, add_gyroscope
 from .learning import Learnt
 from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
-from .posterior import Regression
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
 from .sensors import learn_detector
 from .sources import FitSource
 from .start import position_means
 from .verdict import Finding, enforce
-from .windows import FEWEST_WINDOWS, SET, Model, ThermalWindows, thermal_windows
+from .windows import FEWEST_WINDOWS, Model, ThermalWindows, thermal_windows
 
 Progress = Callable[[float], None]
 
@@ -191,16 +190,13 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     tell(0.7)
     regression, learnt = regress(windows, start, up, options, tell)
     asks = has_case and known is None and options.detector is None
-    if asks and any(one.group == SET for one in learnt.worth):
+    if asks and learnt.has_sets:
         # Only the sets feel when the regime closes: with the case, or with the board too.
         others = thermal_windows(bags, replace(model, detector=replace(detector, closes='case')))
-        again = Regression(others.data, options.gravity, start.scale)
-        again.reweight(regression.weight)
-        evidence = learnt.posterior.log_evidence
-        if again.solve(learnt.posterior.state, learnt.prior).log_evidence > evidence:
-            again, found = regress(others, start, up, options, tell)
-            if found.posterior.log_evidence > evidence + _CLOSING_EARNED:
-                windows, regression, learnt = others, again, found
+        again, found = regress(others, start, up, options, tell)
+        gain = found.posterior.log_evidence - learnt.posterior.log_evidence
+        if gain > _CLOSING_EARNED:
+            windows, regression, learnt = others, again, found
     residuals, left_out = residual_rows(windows, regression, learnt)
     findings += verdict.judge_result(
         learnt.posterior.state.kappa * start.scale,

@@ -30,8 +30,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import GroupEvidence
-from .posterior import Posterior, Regression
+from .posterior import Absent, Posterior, Regression
 from .unknowns import Known, Prior, State
+from .windows import SET
 
 # Of the three weights of a column, what the data must tell under a wide prior to be asked.
 _SILENT = 0.05
@@ -41,14 +42,21 @@ _IDLE = 0.1
 _PATIENCE = 4
 # A round that moves no width by more than this part is the last.
 _SETTLED = 0.03
+# Of a unit with one kind of physics beside parts that lag, the columns of the others make a guess
+# among thousands that say the same of these bags and not of the next: one kind is asked for first.
+_KINDS = (('even',), ('product', 'mixed', 'square'), ('play',), (SET,))
+# Sets that gain so much of what the best kind does may be the best if they closed otherwise.
+_LIKE_SETS = 0.4
 # The memory is as short as it can be [s]: the longest lags of a bank and the curves over
 # temperature are almost one thing to bags that all begin at one temperature. Last come the
 # columns of the third order, which few units need.
 _REACHES_S = (2000.0, 4000.0, np.inf)
-# ... which is more than what a model that is almost right gains by a longer one.
-_LONGER_EARNED = 10.0
-# Widths that are tried for a column that takes no part, in parts of what it would begin with.
+# What more columns must gain in log evidence to be asked for; so many rounds are enough to say.
+_MORE_EARNED, _ROUNDS = 4.0, 8
+# Widths that are tried for columns that take no part, in parts of what they would begin with.
 _WIDTHS = 10.0 ** np.arange(-4.0, 1.01, 0.25)
+# Powers of ten of the walk's share that are tried first.
+_WALKS = (-6.0, -4.0, -2.0)
 # What must be gained in log evidence to stay: of the many columns few are needed.
 _EARNED = 3.0
 # No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
@@ -65,12 +73,16 @@ _NEIGHBOURS = 3
 
 @dataclass(frozen=True)
 class Learnt:
-    """Mode under the prior that the data chose; `claim` leaves open what nobody has seen."""
+    """
+    Mode under the prior that the data chose; `claim` leaves open what nobody has seen; whether it
+    `has_sets`, or would if they closed otherwise.
+    """
 
     posterior: Posterior
     prior: Prior
     worth: tuple[GroupEvidence, ...]
     claim: Posterior
+    has_sets: bool
 
 
 def learn(
@@ -103,20 +115,37 @@ def learn(
         silent = prior.widths > 0.0
     silent[1] |= held
     settle = partial(_settle, regression, silent=silent, kept=kept)
-    for reach in _REACHES_S if asks else (np.inf,):
-        prior = _without(allowed, (regression.windows.reach > reach) & ~kept)
-        # Before knocks have lost their weight nothing may leave: beside them nothing is seen.
-        posterior, prior = settle(state, prior, rounds=_PATIENCE)
-        _downweight(regression, posterior)
-        posterior, prior = settle(posterior.state, prior)
-        tell(0.4)
-        _downweight(regression, posterior)
-        if walks:
+    groups, reach = regression.windows.groups, regression.windows.reach
+    alone = [np.isin(groups, names) & (reach <= _REACHES_S[0]) for names in _KINDS]
+    # A curve of the dynamic set beside that of the static one comes last of all: where no soak
+    # was static, bags do not tell which of the two is which.
+    rest = [(reach <= one) & ~alone[-1] for one in _REACHES_S] + [np.ones(len(groups), dtype=bool)]
+    asked = rest[0] & ~np.any(alone, axis=0) if asks else np.ones_like(rest[0])
+    prior = _without(allowed, ~asked & ~kept)
+    posterior = regression.solve(state, prior)
+    prior = replace(prior, sigma=_sigma(posterior, prior))
+    for k, more in enumerate((alone, *([one] for one in rest))):
+        absent = regression.ask_absent(posterior.state, prior, allowed)
+        gains = [gain_of(absent, allowed, one & ~asked) for one in more]
+        if k == 0:
+            has_sets = gains[-1] > max(_MORE_EARNED, _LIKE_SETS * max(gains))
+        if is_more := max(gains) > _MORE_EARNED:
+            asked = asked | more[int(np.argmax(gains))]
+        if is_more or k == 0:
+            prior = _without(allowed, ~asked & ~kept)
+            # Before knocks have lost their weight nothing may leave: beside them nothing is seen.
+            posterior, prior = settle(state, prior, rounds=_PATIENCE)
+            _downweight(regression, posterior)
+            posterior, prior = settle(posterior.state, prior, rounds=_ROUNDS)
+        if walks and (k == 1 or (is_more and k > 1)):
+            # A walk takes what a missing column leaves: it comes where there are columns enough.
             prior = _walk(regression, posterior, prior)
-        posterior, prior = settle(posterior.state, prior)
-        tell(0.7)
-        if not asks or _longer_gain(regression, posterior, prior, allowed, reach) < _LONGER_EARNED:
-            break
+            posterior, prior = settle(posterior.state, prior, rounds=_ROUNDS)
+        tell(0.16 * (k + 1))
+    posterior, prior = settle(posterior.state, prior)
+    _downweight(regression, posterior)
+    posterior, prior = settle(posterior.state, prior)
+    tell(0.85)
     if knowns:
         tried = [
             regression.solve(posterior.state, replace(prior, known=one), n_steps=3)
@@ -137,7 +166,9 @@ def learn(
         wider = _left_open(regression, posterior, prior, allowed)
         claim = regression.solve(posterior.state, wider, n_steps=1)
     tell(1.0)
-    return Learnt(posterior, prior, group_worth(regression, posterior, prior), claim)
+    worth = group_worth(regression, posterior, prior)
+    has_sets |= any(one.group == SET for one in worth)
+    return Learnt(posterior, prior, worth, claim, has_sets)
 
 
 def told_of(posterior: Posterior) -> Floats:
@@ -195,23 +226,19 @@ def _without(prior: Prior, gone: Bools) -> Prior:
     return replace(prior, widths=np.where(gone, 0.0, prior.widths))
 
 
-def _longer_gain(
-    regression: Regression, posterior: Posterior, prior: Prior, allowed: Prior, reach: float
-) -> float:
+def gain_of(absent: Absent, allowed: Prior, columns: Bools) -> float:
     """
-    Return the most that one column of a longer memory would add to the log evidence.
+    Return what columns that take no part would add to the log evidence, all of one width.
 
-    With S and q of its weights, and their width at its best, it adds ``sum(q^2 / (1 / sd^2 + S) -
-    log(1 + S sd^2)) / 2``.
+    With S and q of their weights, in units of this, ``q (1 + S)^-1 q / 2 - log det(1 + S) / 2``.
     """
-    longer = regression.windows.reach > reach
-    S, q = (
-        one[..., longer] for one in regression.asked_of_absent(posterior.state, prior, allowed)
-    )
-    width = _WIDTHS[:, None, None, None] * allowed.widths[:, None, longer]
-    with np.errstate(divide='ignore'):
-        gain = q**2 / (1.0 / width**2 + S) - np.log1p(S * width**2)
-    return 0.5 * float(gain.sum(axis=2).max(initial=0.0))
+    wanted = (absent.places >= 0) & columns & (allowed.widths[:, None] > 0.0)
+    at = absent.places[wanted]
+    width = np.broadcast_to(allowed.widths[:, None], wanted.shape)[wanted]
+    S, along = np.linalg.eigh(absent.information[np.ix_(at, at)] * np.outer(width, width))
+    square = _WIDTHS[:, None] ** 2
+    S, q2 = square * np.maximum(S, 0.0), square * (along.T @ (width * absent.pull[at])) ** 2
+    return 0.5 * float((q2 / (1.0 + S) - np.log1p(S)).sum(axis=1).max(initial=0.0))
 
 
 def _idle(regression: Regression, posterior: Posterior, prior: Prior, kept: Bools) -> Bools:
@@ -247,7 +274,8 @@ def _left_open(
     they say of it beside the columns that stayed. Where that is more than some sds of a window's
     noise the covariance has it back, with this width; its weight stays 0, the likeliest.
     """
-    S = regression.asked_of_absent(posterior.state, prior, allowed)[0].mean(axis=1)
+    absent = regression.ask_absent(posterior.state, prior, allowed)
+    S = np.append(np.diag(absent.information), 0.0)[absent.places].mean(axis=1)
     sd = np.minimum(1.0 / np.sqrt(np.maximum(S, 1e-300)), allowed.widths)
     matters = (prior.widths == 0.0) & (allowed.widths > 0.0)
     matters &= sd > _OPEN * float(np.mean(prior.sigma)) * _units(regression)
@@ -370,16 +398,14 @@ def _walk(regression: Regression, posterior: Posterior, prior: Prior) -> Prior:
             found = replace(found, sigma=_sigma(left, found))
             return regression.solve(posterior.state, found, n_steps=1).log_evidence, found
 
-        grid, none = 10.0 ** np.arange(-7.0, -0.9, 1.0), evidence(0.0)[0]
-        values = [evidence(float(value))[0] for value in grid]
-        best = int(np.argmax(values))
+        none, tried = evidence(0.0)[0], {one: evidence(10.0**one)[0] for one in _WALKS}
+        best = max(tried, key=tried.__getitem__)
         rho[axis] = 0.0
         # Less than this is what a walk that is not there gains by chance.
-        if values[best] > none + 2.0:
-            around = np.clip(best + np.array([-1, 0, 1]), 0, len(grid) - 1)
-            low, top, high = (values[k] for k in around)
-            bend = low - 2.0 * top + high
-            move = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
-            rho[axis] = grid[best] * 10.0 ** float(np.clip(move, -0.5, 0.5))
+        if tried[best] > none + 2.0:
+            low, high = (evidence(10.0 ** (best + one))[0] for one in (-1.0, 1.0))
+            bend = low - 2.0 * tried[best] + high
+            move = 0.5 * (low - high) / bend if bend < 0.0 else np.sign(high - low)
+            rho[axis] = 10.0 ** (best + float(np.clip(move, -1.0, 1.0)))
         prior = evidence(float(rho[axis]))[1]
     return prior

@@ -115,6 +115,21 @@ class Posterior:
 
 
 @dataclass(frozen=True)
+class Absent:
+    """
+    What the data say of weights that take no part, beside all that does.
+
+    information: on these weights, shape (k, k)
+    pull: towards which they would go, shape (k,)
+    places: which of them each column's is; -1 where it takes part, shape (2, 3, m)
+    """
+
+    information: Floats
+    pull: Floats
+    places: Ints
+
+
+@dataclass(frozen=True)
 class _Equations:
     """Of one linearisation: Hessian, gradient, whitened residuals, minus twice log likelihood."""
 
@@ -206,13 +221,8 @@ class Regression(Design):
         )
         return other, G, g
 
-    def asked_of_absent(self, state: State, prior: Prior, allowed: Prior) -> tuple[Floats, Floats]:
-        """
-        Ask the data for columns that take no part, each alone beside those that do.
-
-        `state`: the mode under `prior`. Returns S and q, shape (2, 3, m): the data's information
-        on each weight, and its pull on it; 0 for columns that take part.
-        """
+    def ask_absent(self, state: State, prior: Prior, allowed: Prior) -> Absent:
+        """Ask the data for columns that take no part; `state` is the mode under `prior`."""
         everything = replace(prior, widths=np.maximum(prior.widths, allowed.widths))
         layout = self.layout(everything.widths > 0.0)
         equations = self._equations(state, everything, layout)
@@ -222,7 +232,7 @@ class Regression(Design):
         absent, present = np.flatnonzero(is_absent), np.flatnonzero(~is_absent)
         away = self.vector(state, layout) - self.prior_mean(everything, layout)
         gradient = equations.gradient - precision * away
-        information = np.diag(hessian).copy()
+        information = hessian[np.ix_(absent, absent)]
         hessian[np.diag_indices(layout.n)] += precision
         for where, matrix in self._inform(prior, layout):
             hessian[where, where] += matrix
@@ -232,11 +242,11 @@ class Regression(Design):
         factor = cho_factor(kept / np.outer(root, root) + _JITTER * np.eye(len(root)))
         cross = hessian[np.ix_(present, absent)] / root[:, None]
         solved = cho_solve(factor, cross)
-        told, pull = np.zeros((2, layout.n + 1))
-        told[absent] = np.maximum(information[absent] - np.sum(cross * solved, axis=0), 0.0)
         # A mode is one to some digits: columns that are almost others' sums would feel the rest.
-        pull[absent] = gradient[absent] - solved.T @ (gradient[present] / root)
-        return told[places], pull[places]
+        pull = gradient[absent] - solved.T @ (gradient[present] / root)
+        number = np.full(layout.n + 1, -1)
+        number[absent] = np.arange(len(absent))
+        return Absent(information - cross.T @ solved, pull, number[places])
 
     def without(self, posterior: Posterior, prior: Prior, p: int) -> State | None:
         """

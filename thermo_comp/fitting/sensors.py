@@ -189,17 +189,26 @@ def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str,
 
 def thermal_states(
     bag: ReducedBag, tracker: ThermalTracker, step_s: float
-) -> tuple[float, Floats]:
-    """Sample a tracker on a grid, shape (n, width); say when that begins in the bag [s], too."""
+) -> tuple[float, Floats, Bools]:
+    """
+    Sample a tracker on a grid: when it begins in the bag [s], states, shape (n, width), and
+    whether every thermometer was heard and believed of late, shape (n,).
+    """
     readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
     reading = next(readings, None)
     step_ns = round(step_s * 1e9)
     begin = max(int(bag.board.stamp_ns[0]), bag.start_ns)
-    rows = []
+    rows, is_heard = [], []
+    board, *others = tracker.thermometers.values()
+    limit_s, other_limit_s = tracker.config.temperature_timeout_s, tracker.config.case_timeout_s
     for stamp_ns in range(begin, max(bag.end_ns, begin) + step_ns, step_ns):
         # Readings up to and including a grid stamp come first, as they do online.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)
         rows.append(tracker.sample(stamp_ns))
-    return (begin - bag.start_ns) * 1e-9, np.array(rows)
+        is_heard.append(
+            board.beyond(stamp_ns) <= limit_s
+            and all(one.beyond(stamp_ns) <= other_limit_s for one in others)
+        )
+    return (begin - bag.start_ns) * 1e-9, np.array(rows), np.array(is_heard)

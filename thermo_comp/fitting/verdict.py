@@ -145,8 +145,8 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
     if found and part > 0.1:
         yield _advice(
             'unmeasured',
-            f'{100.0 * part:.0f} % of the time at rest lies before the first temperature of its '
-            'bag and is left out: do the thermometers and the accelerometer share a clock?',
+            f'{100.0 * part:.0f} % of the time at rest has no temperatures and is left out: do '
+            'the thermometers and the accelerometer share a clock?',
         )
     span = float(np.ptp(windows.temperature))
     text = f'temperature span {span:.1f} degC'

@@ -19,7 +19,7 @@ from ..thermal.memory import MemorySpec, memory_on_grid, start_covariance
 from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Layout
 from ..thermal.tracker import ThermalTracker
-from ..typing import Floats, Ints
+from ..typing import Bools, Floats, Ints
 from ..unit.columns import Column, ColumnTable, memory_of
 from ..unit.functions import TemperatureFunction
 from .reduction import ReducedBag, StillInterval
@@ -126,8 +126,9 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     """
     Join the windows of all bags with the columns of their thermal state.
 
-    Windows before the board's first reading, or while its estimate is still settling, are left
-    out. A bag without any temperature stands at the reference, where no column says anything.
+    Windows before the board's first reading, while its estimate is still settling, and where a
+    thermometer is lost are left out. A bag without any temperature stands at the reference, where
+    no column says anything.
     """
     sets, columns, reference = model.sets, model.columns, model.reference_temperature
     spec = memory_of(columns, model.sensors)
@@ -138,9 +139,9 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     rests: list[tuple[ReducedBag, StillInterval]] = []
     has_rate = all(one.angular_rate is not None for bag in bags for one in bag.intervals)
     for bag, reduced in enumerate(bags):
-        begin, grid, states = _states(reduced, spec, model)
+        grid, states, is_known = _states(reduced, spec, model)
         for interval in reduced.intervals:
-            use = interval.time >= begin
+            use = np.interp(interval.time, grid, is_known, left=0.0) == 1.0
             if not use.any():
                 continue
             time, count = interval.time[use], interval.count[use]
@@ -161,7 +162,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
             numbers.append((np.full(n, len(rests)), np.full(n, bag)))
             rests.append((reduced, interval))
         if not rests or rests[-1][0] is not reduced:
-            said = 'no temperature of the board before the end of its last rest: two clocks?'
+            said = 'no temperatures while it rests: two clocks?'
             raise FitError(f'{reduced.source.name}: {said}')
     time, count, mean, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
     position, bag_of = (np.concatenate(part) for part in zip(*numbers, strict=True))
@@ -201,20 +202,20 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     )
 
 
-def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[float, Floats, Floats]:
-    """Run the tracker: where its estimate has settled, grid from its first reading, states."""
+def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[Floats, Floats, Bools]:
+    """Run the tracker: grid from its first reading, states, where they are known."""
     if not len(bag.board.value):
         # Nothing is known: a unit that has always been at the reference.
         still = np.zeros((2, Layout(spec).width))
         still[:, BOARD] = model.reference_temperature
         ends: Floats = np.array([-_EVER_S, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
-        return -1.0, ends, still
+        return ends, still, np.ones(2, dtype=bool)
     tracker = ThermalTracker(model.detector, MemorySpec(spec.sensors), ThermalConfig())
     shortest = min(
         (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1), default=1.0
     )
     step_s = max(shortest / 5.0, 0.1)
-    start_s, states = thermal_states(bag, tracker, step_s)
+    start_s, states, is_known = thermal_states(bag, tracker, step_s)
     grid = np.asarray(start_s + step_s * np.arange(len(states)), dtype=np.float64)
     # The memory is the tracker's, on the grid at once: reading by reading it takes longer than all
     # the rest of a fit.
@@ -222,7 +223,8 @@ def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[float, Flo
     memory = memory_on_grid(spec, step_s, states[:, BOARD], gradients)
     states = np.hstack((states, memory))
     settled = states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])
-    return float(grid[int(np.argmax(settled))]), grid, states
+    is_known[: int(np.argmax(settled))] = False
+    return grid, states, is_known
 
 
 def _moved(table: ColumnTable, slopes: Floats, age_s: Floats) -> Floats:

@@ -113,10 +113,14 @@ class Column:
         return (BOARD_INPUT, self.tau_s) if self.tau_s and self.kind != 'even' else None
 
     @property
+    def order(self) -> int:
+        """Which power of the temperatures the value grows with, before t multiplies it."""
+        return {'square': 2, 'cube': 3}.get(self.kind, 1)
+
+    @property
     def reach_s(self) -> float:
         """How long a memory asks for the column [s]: for one of the third order, the longest."""
-        order = {'board': 1, 'square': 2, 'cube': 3}.get(self.kind, 0) + self.power
-        return math.inf if self.lag and order > 2 else self.tau_s
+        return math.inf if self.lag and self.order + self.power > 2 else self.tau_s
 
 
 def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
