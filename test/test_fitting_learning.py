@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fitting_truth import GROUPS, MICRO, Truth, begin, prior_of, table_of, widths
 
-from thermo_comp.fitting.learning import Learnt, _downweight, _without, gain_of, group_worth, learn
+from thermo_comp.fitting.learning import Learnt, _downweight, _without, group_worth, learn
 from thermo_comp.fitting.posterior import Regression
 from thermo_comp.fitting.unknowns import Known, Prior
 from thermo_comp.fitting.windows import SET
@@ -244,7 +244,7 @@ def test_a_longer_memory_promises_what_it_brings() -> None:
     assert (short.widths[0] > 0.0).tolist() == [True, True, True, False, False, False]
     posterior = regression.solve(state, short, n_steps=12, tolerance=1e-9)
     absent = regression.ask_absent(posterior.state, short, allowed)
-    promised = gain_of(absent, allowed, windows.reach > 2000.0)
+    promised = absent.gain(allowed.widths, windows.reach > 2000.0)
 
     def gain(part: float) -> float:
         longer = np.where(windows.reach > 2000.0, part * allowed.widths, short.widths)
@@ -263,7 +263,7 @@ def test_a_longer_memory_promises_what_it_brings() -> None:
     regression, state = begin(windows, up)
     posterior = regression.solve(state, short, n_steps=12, tolerance=1e-9)
     absent = regression.ask_absent(posterior.state, short, allowed)
-    assert gain_of(absent, allowed, windows.reach > 2000.0) < 3.0
+    assert absent.gain(allowed.widths, windows.reach > 2000.0) < 3.0
 
 
 @pytest.mark.parametrize(('start_sd', 'lower', 'upper'), [(0.0, 0.0, 0.15), (1.0, 0.8, 1.0)])

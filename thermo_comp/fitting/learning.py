@@ -30,7 +30,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import GroupEvidence
-from .posterior import Absent, Posterior, Regression
+from .posterior import Posterior, Regression
 from .unknowns import Known, Prior, State
 from .windows import SET
 
@@ -53,8 +53,6 @@ _LIKE_SETS = 0.4
 _REACHES_S = (2000.0, 4000.0, np.inf)
 # What more columns must gain in log evidence to be asked for; so many rounds are enough to say.
 _MORE_EARNED, _ROUNDS = 4.0, 8
-# Widths that are tried for columns that take no part, in parts of what they would begin with.
-_WIDTHS = 10.0 ** np.arange(-4.0, 1.01, 0.25)
 # Powers of ten of the walk's share that are tried first.
 _WALKS = (-6.0, -4.0, -2.0)
 # What must be gained in log evidence to stay: of the many columns few are needed.
@@ -126,7 +124,7 @@ def learn(
     prior = replace(prior, sigma=_sigma(posterior, prior))
     for k, more in enumerate((alone, *([one] for one in rest))):
         absent = regression.ask_absent(posterior.state, prior, allowed)
-        gains = [gain_of(absent, allowed, one & ~asked) for one in more]
+        gains = [absent.gain(allowed.widths, one & ~asked) for one in more]
         if k == 0:
             has_sets = gains[-1] > max(_MORE_EARNED, _LIKE_SETS * max(gains))
         if is_more := max(gains) > _MORE_EARNED:
@@ -224,21 +222,6 @@ def group_worth(
 def _without(prior: Prior, gone: Bools) -> Prior:
     """Leave out columns, of bias and scale or of both, shape (2, m) or (m,)."""
     return replace(prior, widths=np.where(gone, 0.0, prior.widths))
-
-
-def gain_of(absent: Absent, allowed: Prior, columns: Bools) -> float:
-    """
-    Return what columns that take no part would add to the log evidence, all of one width.
-
-    With S and q of their weights, in units of this, ``q (1 + S)^-1 q / 2 - log det(1 + S) / 2``.
-    """
-    wanted = (absent.places >= 0) & columns & (allowed.widths[:, None] > 0.0)
-    at = absent.places[wanted]
-    width = np.broadcast_to(allowed.widths[:, None], wanted.shape)[wanted]
-    S, along = np.linalg.eigh(absent.information[np.ix_(at, at)] * np.outer(width, width))
-    square = _WIDTHS[:, None] ** 2
-    S, q2 = square * np.maximum(S, 0.0), square * (along.T @ (width * absent.pull[at])) ** 2
-    return 0.5 * float((q2 / (1.0 + S) - np.log1p(S)).sum(axis=1).max(initial=0.0))
 
 
 def _idle(regression: Regression, posterior: Posterior, prior: Prior, kept: Bools) -> Bools:

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from ..typing import Floats, Ints
+from ..typing import Bools, Floats, Ints
 from .design import Design
 from .unknowns import Layout, Prior, State
 
@@ -42,6 +42,8 @@ _FAR = 0.1
 # ... of no more than so many. One that overshoots is tried again, up to so many times, with bias
 # and scale [g], attitudes [rad] and starts [K] held where they are, at first to these sds.
 _MOST_STEPS, _MOST_TRIES, _BENDS, _BENDS_K = 6, 6, 1e-3, 0.1
+# Parts of their widths in which columns that take no part are tried.
+_PARTS = 10.0 ** np.arange(-4.0, 1.01, 0.25)
 _SKEW_ROWS = ((1, 0), (2, 0), (2, 1))
 
 
@@ -127,6 +129,20 @@ class Absent:
     information: Floats
     pull: Floats
     places: Ints
+
+    def gain(self, widths: Floats, columns: Bools) -> float:
+        """
+        Return what some columns would add to the log evidence, their widths in one part of these.
+
+        With S and q of their weights in units of the widths, ``q (1 + S)^-1 q / 2 - log det(1 + S)
+        / 2``; `widths` has the shape (2, m), `columns` (m,).
+        """
+        wanted = (self.places >= 0) & columns
+        at, width = self.places[wanted], np.broadcast_to(widths[:, None], wanted.shape)[wanted]
+        S, along = np.linalg.eigh(self.information[np.ix_(at, at)] * np.outer(width, width))
+        square = _PARTS[:, None] ** 2
+        S, q2 = square * np.maximum(S, 0.0), square * (along.T @ (width * self.pull[at])) ** 2
+        return 0.5 * float((q2 / (1.0 + S) - np.log1p(S)).sum(axis=1).max(initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -340,6 +356,8 @@ class Regression(Design):
                 if found[-1] < size or promised < far:
                     break
                 damping = max(10.0 * damping, 1.0)
+            else:
+                break
             damping = 0.01 * damping if damping > 0.1 else 0.0
             state, equations, gradient, size = found
         determinant = float(np.log(precision[precision > 0.0]).sum())
