@@ -24,7 +24,7 @@ from .verdict import POSITIONS_NEEDED
 from .windows import CURVE, SET, ThermalWindows
 
 # Widths that columns begin with and silent ones keep: what a cheap sensor does over a chamber.
-_COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
+COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
 # What temperature does to a unit that no thermometer has seen, per K: a cheap sensor's data sheet.
 _UNSEEN_SLOPES = 5e-3, 2e-4
 # A mounting begins with this much of a bias of its own, and the noise with this [m/s^2].
@@ -101,7 +101,7 @@ def _wide_prior(
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
     # What a sensor does, its curve does first: the others begin as those of a good one.
     is_curve = np.array([group == CURVE for group in groups])
-    wide = np.where(is_curve, max(1.0, drift / _COLUMN_BIAS_SD), 1.0)
+    wide = np.where(is_curve, max(1.0, drift / COLUMN_BIAS_SD), 1.0)
     scale_wide = wide
     if len(distinct_directions(up)) == 1:
         # One attitude does not tell it from the bias: its curve stays at its prior.
@@ -113,7 +113,7 @@ def _wide_prior(
     if options.model == 'golovach':
         # The paper's sets stay whatever they earn: their prior says nothing.
         wide, scale_wide = 50.0 * wide, 50.0 * scale_wide
-    widths = np.stack((allowed * wide * _COLUMN_BIAS_SD, in_scale * scale_wide * _COLUMN_SCALE_SD))
+    widths = np.stack((allowed * wide * COLUMN_BIAS_SD, in_scale * scale_wide * _COLUMN_SCALE_SD))
     if not windows.was_measured:
         widths[:, 0] = _UNSEEN_SLOPES
     return Prior(

@@ -23,19 +23,20 @@ from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
 from . import verdict
 from .assembly import build_calibration
-from .beginning import first_guess, regress
+from .beginning import COLUMN_BIAS_SD, first_guess, regress
 from .coverage import LeastKnown, least_known, rough_centre
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .learning import Learnt
 from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
+from .posterior import Regression
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
 from .sensors import learn_detector
 from .sources import FitSource
 from .start import position_means
 from .verdict import Finding, enforce
-from .windows import FEWEST_WINDOWS, Model, ThermalWindows, thermal_windows
+from .windows import FEWEST_WINDOWS, SET, Model, ThermalWindows, thermal_windows
 
 Progress = Callable[[float], None]
 
@@ -193,10 +194,16 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     if asks and learnt.has_sets:
         # Only the sets feel when the regime closes: with the case, or with the board too.
         others = thermal_windows(bags, replace(model, detector=replace(detector, closes='case')))
-        again, found = regress(others, start, up, options, tell)
-        gain = found.posterior.log_evidence - learnt.posterior.log_evidence
-        if gain > _CLOSING_EARNED:
-            windows, regression, learnt = others, again, found
+        again = Regression(others.data, options.gravity, start.scale)
+        again.reweight(regression.weight)
+        with_sets = learnt.prior.widths.copy()
+        with_sets[0, np.array(others.data.groups) == SET] += COLUMN_BIAS_SD
+        prior, state = replace(learnt.prior, widths=with_sets), learnt.posterior.state
+        now, then = (one.solve(state, prior).log_evidence for one in (regression, again))
+        if then > now + _CLOSING_EARNED:
+            again, found = regress(others, start, up, options, tell)
+            if found.posterior.log_evidence > learnt.posterior.log_evidence + _CLOSING_EARNED:
+                windows, regression, learnt = others, again, found
     residuals, left_out = residual_rows(windows, regression, learnt)
     findings += verdict.judge_result(
         learnt.posterior.state.kappa * start.scale,

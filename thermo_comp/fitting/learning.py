@@ -71,10 +71,7 @@ _NEIGHBOURS = 3
 
 @dataclass(frozen=True)
 class Learnt:
-    """
-    Mode under the prior that the data chose; `claim` leaves open what nobody has seen; whether it
-    `has_sets`, or would if they closed otherwise.
-    """
+    """Mode, prior; `claim` has the unseen open; `has_sets`, or might if they closed otherwise."""
 
     posterior: Posterior
     prior: Prior

@@ -132,10 +132,8 @@ class Absent:
 
     def gain(self, widths: Floats, columns: Bools) -> float:
         """
-        Return what some columns would add to the log evidence, their widths in one part of these.
-
-        With S and q of their weights in units of the widths, ``q (1 + S)^-1 q / 2 - log det(1 + S)
-        / 2``; `widths` has the shape (2, m), `columns` (m,).
+        Return what columns, shape (m,), would add to the log evidence in one part of their widths:
+        ``(q (1 + S)^-1 q - log det(1 + S)) / 2`` with S and q in units of these.
         """
         wanted = (self.places >= 0) & columns
         at, width = self.places[wanted], np.broadcast_to(widths[:, None], wanted.shape)[wanted]
@@ -325,7 +323,6 @@ class Regression(Design):
             information[where, where] += matrix
 
         def look(state: State) -> tuple[State, _Equations, Floats, float]:
-            """Give a state, its equations, the gradient, and what is to be smallest."""
             equations = self._equations(state, prior, layout)
             away = self.vector(state, layout) - mean
             pull = information @ away

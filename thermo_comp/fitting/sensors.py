@@ -190,10 +190,7 @@ def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str,
 def thermal_states(
     bag: ReducedBag, tracker: ThermalTracker, step_s: float
 ) -> tuple[float, Floats, Bools]:
-    """
-    Sample a tracker on a grid: when it begins in the bag [s], states, shape (n, width), and
-    whether every thermometer was heard and believed of late, shape (n,).
-    """
+    """Sample a tracker: where the grid begins [s], states, which of them rest on readings."""
     readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
     reading = next(readings, None)
     step_ns = round(step_s * 1e9)
