@@ -164,7 +164,8 @@ def test_where_a_thermometer_is_lost_nothing_is_known(
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     told = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([told])
-    # Whoever stands still is found out when the other has moved.
+    # Silence: the time-out of 60 s, five intervals of 4 s, and a window. Whoever stands still is
+    # found out when the other has moved.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])

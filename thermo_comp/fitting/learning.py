@@ -71,7 +71,7 @@ _NEIGHBOURS = 3
 
 @dataclass(frozen=True)
 class Learnt:
-    """Mode, prior; `claim` has the unseen open; `has_sets`, or might if they closed otherwise."""
+    """What the data chose; `claim` leaves open what nobody saw; `has_sets`: or `_LIKE_SETS`."""
 
     posterior: Posterior
     prior: Prior
@@ -119,9 +119,11 @@ def learn(
     prior = _without(allowed, ~asked & ~kept)
     posterior = regression.solve(state, prior)
     prior = replace(prior, sigma=_sigma(posterior, prior))
-    for k, more in enumerate((alone, *([one] for one in rest))):
-        absent = regression.ask_absent(posterior.state, prior, allowed)
-        gains = [absent.gain(allowed.widths, one & ~asked) for one in more]
+    for k, more in enumerate((alone, *([one] for one in rest)) if asks else (alone, alone)):
+        gains = [0.0]
+        if asks:
+            absent = regression.ask_absent(posterior.state, prior, allowed)
+            gains = [absent.gain(allowed.widths, one & ~asked) for one in more]
         if k == 0:
             has_sets = gains[-1] > max(_MORE_EARNED, _LIKE_SETS * max(gains))
         if is_more := max(gains) > _MORE_EARNED:
