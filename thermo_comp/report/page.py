@@ -259,7 +259,8 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             'rate and the turn-on blur.',
             '' if judged is None else f'Judged on these bags, {judged}.',
         )
-    if any(term.lag for term in calibration.response):
+    moved = (one for one in calibration.response if any((*one.bias, *one.scale)))
+    if any(one.lag and not one.is_of_sensor for one in moved):
         yield (
             'For how long does the unit remember a change of temperature?',
             of_unit.draw_step,
