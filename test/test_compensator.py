@@ -27,7 +27,6 @@ from hypothesis import strategies as st
 
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
-from thermo_comp.online.snapshot import take_snapshot
 from thermo_comp.unit.calibration import Axes, AxisReference
 
 UNIQUE = [0, 1, 2, 4, 5, 8]
@@ -255,7 +254,7 @@ def test_beyond_the_range_the_edge_holds_and_the_covariance_grows():
     def at(celsius):
         compensator = Compensator(unit)
         warm(compensator, celsius, until_s=400, flicker=1e-6)
-        return compensator.process(400 * SECOND_NS, 10.0, 20.0, 3000.0), take_snapshot(compensator)
+        return compensator.process(400 * SECOND_NS, 10.0, 20.0, 3000.0), compensator.status()
 
     edge, inside = at(35.0)
     out, outside = at(41.0)
@@ -287,9 +286,9 @@ def test_nothing_goes_out_before_a_temperature_or_long_after_one():
     compensator.push('board', 2, 20.0)
     assert compensator.process(3, 0.0, 0.0, 1.0) is not None
     assert compensator.process(2 + 20 * SECOND_NS, 0.0, 0.0, 1.0) is not None
-    assert take_snapshot(compensator).is_board_stale
+    assert compensator.status().is_board_stale
     assert compensator.process(3 + 20 * SECOND_NS, 0.0, 0.0, 1.0) is None
-    assert take_snapshot(compensator).is_board_lost
+    assert compensator.status().is_board_lost
     compensator.push('board', 30 * SECOND_NS, 20.0)
     assert compensator.process(30 * SECOND_NS, 0.0, 0.0, 1.0) is not None
     counters = compensator.counters
@@ -378,7 +377,7 @@ def test_swap_to_another_detector_loses_no_sample():
     compensator.swap(rich_calibration())
     row = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
     assert row is not None
-    assert not take_snapshot(compensator).state.is_settled
+    assert not compensator.status().is_settled
 
 
 def test_flush_lets_the_regime_go_on_without_samples():

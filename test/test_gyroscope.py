@@ -20,7 +20,6 @@ from thermo_comp.judging.evaluation import judge_bags
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.online.snapshot import take_snapshot
 from thermo_comp.recording.columns import Block, ImuColumns, Readings
 from thermo_comp.simulation.campaign import parse_cyclogram, plan
 from thermo_comp.simulation.presets import unit_preset
@@ -229,7 +228,7 @@ def test_the_rate_is_corrected_by_hand_numbers():
     assert (np.array(variances) >= least).all()
     assert variances == pytest.approx(least, rel=0.05)
     # What an INS is told: the same without the noise of a message.
-    sd = take_snapshot(compensator).rate_bias_sd
+    sd = compensator.status().rate_bias_sd
     noise = np.square((1e-4, 2e-4, 1e-4)) / 0.01
     np.testing.assert_allclose(np.square(sd), variances - noise, rtol=1e-6)
 

@@ -23,7 +23,6 @@ from thermo_comp.online.checks import (
     StuckCheck,
 )
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
-from thermo_comp.online.snapshot import take_snapshot
 from thermo_comp.online.status import DROPPED, Counters
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 
@@ -206,7 +205,7 @@ def test_a_reversed_axis_is_refused_when_the_platform_stands(rng):
     assert not ((published > 46.0) & (published < 60.0)).any()
     assert ((published > 76.0) & (published < 90.0)).any()
     assert compensator.counters.n_refuted > 1400
-    assert not take_snapshot(compensator).is_refuted
+    assert not compensator.status().is_refuted
     assert compensator.counters.n_in == 9000
 
 
@@ -214,7 +213,7 @@ def test_gravity_is_that_of_the_place_or_of_the_calibration(rng):
     for local, expected in ((0.0, 0.0), (GRAVITY + 2e-3, -2e-3)):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
         run(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
-        gravity = take_snapshot(compensator).gravity
+        gravity = compensator.status().gravity
         # 0.3 counts of noise, 0.29 of rounding: 1.4 mm/s^2 per probe, some 110 probes; and the
         # fractions of a count that noise this small does not average out, a tenth of 0.5.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
@@ -287,4 +286,4 @@ def test_the_batch_refuses_what_the_stream_refuses(events, chunk, stuck_s):
         np.testing.assert_array_equal(force, table[:, :3])
         np.testing.assert_array_equal(covariance[:, UNIQUE], table[:, 3:])
     assert streamed.counters == whole.counters == cut.counters
-    assert take_snapshot(streamed) == take_snapshot(whole) == take_snapshot(cut)
+    assert streamed.status() == whole.status() == cut.status()

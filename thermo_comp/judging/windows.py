@@ -24,9 +24,8 @@ from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import readings_in_order
 from ..online.checks import variance_along
 from ..online.compensator import Compensator
-from ..online.snapshot import take_snapshot
 from ..online.status import CompensatorConfig
-from ..thermal.state import Layout
+from ..thermal.state import BOARD, RATE, WEIGHT, Layout
 from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
@@ -261,15 +260,15 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
             compensator.flush(reading[1])
             reading = next(readings, None)
         corrected = compensator.process(stamp_ns, *row['mean'].tolist())
-        status = take_snapshot(compensator)
-        if corrected is None or status.state is None:
+        status = compensator.status()
+        state = status.state
+        if corrected is None or not state:
             row['excess'] = np.nan
             continue
         row['force'] = corrected[:3]
         row['variance'] = variance_along(corrected[:3], corrected[3:])
         row['excess'] = status.excess.relative
-        state = status.state
-        row['board'], row['rate'], row['weight'] = state.board, state.rate, state.weight
+        row['board'], row['rate'], row['weight'] = state[BOARD], state[RATE], state[WEIGHT]
         if compensator.corrects_rate:
             row['gyro'][3:9] = compensator.correct_rate(stamp_ns, *row['gyro'][:3])
             row['gyro'][9:] = compensator.thermal.tracker.sample(stamp_ns)

@@ -15,21 +15,58 @@ per sample, and a batch comes to the same verdicts.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Final, TypeVar
 
+from ..thermal.plausibility import Fault
+from ..thermal.regime import Regime
 from ..typing import Floats
 from ..unit.calibration import Calibration
+from ..unit.correction import Excess
 from .checks import GravityCheck, StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, ThermalSide
-from .status import CompensatorConfig, Counters
+from .status import CompensatorConfig, Counters, GravityResidual
 
 #: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
 TIME_JUMP_NS: Final = 1_000_000_000
+#: The board temperature is called stale beyond this many of its usual intervals.
+STALE_INTERVALS: Final = 5.0
+SHORTEST_STALE_S: Final = 0.5  # ... but never sooner than this [s]
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]
 Real = TypeVar('Real', float, Floats)  # one sample's, or those of many
+
+
+@dataclass(frozen=True, slots=True)
+class CompensatorStatus:
+    """How a compensator stands at the stamp of its last sample."""
+
+    stamp_ns: int | None
+    #: By thermometer what is wrong with its readings, and the size of a step not believed [K].
+    faults: Mapping[str, tuple[Fault, float]]
+    #: How far the stamps of the readings that wait are ahead of the samples' [s].
+    pending_ahead_s: float
+    #: As `ThermalTracker.sample` gives it; empty until there is a board temperature.
+    state: tuple[float, ...] = ()
+    regime: Regime = Regime.UNKNOWN
+    direction: int = 0  # -1 cooling, +1 heating, 0 neither
+    is_settled: bool = False  # the memory has forgotten that its start was not seen
+    #: Ages of the last used readings at the last sample [s]; infinite when there was none.
+    board_age_s: float = math.inf
+    case_age_s: float = math.inf
+    is_board_stale: bool = True
+    is_board_lost: bool = True
+    is_case_lost: bool = True
+    excess: Excess = Excess(0.0, 0.0, 0.0, 0.0)  # noqa: RUF009 - it is immutable
+    #: Whether the board has led the case in a ramp: the two topics are swapped, most likely.
+    is_lead_reversed: bool = False
+    gravity: GravityResidual | None = None  # None before the platform has stood
+    #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.
+    is_refuted: bool = False
+    #: What is uncertain of the bias of each axis' angular rate [rad/s]; empty where none is known.
+    rate_bias_sd: tuple[float, ...] = ()
 
 
 class Compensator:
@@ -201,6 +238,44 @@ class Compensator:
     def now_ns(self) -> int | None:
         """Stamp of the last sample; None before the first."""
         return self.last_ns if self.last_ns != EVER_NS else None
+
+    def status(self) -> CompensatorStatus:
+        """Say how it stands, for diagnostics."""
+        thermal = self.thermal
+        tracker, rate = thermal.tracker, thermal.rate_correction
+        detector, gravity = tracker.detector, self.gravity
+        stamp_ns = tracker.updated_ns if self.now_ns is None else self.now_ns
+        ahead_s = 0.0 if stamp_ns is None else thermal.queue.ahead(stamp_ns)
+        faults = {name: (check.fault, check.step) for name, check in tracker.checks.items()}
+        board_ns, case_ns = tracker.board.stamp_ns, tracker.case.stamp_ns
+        if stamp_ns is None or (board_ns is None and not thermal.is_unmeasured):
+            return CompensatorStatus(stamp_ns, faults, ahead_s)
+        board_age_s, case_age_s = (
+            math.inf if one is None else (stamp_ns - one) * 1e-9 for one in (board_ns, case_ns)
+        )
+        # Half the time-out at the latest, so that a warning always comes before the error.
+        timeout_s = self.config.temperature_timeout_s
+        usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
+        state = thermal.sample(stamp_ns)
+        return CompensatorStatus(
+            stamp_ns,
+            faults,
+            ahead_s,
+            state,
+            detector.regime,
+            detector.direction,
+            thermal.is_unmeasured or tracker.is_settled(stamp_ns),
+            board_age_s,
+            case_age_s,
+            board_age_s > min(timeout_s / 2.0, usual_s),
+            board_age_s > timeout_s,
+            not tracker.is_live(stamp_ns, tracker.case),
+            thermal.correction.excess(state, is_dynamic=detector.regime == Regime.DYNAMIC),
+            tracker.lead.is_reversed,
+            gravity.result,
+            gravity.is_refuted,
+            thermal.bias_sd(rate, self.rate_line[12::3]) if rate else (),
+        )
 
 
 def corrected(

@@ -23,7 +23,7 @@ from ..thermal.memory import BOARD_INPUT
 from ..thermal.reading_queue import NEVER_NS, ReadingQueue
 from ..thermal.regime import Regime
 from ..thermal.settings import ThermalConfig
-from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, ThermalState
+from ..thermal.state import BOARD
 from ..thermal.tracker import ThermalTracker
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction
@@ -170,20 +170,6 @@ class ThermalSide:
             reference = self.calibration.reference_temperature_c
             return (reference, UNMEASURED_SD_K**2, 0.0, 0.0, 0.0, *gradients)
         return self.tracker.sample(stamp_ns)
-
-    def state_at(self, stamp_ns: int) -> ThermalState:
-        """Thermal state at a stamp, once it is known, for diagnostics."""
-        flat, detector = self.sample(stamp_ns), self.tracker.detector
-        return ThermalState(
-            flat[BOARD],
-            flat[VAR_BOARD],
-            flat[RATE],
-            flat[GRADIENT],
-            flat[WEIGHT],
-            detector.regime,
-            detector.direction,
-            self.is_unmeasured or self.tracker.is_settled(stamp_ns),
-        )
 
     @property
     def fresh_until_ns(self) -> int:

@@ -83,11 +83,6 @@ class GravityResidual(NamedTuple):
     n_windows: int
     is_still: bool
 
-    @property
-    def sigmas(self) -> float:
-        """Size of the residual in its own standard deviations."""
-        return abs(self.residual) / self.residual_sd
-
 
 def stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
     """Serialize a DiagnosticArray of one status, stamped as the reading which decided."""

@@ -20,11 +20,11 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.subscription import Subscription
 
 from ..online.checks import RATE_TOLERANCE
-from ..online.compensator import Compensator
-from ..online.snapshot import CompensatorStatus, take_snapshot
+from ..online.compensator import Compensator, CompensatorStatus
 from ..text import one_line
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
+from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT
 from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop, type_name
@@ -86,7 +86,7 @@ class Reporter:
         silence_s = time.monotonic() - self._last_samples
         if silence_s > IDLE_S:
             self._relay.advance_without_samples(int(silence_s * 1e9))
-        status, counts = take_snapshot(self._compensator), self._count()
+        status, counts = self._compensator.status(), self._count()
         new = {name: n - self._before[name] for name, n in counts.items()}
         rate = None
         if status.stamp_ns is not None and self._before_ns is not None:
@@ -151,16 +151,16 @@ class Reporter:
     ) -> dict[str, str]:
         """List the figures, in the order in which a reader wants them."""
         calibration, state, gravity = loaded.calibration, status.state, status.gravity
-        values = {'regime': 'unknown' if state is None else state.regime.name.lower()}
-        if state is not None:
+        values = {'regime': status.regime.name.lower()}
+        if state:
             values |= {
-                'direction': _DIRECTIONS[state.direction],
-                'dynamic weight': f'{state.weight:.3f}',
-                'board temperature [degC]': f'{state.board:.4f}',
-                'board temperature sd [K]': f'{math.sqrt(state.var_board):.4f}',
-                'board rate [K/min]': f'{60.0 * state.rate:.4f}',
-                'case minus board [K]': f'{state.gradient:.4f}',
-                'memory settled': str(state.is_settled),
+                'direction': _DIRECTIONS[status.direction],
+                'dynamic weight': f'{state[WEIGHT]:.3f}',
+                'board temperature [degC]': f'{state[BOARD]:.4f}',
+                'board temperature sd [K]': f'{math.sqrt(state[VAR_BOARD]):.4f}',
+                'board rate [K/min]': f'{60.0 * state[RATE]:.4f}',
+                'case minus board [K]': f'{state[GRADIENT]:.4f}',
+                'memory settled': str(status.is_settled),
             }
         values |= {
             'board age [s]': f'{status.board_age_s:.3f}',
@@ -240,7 +240,7 @@ def _findings(
     unit, needs_board = loaded.calibration.unit, loaded.calibration.needs_temperature
     if new['n_in'] == 0 and silence_s > max(SILENT_S, SILENT_CYCLES * unit.cycle_time_s):
         yield _ERROR, 'no samples are coming in'
-    if status.state is None:
+    if not status.state:
         if needs_board:
             yield _ERROR, 'no board temperature yet, nothing is published'
     elif status.is_board_lost and needs_board:
@@ -265,9 +265,9 @@ def _findings(
         missed += f' +- {gravity.residual_sd:.1e} m/s^2'
         if status.is_refuted:
             yield _ERROR, f'{missed}: another unit, or an axis reversed? Nothing is published'
-        elif gravity.sigmas > GRAVITY_SIGMAS:
+        elif abs(gravity.residual) > GRAVITY_SIGMAS * gravity.residual_sd:
             yield _WARN, f'{missed}: has the unit aged?'
-    if status.state is not None and status.is_case_lost and needs_board:
+    if status.state and status.is_case_lost and needs_board:
         yield _WARN, 'case temperature lost, the board sensor decides the regime'
     for excess, what in (
         (status.excess.gradient, 'case minus board {:+.2f} K'),
@@ -285,6 +285,6 @@ def _all_well(loaded: LoadedCalibration, status: CompensatorStatus) -> str:
     if not loaded.calibration.needs_temperature:
         reference = loaded.calibration.reference_temperature_c
         return f'constants of {reference:g} degC, what temperature does is not known'
-    if status.state is None or status.state.regime == Regime.UNKNOWN:
+    if status.regime == Regime.UNKNOWN:
         return 'regime not known yet, the static set applies'
-    return f'{status.state.regime.name.lower()} regime'
+    return f'{status.regime.name.lower()} regime'

@@ -4,11 +4,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 from .memory import MemorySpec
-from .regime import Regime
 
 #: A memory is called settled when its start-up uncertainty is below this [K].
 MEMORY_SETTLED_SD: Final = 0.05
@@ -31,22 +29,3 @@ class Layout:
         self.first_play = self.first_lag + 2 * len(spec.lags)
         self.plays = {play: self.first_play + k for k, play in enumerate(spec.plays)}
         self.width = self.first_play + len(spec.plays)
-
-
-@dataclass(frozen=True, slots=True)
-class ThermalState:
-    """What diagnostics tell of the thermal state at one stamp."""
-
-    #: Board temperature [degC], its variance [K^2] and its rate [K/s].
-    board: float
-    var_board: float
-    rate: float
-    #: T_sensor - T_board of the leading sensor [K].
-    gradient: float
-    #: Weight of the dynamic set, 0..1.
-    weight: float
-    regime: Regime
-    #: -1 cooling, +1 heating, 0 neither.
-    direction: int
-    #: Whether the memory has forgotten that its start was not seen.
-    is_settled: bool
