@@ -111,11 +111,17 @@ class Recorder(_Listener):
             times = [_stamps(data) for name, data, _ in self._came if self._topics[name] is Imu]
             newest_ns = times[0][:1] if times else np.zeros(1, np.int64)
             following = iter(times)
+            rows: dict[str, tuple[list[Ints], list[bytes]]] = {}
             for name, messages, _ in self._came:
                 is_stamped = self._topics[name] is Imu
                 log_ns = next(following) if is_stamped else newest_ns.repeat(len(messages))
                 newest_ns = log_ns[-1:]
-                writer.write_raw(name, type_name(self._topics[name]), log_ns, messages)
+                parts, joined = rows.setdefault(name, ([], []))
+                parts.append(log_ns)
+                joined += messages
+            for name, (parts, joined) in rows.items():
+                kind = type_name(self._topics[name])
+                writer.write_raw(name, kind, np.concatenate(parts), joined)
 
     def _open(self) -> None:
         for name, kind in self._topics.items():
