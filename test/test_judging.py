@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import io
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +17,12 @@ from thermo_comp.fitting.sources import digest
 from thermo_comp.judging.evaluation import evaluate
 from thermo_comp.judging.judgement import Judgement, judge
 from thermo_comp.judging.verdicts import Verdict
-from thermo_comp.judging.windows import Windows, csv_of
+from thermo_comp.judging.windows import Windows, columns_of
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
-from thermo_comp.recording.writer import BagWriter
+from thermo_comp.recording.writer import BagWriter, table_writer
 from thermo_comp.unit.calibration import Calibration, Provenance, ResidualSummary, Source
 from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, spoken
 
@@ -401,9 +400,11 @@ class TestShifts:
         np.testing.assert_allclose(found.axis_rms, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
 
 
-def test_windows_as_a_table() -> None:
+def test_windows_as_a_table(tmp_path: Path) -> None:
     windows = made(50.0, 1000.0, 60.0, outside=3)
-    first, *rows = csv.reader(io.StringIO(csv_of(windows, ['a,"b".mcap'])))
+    with table_writer(tmp_path / 'rows', {}) as write:
+        write(columns_of(windows, ['a,"b".mcap']))
+    first, *rows = csv.reader((tmp_path / 'rows').read_text().splitlines())
     assert first == [
         *('bag', 'position', 'start_ns', 'time_s', 'window_s', 'samples'),
         *('board_c', 'board_rate_k_min', 'regime', 'is_inside'),

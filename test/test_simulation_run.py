@@ -206,17 +206,6 @@ def test_chamber_ripple_stays_within_its_amplitude(unit: UnitModel) -> None:
     assert deviation.std() == pytest.approx(0.1 / np.sqrt(2.0), rel=0.1)
 
 
-def test_cold_start_warms_itself_up(unit: UnitModel) -> None:
-    """Switched on in still air the board drifts by its self-heating; started warm it does not."""
-    soak = parse_cyclogram('soak')
-    cold = simulate(unit, soak, UP, rate_hz=1.0, warm=False).truth.temperature('board')
-    warm = simulate(unit, soak, UP, rate_hz=1.0).truth.temperature('board')
-    assert cold[0] == pytest.approx(20.0)
-    assert np.ptp(warm) < 1e-9
-    assert cold[-1] == pytest.approx(warm[-1], abs=0.05)
-    assert warm[0] - cold[0] > 2.0
-
-
 @pytest.mark.parametrize(
     ('n', 'least'), [(6, 0.0), (9, 0.4), (12, 0.6), (18, 0.7), (24, 0.8), (26, 1.2), (40, 2.0)]
 )

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import ThermoCompError
-from ..files import CSV, PAGE, check_output, write_atomically
+from ..files import CSV, PAGE, check_output, shown_name
 from . import options
 from .options import argument, option
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
@@ -43,11 +43,13 @@ def evaluate(
     """
     from ..judging.evaluation import evaluate as run
     from ..judging.history import drifts_of, history_of
-    from ..judging.windows import csv_of
+    from ..judging.windows import columns_of
+    from ..recording.writer import TABLES, table_writer
     from ..unit.calibration_file import load_calibration
 
     if csv is not None:
-        check_output(csv, CSV, overwrite=force, others=[*bags, *calibration])
+        kind = TABLES.get(csv.suffix, CSV)
+        check_output(csv, kind, overwrite=force, others=[*bags, *calibration])
     is_named = len({path.stem for path in calibration}) == len(calibration)
     models = [(one.stem if is_named else str(one), load_calibration(one)) for one in calibration]
     with out.progress('evaluating') as done:
@@ -55,8 +57,8 @@ def evaluate(
     out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)
     judged = result.judgements[models[0][0]]
     if csv is not None:
-        text = csv_of(judged.windows, [bag.name for bag in bags])
-        write_atomically(csv, text.encode(), CSV, overwrite=force)
+        with table_writer(csv, {}, overwrite=force) as write:
+            write(columns_of(judged.windows, list(map(shown_name, bags))))
     drifts = drifts_of(history_of([one for _, one in models]))
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),

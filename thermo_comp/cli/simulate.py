@@ -62,9 +62,6 @@ def simulate(
     ),
     seed: int = option('Seed of the noise.', 0, min=0),
     gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY),
-    cold_start: bool = option(
-        'Switch the unit on when the recording starts.', False, '--cold-start'
-    ),
     imu: bool = option(
         'Write sensor_msgs/Imu, with the angular rate of a unit that has one.', False, '--imu'
     ),
@@ -127,7 +124,6 @@ def simulate(
                     station.program,
                     station.up,
                     temperature_rate_hz=temperature_rate_hz,
-                    warm=not cold_start,
                     **settings,
                 )
             n_cycles = station.program.duration_s * rate_hz

@@ -7,8 +7,6 @@ as the node would correct a sample there; a row each is all that is kept of a ba
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -143,10 +141,10 @@ def corrected_windows(
     )
 
 
-def csv_of(windows: Windows, bags: Sequence[str]) -> str:
-    """Write windows as CSV with all digits: a line of headings, then one per window."""
+def columns_of(windows: Windows, bags: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
+    """Give the columns of a table of windows."""
     force = windows.force.T
-    columns = {
+    return {
         'bag': np.array(bags, dtype=object)[windows.bag],
         'position': windows.position + 1,
         'start_ns': windows.start_ns,
@@ -162,11 +160,6 @@ def csv_of(windows: Windows, bags: Sequence[str]) -> str:
         'residual_ug': windows.residual / MICRO_G,
         'claimed_sd_ug': windows.claimed_sd / MICRO_G,
     }
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(columns)
-    writer.writerows(zip(*(one.tolist() for one in columns.values()), strict=True))
-    return text.getvalue()
 
 
 def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floats:

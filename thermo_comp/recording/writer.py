@@ -10,13 +10,13 @@ there before stays if writing fails.
 
 from __future__ import annotations
 
+import csv
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -256,37 +256,36 @@ def table_writer(
     path: str | Path, metadata: Mapping[str, str], *, overwrite: bool = False
 ) -> Iterator[WriteRows]:
     """
-    Write a table, by its suffix one of `TABLES`; it takes its name when the block ends well.
+    Write a table, by its suffix one of `TABLES`, else CSV; named so when the block ends well.
     Yields what takes columns by name, shape (n,) each, the same ones every time; CSV has no place
     for the metadata. OutputError if it may not or cannot be written, or pyarrow is missing.
     """
-    kind = TABLES[Path(path).suffix]
-    with drafted(path, kind, overwrite=overwrite) as partial, partial.open('wb') as file:
+    kind = TABLES.get(Path(path).suffix, CSV)
+    with drafted(path, kind, overwrite=overwrite) as partial, ExitStack() as stack:
+        writer: Any = None
         if kind is CSV:
-            yield lambda columns: _write_csv(file, columns)
+            text = stack.enter_context(partial.open('w', encoding='utf-8', newline=''))
+
+            def write_lines(columns: Mapping[str, NDArray[Any]]) -> None:
+                nonlocal writer
+                if writer is None:
+                    writer = csv.writer(text, lineterminator='\n')
+                    writer.writerow(columns)
+                writer.writerows(zip(*(one.tolist() for one in columns.values()), strict=True))
+
+            yield write_lines
             return
         try:
             import pyarrow as pa
             from pyarrow import parquet as pq
         except ImportError as error:
             raise OutputError("needs pyarrow: pip install 'thermo_comp[parquet]'", path) from error
-        with ExitStack() as stack:
-            writer: Any = None
 
-            def write(columns: Mapping[str, NDArray[Any]]) -> None:
-                nonlocal writer
-                arrays = {name: pa.array(column) for name, column in columns.items()}
-                table = pa.table(arrays, metadata=dict(metadata))
-                writer = writer or stack.enter_context(pq.ParquetWriter(file, table.schema))
-                writer.write_table(table)
+        def write(columns: Mapping[str, NDArray[Any]]) -> None:
+            nonlocal writer
+            arrays = {name: pa.array(column) for name, column in columns.items()}
+            table = pa.table(arrays, metadata=dict(metadata))
+            writer = writer or stack.enter_context(pq.ParquetWriter(partial, table.schema))
+            writer.write_table(table)
 
-            yield write
-
-
-def _write_csv(file: BinaryIO, columns: Mapping[str, NDArray[Any]]) -> None:
-    # str of a float has all its digits.
-    cells = [map(str, column.tolist()) for column in columns.values()]
-    rows: Iterable[Iterable[str]] = zip(*cells, strict=True)
-    if not file.tell():
-        rows = chain([columns], rows)
-    file.writelines(f'{",".join(row)}\n'.encode() for row in rows)
+        yield write

@@ -4,9 +4,9 @@
 Owns the heat paths: lumped parts joined by conductances, self-heating, the thermostat; solved.
 
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
-parts, then the thermostat's integral and set point; `u` is the air temperature; `p` holds the
-constant powers. Between knots of the air the solution is a straight line plus decaying modes. What
-convection carries beyond the line through its flow at 1 K is held from second to second.
+parts, then the thermostat's integral; `u` is the air temperature; `p` holds what is constant.
+Between knots of the air the solution is a straight line plus decaying modes. What convection
+carries beyond the line through its flow at 1 K is held from second to second.
 """
 
 from __future__ import annotations
@@ -39,16 +39,12 @@ class Link:
 
 @dataclass(frozen=True)
 class Thermostat:
-    """
-    Heater of one part, 0 to `max_power` W, which holds `set_point` [degC], and approaches it with
-    the time constant `soft_start` [s]; gains in W/K and W/(K s).
-    """
+    """Heater of one part, 0 to `max_power` W, that holds `set_point` [degC]; W/K and W/(K s)."""
 
     node: str
     set_point: float
     proportional: float
     integral: float
-    soft_start: float
     max_power: float
 
 
@@ -78,7 +74,7 @@ class ThermalNetwork:
     def system(self) -> tuple[Floats, Floats, Floats]:
         """Return A, b and p, shapes (k, k), (k,) and (k,), as if every exponent were 1."""
         n, index = len(self.nodes), self._places
-        size = n + (0 if self.thermostat is None else 2)
+        size = n + (self.thermostat is not None)
         both, p = np.zeros((size + 1, size + 1)), np.zeros(size)
         for link in self.links:
             i, j = index[link.a], index[link.b]
@@ -89,15 +85,12 @@ class ThermalNetwork:
             p[index[name]] += watts
         heat = self.thermostat
         if heat is not None:
-            i, integral, set_point = index[heat.node], n, n + 1
+            i, integral = index[heat.node], n
             # Heater power = proportional * (set point - T) + integral state.
             A[i, i] -= heat.proportional
-            A[i, set_point] += heat.proportional
             A[i, integral] += 1.0
-            A[integral, set_point] += heat.integral
             A[integral, i] -= heat.integral
-            A[set_point, set_point] = -1.0 / heat.soft_start
-            p[set_point] = heat.set_point / heat.soft_start
+            p[[i, integral]] += np.array([heat.proportional, heat.integral]) * heat.set_point
         rows = np.array(list(self.capacity.values()))
         A[:n] /= rows[:, None]
         b[:n] /= rows
@@ -148,8 +141,8 @@ class ThermalResponse:
     Temperatures of a network over a program, at any instant.
 
     `knot_air` are the air temperatures at the `knot_time` [s], shape (m,); `power` is what the
-    parts dissipate between the knots beside the constant powers, W, shape (m - 1, n_parts). A warm
-    start is in equilibrium with everything on; else all is switched on at the air's temperature.
+    parts dissipate between the knots beside the constant powers, W, shape (m - 1, n_parts). At the
+    start all is on and in equilibrium.
     """
 
     def __init__(
@@ -157,9 +150,7 @@ class ThermalResponse:
         network: ThermalNetwork,
         knot_time: ArrayLike,
         knot_air: ArrayLike,
-        *,
         power: ArrayLike | None = None,
-        is_warm: bool = True,
     ) -> None:
         self.network = network
         self._time = np.asarray(knot_time, dtype=float)
@@ -178,9 +169,6 @@ class ThermalResponse:
         drive = np.tile(p, (len(self._time) - 1, 1))
         if power is not None:
             drive[:, : len(network.nodes)] += np.asarray(power) / list(network.capacity.values())
-        # Parts and set point begin with the air, the integral with nothing.
-        cold = np.full(len(p), air[0])
-        cold[len(network.nodes) : len(p) - 1] = 0.0
         if network.is_convective:
             steps = np.arange(self._time[0], self._time[-1], _STEP_S)
             fine = np.union1d(self._time, steps)
@@ -196,7 +184,7 @@ class ThermalResponse:
         self._beta = -(np.diff(air) / length)[:, None] * (inverse @ b)
         self._alpha = (self._beta - np.outer(air[:-1], b) - drive) @ inverse.T
         self._amplitude = np.empty((len(length), len(rate)), dtype=complex)
-        state = network.settled(air[0], drive[0]) if is_warm else cold
+        state = network.settled(air[0], drive[0])
         before = network.convection(state, air[0])
         for k, lasts in enumerate(length):
             # The mean over the interval, foreseen from the last two (Adams and Bashforth).
@@ -207,7 +195,7 @@ class ThermalResponse:
             state, before = self._alpha[k] + self._beta[k] * lasts + decayed.real, now
 
     def states(self, time: ArrayLike) -> Floats:
-        """Return the parts' temperatures, the thermostat's integral [W] and set point, (m, k)."""
+        """Return the parts' temperatures and the thermostat's integral [W], shape (m, k)."""
         time = np.atleast_1d(np.asarray(time, dtype=float))
         k = np.clip(np.searchsorted(self._time, time, side='right') - 1, 0, len(self._time) - 2)
         since = (time - self._time[k])[:, None]

@@ -102,7 +102,7 @@ def _thermostatted(draw: _Specimen) -> UnitModel:
             ('oven', 'head', 1.5),
         ),
         power={'board': 0.8, 'reference': 0.02, 'head': 0.3},
-        thermostat=Thermostat('oven', 55.0, 20.0, 0.08, 1800.0, 25.0),
+        thermostat=Thermostat('oven', 55.0, 20.0, 0.08, 25.0),
     )  # fmt: skip
     drift = (
         # The reference current sets the scale of all axes; its curvature is a bandgap's.

@@ -118,14 +118,13 @@ def simulate_blocks(
     seed: int = 0,
     start_ns: int = START_NS,
     gravity: float = STANDARD_GRAVITY,
-    warm: bool = True,
 ) -> Iterator[SimulatedRun]:
     """
     Run a unit through a program in bounded memory; blocks of any size have the same bits.
 
     A reading is in the block among whose cycles it falls, or in the last. `up` is the direction of
     the specific force; K in counts per cycle does not depend on `rate_hz`. `seed` is of all that
-    is random in this run. Unless `warm`, the unit is switched on at the start.
+    is random in this run.
     """
     readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz
     positive = {'rate_hz': rate_hz, 'temperature_rate_hz': readings_hz, 'gravity': gravity}
@@ -138,7 +137,7 @@ def simulate_blocks(
         raise ValueError(f'the program of {duration} s is shorter than one cycle')
     direction = np.asarray(up, dtype=float)
     # Only what switches a load is random in it.
-    truth = _heat_flow(unit, cyclogram, seed if unit.load else 0, warm)
+    truth = _heat_flow(unit, cyclogram, seed if unit.load else 0)
     truth = replace(
         truth,
         bias_grid=truth.thermal_bias + _walk(unit, truth.grid_s, seed),
@@ -190,7 +189,7 @@ def simulate_blocks(
 
 
 @lru_cache(maxsize=1)
-def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int, warm: bool) -> Truth:
+def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
     """Solve what temperature does over a program, once for all attitudes."""
     knots, air, power = np.array(cyclogram.time_s), np.array(cyclogram.temperature_c), None
     if unit.load is not None:
@@ -198,7 +197,7 @@ def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int, warm: bool) -> 
         air = np.interp(knots, cyclogram.time_s, air)
         heated = [part == unit.load.part for part in unit.network.nodes]
         power = unit.load.power * np.outer(is_on, heated)
-    response = ThermalResponse(unit.network, knots, air, power=power, is_warm=warm)
+    response = ThermalResponse(unit.network, knots, air, power)
     grid = np.arange(math.ceil(cyclogram.duration_s / _GRID_S) + 1, dtype=float) * _GRID_S
     temperatures = response.temperatures(grid)
     origin = unit.origin
