@@ -34,8 +34,9 @@ import numpy.typing as npt
 
 from ..errors import RecordingError
 from ..files import open_regular
+from ..recording.columns import Readings
 from ..typing import Floats, Ints
-from .log import NO_STAMP, SLOW_HZ, ForeignLog, Readings, find_stillness, library, thin
+from .log import NO_STAMP, SLOW_HZ, ForeignLog, find_stillness, library, thin
 
 T = TypeVar('T')
 #: What a log holds by instance: IMUs, barometers, and why an IMU's thermal drift is gone.

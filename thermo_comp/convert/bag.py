@@ -19,7 +19,7 @@ from ..errors import RecordingError
 from ..recording.chunks import translated
 from ..recording.reader import inspect_recording, read_recording
 from ..recording.topics import IMU, TEMPERATURE, Present, Topics, said_choice
-from .log import ForeignLog, Readings
+from .log import ForeignLog
 
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'
 
@@ -52,7 +52,7 @@ def bag_log(
         columns.accel,
         None if columns.imu is None else columns.imu.angular_velocity,
         {
-            name: Readings(*one[:2]).take(np.isfinite(one.celsius))
+            name: one.take(np.isfinite(one.celsius))
             for name, one in columns.temperatures.items()
             if name in found
         },

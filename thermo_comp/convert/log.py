@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from ..arrays import said_anew
 from ..errors import RecordingError
 from ..files import shown_name
 from ..fitting.sources import digest
-from ..recording.columns import ImuColumns
+from ..recording.columns import ImuColumns, Readings
 from ..recording.stillness import CellAccumulator
 from ..recording.topics import Topics
 from ..recording.writer import STAMP_END_NS, BagWriter
@@ -51,17 +51,6 @@ _PLAUSIBLE_CELSIUS = (-90.0, 200.0)
 _RUN_ROWS = 100_000  # rows are reduced and written in runs of so many: bounded memory
 _EXAMPLES = 5
 SLOW_HZ = 5.0  # slower logs tell of soaks alone
-
-
-class Readings(NamedTuple):
-    """One thermometer's readings [degC] with their stamps, shape (n,), in file order."""
-
-    stamp_ns: Ints
-    celsius: Floats
-
-    def take(self, rows: Bools | Ints) -> Readings:
-        """Choose some of them."""
-        return Readings(self.stamp_ns[rows], self.celsius[rows])
 
 
 @dataclass(frozen=True)
@@ -256,8 +245,8 @@ def _write(
             until = newest[rows.stop - 1] if rows.stop < n else np.iinfo(np.int64).max
             for topic, readings, log_ns in waiting:
                 run = slice(*np.searchsorted(log_ns, (since, until), side='right'))
-                stamp_ns, celsius = (column[run] for column in readings)
-                writer.write_temperature(topic, stamp_ns, celsius, log_ns[run], log.frame_id)
+                own = readings.take(run)
+                writer.write_temperature(topic, *own[:2], log_ns[run], log.frame_id)
             since = until
             stamp_ns, values = log.stamp_ns[rows], log.accel[rows] * factor
             if log.input == 'counts':

@@ -219,11 +219,15 @@ class ImuColumns(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """What one thermometer said, shape (m,), `after` so many of the samples of its block."""
+    """What one thermometer said, shape (m,), in a block `after` so many of its samples."""
 
     stamp_ns: Ints
     celsius: Floats
-    after: Ints
+    after: Ints = np.empty(0, np.int64)
+
+    def take(self, which: Ints | Bools | slice) -> Readings:
+        """Choose some of them, of no block."""
+        return Readings(self.stamp_ns[which], self.celsius[which])
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,8 +268,8 @@ class Block:
         n_before = np.concatenate(([0], np.cumsum(own)))
         temperatures = {}
         for name, one in self.temperatures.items():
-            which, after = rows[name], n_before[one.after[rows[name]]]
-            temperatures[name] = Readings(one.stamp_ns[which], one.celsius[which], after)
+            after = n_before[one.after[rows[name]]]
+            temperatures[name] = one.take(rows[name])._replace(after=after)
         return Block(
             self.accel_stamp_ns[own],
             self.accel[own],
