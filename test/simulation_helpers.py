@@ -43,4 +43,5 @@ def rippled(
     )
     wave = amplitude * np.sin(phase + 2.0 * np.pi * time / period)
     both = np.union1d(time, program.time_s)
-    return Cyclogram(tuple(both), tuple(program.at(both) + np.interp(both, time, wave)))
+    air = np.interp(both, program.time_s, program.temperature_c)
+    return Cyclogram(tuple(both), tuple(air + np.interp(both, time, wave)))

@@ -13,7 +13,7 @@ import pytest
 from builders import axis_set, calibration, regime_set
 from report_helpers import evidence, fitted, write_bag
 
-from thermo_comp.judging.history import drifts_of, history_of
+from thermo_comp.judging.evaluation import drifts_of, history_of
 from thermo_comp.report.page import render_report
 from thermo_comp.unit.calibration import AxisReference, Calibration, Source
 from thermo_comp.unit.calibration_file import save_calibration

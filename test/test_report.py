@@ -21,8 +21,7 @@ from simulation_helpers import ideal_regime
 from thermo_comp import __version__
 from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.fitting.reduction import Readings, ReducedBag
-from thermo_comp.judging.evaluation import open_bags
-from thermo_comp.judging.history import history_of
+from thermo_comp.judging.evaluation import history_of, open_bags
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.report.evidence import LEFT_OUT, Evidence, evidence_of_bags
 from thermo_comp.report.figures_unit import draw_history

@@ -15,7 +15,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.container import ErrorbarContainer
 from report_helpers import evidence, fitted
 
-from thermo_comp.judging.history import history_of
+from thermo_comp.judging.evaluation import history_of
 from thermo_comp.report import figures_bags as of_bags
 from thermo_comp.report import figures_unit as of_unit
 from thermo_comp.report.html import label_text, number

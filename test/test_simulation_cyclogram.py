@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulation_helpers import rates_k_min
 
-from thermo_comp.simulation.campaign import CYCLOGRAM_NAMES, Cyclogram, parse_cyclogram
+from thermo_comp.simulation.campaign import CYCLOGRAM_NAMES, parse_cyclogram
 
 
 @pytest.mark.parametrize('name', [name for name in CYCLOGRAM_NAMES if name != 'soak'])
@@ -61,8 +61,3 @@ def test_a_typed_program_is_read_as_written() -> None:
 def test_a_typed_program_that_cannot_be_read_is_refused(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parse_cyclogram(text)
-
-
-def test_air_is_straight_between_points_and_rests_outside() -> None:
-    program = Cyclogram((0.0, 600.0, 1200.0), (20.0, 25.0, 25.0))
-    np.testing.assert_allclose(program.at([-1.0, 300.0, 900.0, 5000.0]), [20.0, 22.5, 25.0, 25.0])

@@ -41,8 +41,8 @@ def evaluate(
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
     """
+    from ..judging.evaluation import drifts_of, history_of
     from ..judging.evaluation import evaluate as run
-    from ..judging.history import drifts_of, history_of
     from ..judging.windows import columns_of
     from ..recording.writer import TABLES, table_writer
     from ..unit.calibration_file import load_calibration
@@ -153,8 +153,7 @@ def report(
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
     """
-    from ..judging.evaluation import open_bags
-    from ..judging.history import drifts_of
+    from ..judging.evaluation import drifts_of, open_bags
     from ..report.certificate import load_certificate_info
     from ..report.evidence import evidence_of_bags
     from ..report.page import write_report

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..judging.history import Drift
+from ..judging.evaluation import Drift
 from ..judging.verdicts import Verdict
 from ..typing import Floats
 from .table import COLUMNS, Column, Row, is_fitted

@@ -123,10 +123,6 @@ def judge(
     Judge a calibration by its windows, those that its fit has seen by what it left on positions
     left out; a `tolerance` on the RMS [m/s^2] decides where given.
     """
-    if not len(windows):
-        raise ValueError('`windows` must hold at least one')
-    if tolerance is not None and not 0.0 < tolerance < np.inf:
-        raise ValueError(f'`tolerance` must be positive, got {tolerance:g}')
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)
     sections = verdicts.sections_of(windows, windows.raw_residual, windows.residual, claimed)

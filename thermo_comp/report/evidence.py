@@ -19,8 +19,7 @@ from ..fitting.coverage import LeastKnown, least_known
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector
 from ..fitting.verdict import Finding
-from ..judging.evaluation import judge_bags
-from ..judging.history import Epoch, history_of
+from ..judging.evaluation import Epoch, history_of, judge_bags
 from ..judging.judgement import Judgement
 from ..judging.verdicts import Verdict
 from ..judging.windows import WINDOW_S, Windows, corrected_windows, means_by, usual_window

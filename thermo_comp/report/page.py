@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from ..files import PAGE, PICTURE, write_atomically
 from ..fitting.reduction import ReducedBag
-from ..judging.history import drifts_of
+from ..judging.evaluation import drifts_of
 from ..text import counted
 from ..thermal.regime import Regime
 from ..unit.gravity import STANDARD_GRAVITY

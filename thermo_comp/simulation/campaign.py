@@ -11,7 +11,6 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..typing import Floats
 from .unit import Stream, generator
@@ -70,11 +69,6 @@ class Cyclogram:
     def duration_s(self) -> float:
         """Length of the program, s."""
         return self.time_s[-1]
-
-    def at(self, time: ArrayLike) -> Floats:
-        """Return the programmed air temperature [degC] at times [s] from the start, shape (m,)."""
-        air: Floats = np.interp(np.asarray(time, dtype=float), self.time_s, self.temperature_c)
-        return air
 
 
 def parse_cyclogram(text: str) -> Cyclogram:
