@@ -19,10 +19,11 @@ from thermo_comp.judging.judgement import Judgement, judge
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.judging.windows import Windows, columns_of
 from thermo_comp.online.batch import process_block
-from thermo_comp.online.compensator import Compensator
+from thermo_comp.online.compensator import SWAPPED, Compensator
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter, table_writer
+from thermo_comp.replay import replay
 from thermo_comp.unit.calibration import Calibration, Provenance, ResidualSummary, Source
 from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, spoken
 
@@ -99,6 +100,7 @@ def made(
         rate=np.zeros(n),
         is_dynamic=rows < dynamic,
         is_inside=rows >= outside,
+        is_swapped=np.zeros(n, bool),
         raw=constant,
         force=force,
         claimed_sd=np.full(n, claimed * MICRO_G),
@@ -389,6 +391,27 @@ class TestShifts:
         force[:20, 0] += 3e-5 * np.where(np.arange(20) % 2, 1.0, -1.0)
         found = judge(dataclasses.replace(windows, force=force), CLAIMING)
         np.testing.assert_allclose(found.axis_rms, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
+
+
+def test_thermometers_in_doubt_are_told_offline_too(root: Path, tmp_path: Path) -> None:
+    """
+    WHY: replay said nothing of exchanged thermometers, and evaluate called them valid.
+
+    WHAT: both say the node's words, and no verdict is built on it; of a heat beyond, too.
+    """
+    exchanged = Topics(board='temperature/case', case='temperature/board')
+    for topics, said in ((Topics(), []), (exchanged, [SWAPPED])):
+        bag = root / 'bags' / 'held_out.mcap'
+        one = replay(bag, CLAIMING, tmp_path / f'{len(said)}.mcap', topics=topics, serial='')
+        assert one.notes == said
+        verdict = judged(bag, CLAIMING, topics=topics, serial='', tolerance=1.0 + 9.0 * len(said))
+        assert (verdict.kind is Verdict.SWAPPED) == bool(said)
+        assert not (said and verdict.is_valid)
+        assert verdict.reason.startswith(SWAPPED) == bool(said)
+    _, upper = CLAIMING.static.temperature_range_c
+    hot = resting(tmp_path / 'hot', upper + 2.0)
+    (note,) = replay(hot, CLAIMING, tmp_path / 'hot.mcap').notes
+    assert note == 'board temperature +2.00 K outside the calibrated range, held at its edge'
 
 
 def test_windows_as_a_table(tmp_path: Path) -> None:

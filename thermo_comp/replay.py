@@ -26,7 +26,7 @@ from . import __version__
 from .errors import CalibrationError, OutputError
 from .files import shown_name
 from .online.batch import CompensatedBlock, process_block
-from .online.compensator import Compensator
+from .online.compensator import HELD, SWAPPED, Compensator
 from .online.status import STAMPED_TOPIC, STAMPED_TYPE, CompensatorConfig, Counters, stamped_flag
 from .recording.columns import Block, ImuColumns, Input, Messages, RecordingInfo, Role
 from .recording.reader import RecordingReader, open_recording
@@ -39,6 +39,8 @@ OUTPUT_TOPIC = 'imu/data_raw'
 REGIME_TOPIC = 'regime/dynamic'
 #: Messages corrected at once: enough that what is done per block costs little beside them.
 BLOCK_MESSAGES = 1 << 15
+# Readings between these quantiles are no glitches; thermometers have this noise [K].
+_BULK, _NOISE_K = (0.01, 0.99), 0.1
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
 
 
@@ -52,6 +54,8 @@ class ReplayResult:
     n_flags: int
     #: The first flag, and each that differs from the one before.
     switches: list[tuple[int, bool]]
+    #: What the node would warn of: exchanged thermometers, temperatures beyond the calibration.
+    notes: list[str]
 
 
 #: Takes a block of a recording, what the compensator made of it, and flags: stamp and regime.
@@ -119,6 +123,7 @@ def replay(
         }
         total = reader.info.topics[reader.topics['accel']][1]
         flags: list[tuple[int, bool]] = []
+        is_swapped, beyond = False, 0.0
         is_raw = keep_inputs or all_topics
         if Path(output).suffix in TABLES:
             if is_raw:
@@ -134,10 +139,25 @@ def replay(
                 new = compensator.take_flags()
                 write(block, corrected, new)
                 flags += new
+                is_swapped |= compensator.thermal.tracker.lead.is_reversed
+                beyond = max(beyond, _beyond(calibration, block), key=abs)
                 if progress is not None:
                     progress(compensator.counters.n_in / max(total, 1))
-        counters = compensator.counters
-        return ReplayResult(reader.info, Path(output), counters, len(flags), switches(flags))
+        notes = [SWAPPED] if is_swapped else []
+        if beyond:
+            notes.append(f'board temperature {beyond:+.2f} K {HELD}')
+        counters, told = compensator.counters, switches(flags)
+        return ReplayResult(reader.info, Path(output), counters, len(flags), told, notes)
+
+
+def _beyond(calibration: Calibration, block: Block) -> float:
+    """Say how far a block's board readings, but for glitches, lie beyond all ranges [K]."""
+    ranges = [one.temperature_range_c for one in calibration.regime_sets()]
+    lower, upper = min(one[0] for one in ranges), max(one[1] for one in ranges)
+    celsius = block.temperatures['board'].celsius
+    found = np.nanquantile(celsius, _BULK) if np.isfinite(celsius).any() else np.array([lower])
+    excess = float(max(found - np.clip(found, lower, upper), key=abs))
+    return excess if calibration.needs_temperature and abs(excess) > _NOISE_K else 0.0
 
 
 def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:

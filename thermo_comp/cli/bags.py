@@ -182,6 +182,8 @@ def replay(
         )
     info, counters = result.info, result.counters
     out.told([(info.path, info.chosen, info.truncated)])
+    for one in result.notes:
+        out.note(f'{info.path}: {one}')
     counts = asdict(counters)
     out.line(f'{output}: {counters.n_out} of {counters.n_in} samples corrected')
     for name, count in counts.items():
@@ -200,6 +202,7 @@ def replay(
         flags=result.n_flags,
         switches=[{'stamp_ns': at, 'dynamic': flag} for at, flag in result.switches],
         truncated=info.truncated,
+        notes=result.notes,
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..fitting.coverage import distinct_directions, norm_columns
 from ..fitting.verdict import POSITIONS_NEEDED
+from ..online.compensator import SWAPPED
 from ..text import counted
 from ..typing import Floats
 from ..unit.calibration import Calibration
@@ -155,7 +156,9 @@ def _verdict(found: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict,
     ratio = sections.worst_ratio
     # A NaN of no claim compares false.
     is_wide = one.claimed_rms > (tolerance or min(verdicts.WIDE_PART * one.raw_rms, _WIDE_CLAIM))
-    if one.rms >= one.raw_rms and is_thermal:
+    if windows.is_swapped.any():
+        kind = Verdict.SWAPPED
+    elif one.rms >= one.raw_rms and is_thermal:
         kind = Verdict.NO_BETTER
     elif tolerance is not None and worst > tolerance:
         kind = Verdict.RECALIBRATE
@@ -175,6 +178,8 @@ def _verdict(found: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict,
         says.append(f'largest ratio of a regime {ratio:.2g}, limit {verdicts.LARGEST_RATIO:g}')
     else:
         says.append('the calibration says nothing of its uncertainty: give a tolerance')
+    if kind is Verdict.SWAPPED:
+        says.insert(0, SWAPPED)
     if found.moved:
         says.append('moved: ' + ', '.join(found.moved))
     if outside.n:

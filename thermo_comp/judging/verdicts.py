@@ -39,6 +39,7 @@ class Verdict(Enum):
     RECALIBRATE = 'recalibrate'
     NO_BETTER = 'no better than raw'
     OUTSIDE = 'outside the calibrated range: not judged'
+    SWAPPED = 'thermometers in doubt: not judged'
     NO_CLAIM = 'no claim'
 
     @property

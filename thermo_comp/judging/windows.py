@@ -46,7 +46,8 @@ class Windows:
     Each is `window_s` long, and begins at `start_ns`; `time` is its middle since the bag's first
     sample [s], `count` and `mean` are of its raw samples. A position is a still interval, counted
     through all bags. The rate is the board's [K/s]. Dynamic are those in which the dynamic set
-    prevails, inside those that lie inside the calibrated ranges as a whole. `raw` is the specific
+    prevails, inside those that lie inside the calibrated ranges as a whole; swapped those in which
+    the board leads the case. `raw` is the specific
     force by the constants at the reference temperature, `force` that by the calibration, shapes
     (n, 3); `claimed_sd` is claimed for the norm of `force`: the calibration's error and the white
     noise of the mean, which is `noise_sd` alone. `gyro` has rows of the angular rate, raw and
@@ -65,6 +66,7 @@ class Windows:
     rate: Floats
     is_dynamic: Bools
     is_inside: Bools
+    is_swapped: Bools
     raw: Floats
     force: Floats
     claimed_sd: Floats
@@ -134,6 +136,7 @@ def corrected_windows(
         gravity=np.nan if gravity is None else gravity,
         is_dynamic=table['weight'] > 0.5,
         is_inside=table['excess'] <= _EDGE,
+        is_swapped=table['swapped'] > 0.0,
         raw=raw,
         claimed_sd=claimed_sd,
         noise_sd=noise_sd,
@@ -176,7 +179,7 @@ def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floa
 _Table: TypeAlias = npt.NDArray[Any]
 # What is there once for a window, all else but `excess` is averaged over its sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
-_AVERAGED = ('time', 'board', 'rate', 'weight', 'variance')
+_AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped')
 _TRIPLES = ('mean', 'force')
 
 
@@ -260,7 +263,7 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
             continue
         row['force'] = corrected[:3]
         row['variance'] = variance_along(corrected[:3], corrected[3:])
-        row['excess'] = status.excess.relative
+        row['excess'], row['swapped'] = status.excess.relative, status.is_lead_reversed
         row['board'], row['rate'], row['weight'] = state[BOARD], state[RATE], state[WEIGHT]
         if compensator.corrects_rate:
             row['gyro'][3:9] = compensator.correct_rate(stamp_ns, *row['gyro'][:3])

@@ -33,6 +33,12 @@ TIME_JUMP_NS: Final = 1_000_000_000
 #: The board temperature is called stale beyond this many of its usual intervals.
 STALE_INTERVALS: Final = 5.0
 SHORTEST_STALE_S: Final = 0.5  # ... but never sooner than this [s]
+#: What is said of a status, live and offline.
+SWAPPED: Final = (
+    'the board leads the case in ramps: are temperature/board and temperature/case swapped, or is '
+    'it heated from inside?'
+)
+HELD: Final = 'outside the calibrated range, held at its edge'
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]

@@ -20,7 +20,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.subscription import Subscription
 
 from ..online.checks import RATE_TOLERANCE
-from ..online.compensator import Compensator, CompensatorStatus
+from ..online.compensator import HELD, SWAPPED, Compensator, CompensatorStatus
 from ..text import one_line
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
@@ -257,8 +257,7 @@ def _findings(
         text = f'{status.pending_ahead_s:.0f} s ahead of the samples'
         yield _WARN, f'temperatures are stamped {text}'
     if status.is_lead_reversed:
-        text = 'are temperature/board and temperature/case swapped, or is it heated from inside?'
-        yield _ERROR, f'the board leads the case in ramps: {text}'
+        yield _ERROR, SWAPPED
     gravity = status.gravity
     if gravity is not None:
         missed = f'|f| at rest misses gravity by {gravity.residual:+.2e}'
@@ -275,7 +274,7 @@ def _findings(
         (60.0 * status.excess.rate, 'temperature rate {:+.2f} K/min'),
     ):
         if excess:
-            yield _WARN, f'{what.format(excess)} outside the calibrated range, held at its edge'
+            yield _WARN, f'{what.format(excess)} {HELD}'
     calibrated = 1.0 / unit.cycle_time_s
     if rate is not None and abs(rate / calibrated - 1.0) > RATE_TOLERANCE:
         yield _WARN, f'{rate:.4g} samples/s, calibrated for {calibrated:.4g}'
