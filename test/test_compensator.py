@@ -330,6 +330,37 @@ def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
     assert compensator.counters.n_board_rejected == 10_000 - 4096
 
 
+@pytest.mark.parametrize('n_before', [0, 3])
+@pytest.mark.parametrize('ahead_s', [0, 2])
+def test_readings_of_a_long_time_without_samples_all_count(n_before, ahead_s):
+    """
+    WHY: of thermometers at 50 Hz that came 41 s ahead of the samples, a block lost the newest.
+
+    WHAT: those of any silence take effect in their order, as in a node that waits meanwhile.
+    """
+    first = [('accel', k * SECOND_NS // 100, (1.0, 2.0, 2930.0)) for k in range(1, 1 + n_before)]
+    readings = [
+        (name, k * SECOND_NS // 50, 20.0 + 1e-4 * k + 1e-3 * (k % 7))
+        for k in range(10, 50 * 120)
+        for name in ('board', 'case')
+    ]
+    # Some readings are stamped later than the sample behind them.
+    after_ns = (120 - ahead_s) * SECOND_NS
+    last = [('accel', after_ns + k * SECOND_NS // 100, (1.0, 2.0 + k, 2930.0)) for k in range(5)]
+    block, live = (Compensator(replace(rich_calibration(), gyroscope=None)) for _ in range(2))
+    found = batch(block, [*first, *readings, *last])
+    rows, _ = stream(live, first)
+    for reading in readings:
+        live.push(*reading)
+        if reading[1] <= after_ns:
+            live.flush(reading[1])
+    more, _ = stream(live, last)
+    columns = np.column_stack([found.specific_force, found.covariance[:, UNIQUE]])
+    np.testing.assert_array_equal(columns, np.concatenate([rows, more]))
+    assert block.counters == live.counters
+    assert block.counters.n_board_rejected == block.counters.n_case_rejected == 0
+
+
 def test_switch_makes_no_step():
     # The sets differ by 5 counts = 1.7 mg: at the longest over 300 s, at 100 Hz 0.057 ug a sample.
     unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))

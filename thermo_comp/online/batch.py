@@ -10,19 +10,22 @@ is gathered, evaluated for all segments together and applied to all samples by t
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from operator import itemgetter
 from typing import Final, TypeAlias
 
 import numpy as np
 
 from ..recording.columns import Block
+from ..thermal.reading_queue import DISORDER_NS, NEVER_NS, PENDING_LIMIT
 from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.correction import Correction
 from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
 
-#: Readings yet to come, the next one last: samples before it, thermometer, stamp, degC.
-_Arrivals: TypeAlias = list[tuple[int, str, int, float]]
+#: Readings yet to come, the next one last: samples before it, the latest stamp of its thermometer
+#: so far, its name, its stamp, degC.
+_Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
 #: Each with the number of its samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
 #: Why a sample does not go out, 0 where it does.
@@ -55,15 +58,19 @@ def process_block(
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)
-    arrivals: _Arrivals = [
-        (place, name, stamp_ns, celsius)
-        for name in thermal.inputs
-        if name in block.temperatures
-        for stamp_ns, celsius, place in zip(
-            *(np.asarray(column).tolist() for column in block.temperatures[name]), strict=True
-        )
-    ]
-    arrivals.sort(key=lambda arrival: arrival[0])
+    arrivals: _Arrivals = []
+    for name in thermal.inputs:
+        if name in block.temperatures:
+            stamp_ns, celsius, place = map(np.asarray, block.temperatures[name])
+            own = (
+                place,
+                np.maximum.accumulate(stamp_ns),
+                np.full(len(place), name),
+                stamp_ns,
+                celsius,
+            )
+            arrivals += zip(*(column.tolist() for column in own), strict=True)
+    arrivals.sort(key=itemgetter(0, 1))
     arrivals.reverse()
     runs = _runs(compensator.last_ns, stamps)
     compensator.counters.n_out_of_order += len(stamps) - sum(map(len, runs))
@@ -101,9 +108,18 @@ def _runs(last_ns: int, stamps: Stamps) -> list[Ints]:
     return [np.array(run, dtype=np.int64) for run in runs]
 
 
-def _push(compensator: Compensator, arrivals: _Arrivals, place: int) -> None:
+def _push(
+    compensator: Compensator, arrivals: _Arrivals, place: int, due_ns: int = EVER_NS
+) -> None:
+    """Queue readings up to a place, the next sample of which is stamped so, if it is known."""
+    thermal = compensator.thermal
     while arrivals and arrivals[-1][0] <= place:
-        compensator.thermal.push(*arrivals.pop()[1:])
+        _, _, name, stamp_ns, celsius = arrivals.pop()
+        if len(thermal.queue) >= PENDING_LIMIT:
+            # They take effect meanwhile in a node that waits for a sample; for the first, all do.
+            limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
+            thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
+        thermal.push(name, stamp_ns, celsius)
 
 
 def _gather(
@@ -116,11 +132,12 @@ def _gather(
     rows = [np.arange(0)]
     at = 0
     while at < len(stamps):
-        _push(compensator, arrivals, index.item(at))
+        _push(compensator, arrivals, index.item(at), stamps.item(at))
         thermal.flush(stamps.item(at))
+        compensator.last_ns = stamps.item(at)
         stop = int(stamps.searchsorted(thermal.queue.next_ns))
         while arrivals and (place := int(index.searchsorted(arrivals[-1][0]))) < stop:
-            _, name, stamp_ns, celsius = arrivals.pop()
+            _, _, name, stamp_ns, celsius = arrivals.pop()
             thermal.push(name, stamp_ns, celsius)
             stop = min(stop, max(place, int(stamps.searchsorted(stamp_ns))))
         after, fresh_ns = stop, thermal.fresh_until_ns
