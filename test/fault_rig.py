@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from thermo_comp.unit.calibration import Axes, AxisReference, Calibration, Unit
 
 START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5
-READINGS_HZ = 5.0
+READINGS_HZ = 2.5
 DURATION_S = 320.0
 #: The platform turns until here and stands from here on.
 STANDS_S = 40.0
@@ -145,6 +146,7 @@ def counts_of(force: np.ndarray, case: np.ndarray, board: np.ndarray, memory: np
     return force * scale[:, None] + np.array(BIAS) + drift[:, None]
 
 
+@cache
 def bag(
     rate_hz: float = RATE_HZ,
     ramp_s: tuple[float, float] = RAMP_S,

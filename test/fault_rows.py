@@ -120,7 +120,7 @@ def sensor_rows(name: str) -> list[Row]:
             frozen(name, 80.0, 130.0),
             ((WARN, f'{name} temperature frozen'), (level, lost)),
             3650,
-            silent=((107.0, 129.5),) if is_board else (),
+            silent=((107.8, 129.5),) if is_board else (),
             recovered=165.0,
         ),
         Row(
@@ -298,8 +298,8 @@ SAMPLE_ROWS = [
         value('counts', 130.0, 220.0, lambda v: (v[0], v[1], -v[2])),
         ((ERROR, 'or an axis reversed? Nothing is published'),),
         2800,
-        silent=((137.0, 220.0),),
-        blind=(130.0, 137.0),
+        silent=((138.1, 220.0),),
+        blind=(130.0, 138.1),
         recovered=220.0,
     ),
     Row(
@@ -309,8 +309,8 @@ SAMPLE_ROWS = [
         value('counts', 0.0, 999.0, lambda v: (v[0], v[1], -v[2])),
         ((ERROR, 'or an axis reversed? Nothing is published'),),
         500,
-        silent=((47.0, 320.0),),
-        blind=(0.0, 47.0),
+        silent=((48.1, 320.0),),
+        blind=(0.0, 48.1),
         recovered=math.inf,
     ),
     *(
