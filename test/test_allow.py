@@ -107,6 +107,10 @@ def frozen(rest: Rest) -> None:
     rest.accel[:] = rest.level
 
 
+def in_kelvins(rest: Rest) -> None:
+    rest.warm += 273.15
+
+
 @pytest.mark.parametrize(
     ('spoil', 'said'),
     [
@@ -126,11 +130,25 @@ def test_what_gives_no_numbers_is_a_sentence(rng, spoil, said):
     [
         (two_minutes_are_lost, 'unmeasured', '^2[0-9] % of the time at rest has no temperatures'),
         (frozen, 'stuck', '^no sample at rest differs from the one before'),
+        (
+            in_kelvins,
+            'kelvins',
+            r'^temperature/board reads 2\d+\S* .. \d+\S* degC: that looks like',
+        ),
     ],
 )
 def test_what_is_likely_a_mistake_is_said(rng, spoil, name, said):
     findings = {one.name: one.message for one in fit(spoilt(rng, spoil), FORCE).findings}
     assert re.search(said, findings[name])
+
+
+def test_an_axis_that_is_dead_in_one_position_is_named(rng):
+    # WHY: y read 3000 to the bit for hours, and its drift went into all others.
+    rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
+    rests[4].accel[:, 1] = rests[4].level[1]
+    sources = [rest.source(name=f'bag{number}') for number, rest in enumerate(rests)]
+    with pytest.raises(FitError, match=r'^bag4: y reads \S+ to the bit for 0\.\d+ h: the axis is'):
+        fit(sources, FORCE)
 
 
 def spoilt(rng, spoil):

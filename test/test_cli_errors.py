@@ -90,8 +90,12 @@ class TestUsage:
             (('simulate', '-o', 'a', '--profile', '20, up'), r"step 2 'up'"),
             (('simulate', '-o', 'a', '--profile', '20, 90'), r'air of 20\.\.90 degC needs -.* W'),
             (
-                ('simulate', '-o', 'a', '--temperature-rate-hz', '0'),
-                r'`temperature_rate_hz` must be positive',
+                ('simulate', '-o', 'a', '--temperature-rate-hz', '1e6'),
+                r"'--temperature-rate-hz': .* less than or equal to 100",
+            ),
+            (
+                ('simulate', '-o', 'a', '--plan', 'held-out', '--positions', '3'),
+                r'--plan is a whole test: leave out --profile and --positions',
             ),
             (('simulate', '-o', 'a', '--positions', '0'), r"Invalid value for '--positions'"),
             (('convert', 'a.parquet', '-o', 'b'), r'--columns'),

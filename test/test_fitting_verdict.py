@@ -180,6 +180,11 @@ def test_a_drift_that_temperature_does_not_explain_is_said() -> None:
     assert 'temperature does not explain' in finding.message
 
 
+def test_what_is_worse_than_nothing_on_another_position_is_said() -> None:
+    """Temperatures an hour late by another clock: 692 raw, 520 in sample, 878 left out."""
+    assert 'left out are worse than raw' in judged(692.0, 520.0, 9.0, 878.0)['misfit'].message
+
+
 def test_data_without_drift_look_compensated() -> None:
     assert 'already compensated?' in judged(1.1, 1.0, 0.1, 1.0)['compensated'].message
 

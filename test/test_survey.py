@@ -80,6 +80,14 @@ def test_thousandths_of_a_degree_are_no_degrees(tmp_path: Path) -> None:
     ]
 
 
+def test_kelvins_are_told_with_their_topic(tmp_path: Path) -> None:
+    findings = survey(tmp_path / 'bag', up_and_down(278.0, 308.0)).findings
+    assert [f for f in findings if 'kelvins' in f] == [
+        f'temperature/{name} reads 278 .. 308 degC: that looks like kelvins'
+        for name in ('board', 'case')
+    ]
+
+
 def test_one_direction_only(tmp_path: Path) -> None:
     heating = np.interp(np.arange(3600.0), [0, 600, 3000, 3600], [5.0, 5.0, 35.0, 35.0])
     findings = survey(tmp_path / 'bag', heating).findings

@@ -51,14 +51,14 @@ def simulate(
         'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
         'tumble, tumble-3, tumble-1 or held-out.'
     ),
-    profile: str = option(
-        "Chamber program: a name, or like '20 30min, 35@0.5 1h, 5@1 1h'.", 'chamber'
+    profile: str | None = option(
+        "Chamber program: a name (else chamber), or like '20 30min, 35@0.5 1h, 5@1 1h'."
     ),
-    positions: int = option('Number of positions, one bag each.', 1, min=1, max=999),
+    positions: int | None = option('Number of positions, one bag each; else 1.', min=1, max=999),
     position_seed: int = option('Which set of positions.', 0, min=0),
-    rate_hz: float = option('Conversion cycles per second.', 100.0, min=0.1),
+    rate_hz: float = option('Conversion cycles per second.', 100.0, min=0.1, max=1e5),
     temperature_rate_hz: float | None = option(
-        "Temperature readings per second, else the sensors' own."
+        "Temperature readings per second, else the sensors' own.", min=1e-4, max=100.0
     ),
     seed: int = option('Seed of the noise.', 0, min=0),
     gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY),
@@ -86,9 +86,12 @@ def simulate(
     with options.usage_of():
         specimen = presets.unit_preset(unit, unit_seed)
         if plan is None:
+            profile = profile or 'chamber'
             program = campaign.parse_cyclogram(profile)
-            ups = campaign.positions(positions, position_seed)
+            ups = campaign.positions(positions or 1, position_seed)
             stations = tuple(campaign.Position(profile, program, up) for up in ups)
+        elif profile or positions:
+            raise options.usage('--plan is a whole test: leave out --profile and --positions')
         else:
             stations = campaign.plan(plan, position_seed)
     if sibling is not None:

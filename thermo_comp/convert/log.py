@@ -23,6 +23,7 @@ from ..errors import RecordingError
 from ..files import shown_name
 from ..fitting.sources import digest
 from ..recording.columns import ImuColumns, Readings
+from ..recording.overview import KELVINS
 from ..recording.stillness import CellAccumulator
 from ..recording.topics import Topics
 from ..recording.writer import STAMP_END_NS, BagWriter
@@ -209,7 +210,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
     for name, readings in log.temperatures.items():
         typical = float(np.nanmedian(readings.celsius)) if len(readings.celsius) else low
         if not low <= typical <= high:
-            guess = ': that looks like kelvins' if 180.0 < typical < 480.0 else ''
+            guess = ': that looks like kelvins' if KELVINS[0] < typical < KELVINS[1] else ''
             raise RecordingError(
                 f'the {name} temperature is {typical:.4g} degC in the median{guess}', path=log.path
             )

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ..errors import FitError
+from ..recording.overview import KELVINS
 from ..text import counted
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..typing import Floats
@@ -36,6 +37,8 @@ _WORST_GEOMETRY = 6.0
 _SATURATED_NEEDED, _SATURATED_ADVISED = 0.05, 0.001
 # A direction is unseen whose |f| is known so many times less than in the positions.
 _UNSEEN = 3.0
+# An axis that is alive differs from itself within so many samples.
+_DEAD_SAMPLES = 1000
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,14 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
     if not any(interval.sample_sd.any() for bag in bags for interval in bag.intervals):
         text = 'no sample at rest differs from the one before: does the sensor stand still?'
         yield _advice('stuck', text)
+    if dead := '; '.join(_dead_axes(bags)):
+        yield Finding('stuck', 'refusal', f'{dead}: the axis is dead there, leave out such a bag')
+    for name in sorted({name for bag in bags for name in bag.temperatures}):
+        read = [b.temperatures[name].value for b in bags if name in b.temperatures]
+        celsius = np.concatenate(read)
+        if len(celsius) and KELVINS[0] < np.median(celsius) < KELVINS[1]:
+            reads = f'temperature/{name} reads {np.min(celsius):.4g} .. {np.max(celsius):.4g} degC'
+            yield _advice('kelvins', f'{reads}: that looks like kelvins')
     means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
     size = float(np.median(np.linalg.norm(means, axis=1)))
     if options.input == 'counts' and not all(bag.is_integer for bag in bags):
@@ -114,6 +125,17 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
         text = f'{names}: not every sample has an angular rate, so no gyroscope was fitted'
         yield _advice('rate', text)
+
+
+def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[str]:
+    """Name axes that read one word throughout a rest, and more than one in most."""
+    rests = [(bag.source.name, one) for bag in bags for one in bag.intervals]
+    alive = np.array([one.sample_sd > 0.0 for _, one in rests])
+    for (name, one), row in zip(rests, alive, strict=True):
+        is_dead = ~row & (2 * alive.sum(axis=0) >= len(rests)) & (np.ptp(one.mean, axis=0) == 0.0)
+        for axis in np.flatnonzero(is_dead & (one.count.sum() >= _DEAD_SAMPLES)):
+            hours = (one.end_ns - one.start_ns) / 3600e9
+            yield f'{name}: {"xyz"[axis]} reads {one.mean[0, axis]:g} to the bit for {hours:.2g} h'
 
 
 def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
@@ -262,6 +284,9 @@ def judge_result(
     elif raw < 1.2 * fitted and has_temperature:
         why = ': no temperature drift above the noise; already compensated?'
         yield _advice('compensated', text + why)
+    elif overall.left_out.rms > overall.raw.rms and has_temperature:
+        why = 'it takes more positions, or temperature does not explain the drift'
+        yield _advice('misfit', f'{text}: positions left out are worse than raw: {why}')
     else:
         yield Finding('residual', 'good', text)
     if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:

@@ -62,13 +62,8 @@ def process_block(
     for name in thermal.inputs:
         if name in block.temperatures:
             stamp_ns, celsius, place = map(np.asarray, block.temperatures[name])
-            own = (
-                place,
-                np.maximum.accumulate(stamp_ns),
-                np.full(len(place), name),
-                stamp_ns,
-                celsius,
-            )
+            order, names = np.maximum.accumulate(stamp_ns), np.full(len(place), name)
+            own = (place, order, names, stamp_ns, celsius)
             arrivals += zip(*(column.tolist() for column in own), strict=True)
     arrivals.sort(key=itemgetter(0, 1))
     arrivals.reverse()

@@ -19,6 +19,8 @@ from .reader import open_recording
 from .stillness import CellAccumulator, still_intervals
 from .topics import Topics
 
+#: What no board endures, and a thermometer in kelvins reads.
+KELVINS = (180.0, 480.0)
 _RAMP_WINDOW_S = 120.0  # a ramp's rate is that of the board over so long
 _CELL_S, _MIN_REST_S = 0.5, 3.0
 _GAP_INTERVALS = 5.0  # a pause of this many usual intervals is a gap
@@ -76,8 +78,11 @@ def thermal_findings(thermometers: Mapping[str, ThermometerSurvey]) -> list[str]
             if rate < RAMP_K_MIN:
                 found.append(f'no {name} ramp: the dynamic set would not know {name}')
     for name, one in thermometers.items():
+        reads = f'{name} reads {one.lowest:.4g} .. {one.highest:.4g}'
         if one.lowest < COLDEST or one.highest > HOTTEST:
-            found.append(f'{name} reads {one.lowest:.4g} .. {one.highest:.4g}: that is no degC')
+            found.append(f'{reads}: that is no degC')
+        elif KELVINS[0] < one.lowest and one.highest < KELVINS[1]:
+            found.append(f'temperature/{reads} degC: that looks like kelvins')
     if 'case' not in thermometers:
         found.append(
             'no case temperature: the regime will follow the slower board sensor; name yours '
