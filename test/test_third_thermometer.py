@@ -70,8 +70,8 @@ def record(path: Path, run: SimulatedRun, *, has_lid: bool) -> Path:
 
 def fitted(bags: list[Path]) -> Calibration:
     sources, _ = fit_sources(bags)
-    # A response without products: the lid's effect has none, and the bank is a third as long.
-    groups = ('curve', 'now', 'board', 'neighbour')
+    # The lid's effect is of its temperature now, and the bank of these is a sixth of the whole.
+    groups = ('curve', 'now', 'board')
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups)).calibration
 
 
