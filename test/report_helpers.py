@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from builders import ArrayBlock
 
-from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
+from thermo_comp import fitting
+from thermo_comp.fitting import FitOptions, FitResult, FitSource
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.report.evidence import Evidence, evidence_of_fit
 from thermo_comp.report.page import render_report
@@ -65,7 +66,7 @@ def fitted() -> FitResult:
         )
     # Without products the bank is a third of the whole.
     groups = ('curve', 'set', 'now', 'board')
-    return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))
+    return fitting.fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))
 
 
 @cache

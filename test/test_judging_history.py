@@ -19,6 +19,8 @@ from thermo_comp.unit.calibration import AxisReference, Calibration, Source
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 
+pytestmark = pytest.mark.usefixtures('equal_fits_once')
+
 K = 300.0
 
 

@@ -13,6 +13,8 @@ from report_helpers import fitted, write_bag
 from thermo_comp.report.html import number
 from thermo_comp.unit.calibration_file import save_calibration
 
+pytestmark = pytest.mark.usefixtures('equal_fits_once')
+
 FACTS = (
     *('verdict', 'reason', 'is_valid', 'gravity_m_s2', 'window_s', 'tolerance_m_s2'),
     *('sections_m_s2', 'n_positions', 'moved', 'shifts', 'axis_rms_m_s2'),

@@ -31,6 +31,8 @@ from thermo_comp.report.style import drawing, svg
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.unit.calibration import Provenance
 
+pytestmark = pytest.mark.usefixtures('equal_fits_once')
+
 VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
 
 

@@ -31,6 +31,8 @@ from thermo_comp.report.page import render_report
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 
+pytestmark = pytest.mark.usefixtures('equal_fits_once')
+
 LAB = """
 number: 2026-017
 laboratory: {name: Inertial Lab, address: 1 Street, accreditation: L-1}

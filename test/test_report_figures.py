@@ -26,6 +26,8 @@ from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.gravity import MICRO_G
 
+pytestmark = pytest.mark.usefixtures('equal_fits_once')
+
 
 def test_bias_and_scale_curves_by_hand():
     # 3 counts per 10 K in a soak; while it heats at 1 K/min for 10 min, a lag of 600 s is

@@ -31,6 +31,8 @@ from thermo_comp.report.live import MOST_CLIENTS, LiveReport, LiveServer
 from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.calibration_file import save_calibration
 
+pytestmark = pytest.mark.usefixtures('equal_fits_once')
+
 TIMEOUT_S = 60.0
 
 

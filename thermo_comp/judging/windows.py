@@ -247,7 +247,8 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     # A window's mean is no sample: what looks for stuck or too large ones would misread it.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
-    readings = iter(readings_in_order(bag, compensator.thermal.inputs))
+    thermal = compensator.thermal
+    readings = iter(readings_in_order(bag, thermal.inputs))
     reading = next(readings, None)
     for row in sums:
         stamp_ns = bag.start_ns + round(float(row['time']) * 1e9)
@@ -256,15 +257,15 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
             compensator.flush(reading[1])
             reading = next(readings, None)
         corrected = compensator.process(stamp_ns, *row['mean'].tolist())
-        status = compensator.status()
-        state = status.state
-        if corrected is None or not state:
+        if corrected is None:
             row['excess'] = np.nan
             continue
+        state = thermal.sample(stamp_ns)
         row['force'] = corrected[:3]
         row['variance'] = variance_along(corrected[:3], corrected[3:])
-        row['excess'], row['swapped'] = status.excess.relative, status.is_lead_reversed
+        row['excess'] = thermal.correction.excess(state, is_dynamic=False).relative
+        row['swapped'] = thermal.tracker.lead.is_reversed
         row['board'], row['rate'], row['weight'] = state[BOARD], state[RATE], state[WEIGHT]
         if compensator.corrects_rate:
             row['gyro'][3:9] = compensator.correct_rate(stamp_ns, *row['gyro'][:3])
-            row['gyro'][9:] = compensator.thermal.tracker.sample(stamp_ns)
+            row['gyro'][9:] = thermal.tracker.sample(stamp_ns)
