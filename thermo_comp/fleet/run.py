@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns a run over a fleet: find, do what is missing, learn the type, write the table and page; a unit
-without a result.json, which is written last, has not been done.
-"""
+"""Owns a run over a fleet: what is missing is done; a result.json, written last, says it is."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns where a fleet's bags lie: on any file system that fsspec knows, which files make a bag, and
-which bags a unit: those of one folder, or of one serial.
-"""
+"""Owns where a fleet's bags lie, on any file system of fsspec, and which are one unit's."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the work on units, one after the other on each worker: bags read, unit fitted; and the way
-onto Dask: a cluster of this machine or of others, and what its accidents mean.
-"""
+"""Owns the work on a unit, its bags read and fitted, and the way of units onto Dask."""
 
 from __future__ import annotations
 

@@ -4,14 +4,10 @@
 Owns what physics says about samples: a converter that stands still, samples that come faster than
 conversions can, and |f| while the platform stands, which must be gravity.
 
-A converter with noise does not give the same three numbers to the bit for seconds, and three exact
-zeros are no measurement but a dead wire. A count is charge per conversion cycle, so samples that
-come at another rate are of another scale, whatever else they are.
-
-A calibration that has aged, or a unit that was exchanged, shows as a residual of |f| larger than
-its own uncertainty. Samples are gathered in windows of one second; a window counts as still when
-its scatter is that of the sensor and its mean that of the window before. A part of the samples
-serves as well as all of them; the window is longer where they are few.
+A converter with noise does not give three numbers to the bit for seconds; three exact zeros are a
+dead wire. A count is charge per cycle, so at another rate it is of another scale. A calibration
+that has aged, or of another unit, misses gravity by more than its own uncertainty in windows of a
+second, or longer, which are still: scatter as the sensor's, mean as in the window before.
 """
 
 from __future__ import annotations

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what makes a report a certificate: the laboratory's statements, the results with their
-expanded uncertainty, and the budget behind it, in the order of ISO/IEC 17025 practice.
-"""
+"""Owns what makes a report a certificate: statements, results, budget, after ISO/IEC 17025."""
 
 from __future__ import annotations
 
@@ -113,10 +110,7 @@ class CertificateInfo:
 
 
 def load_certificate_info(path: str | Path, serial: str | None = None) -> CertificateInfo:
-    """
-    Read a laboratory's statements on the unit with a serial; ThermoCompError, naming file and key,
-    if one is wrong or of another unit.
-    """
+    """Read a laboratory's statements; ThermoCompError, with file and key, if one is wrong."""
     data = read_plain_yaml(path)
     try:
         info = build(CertificateInfo, {} if data is None else data)
@@ -150,9 +144,7 @@ class Result(NamedTuple):
 def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...]:
     """
     Split the uncertainty of ``|f|`` at rest into what it comes from; empty without a judgement.
-
-    The calibration's claim for the judged windows is their white noise, the attitude and the
-    model together; repeatability is what the residual is larger than all of that claim.
+    Repeatability is what the residual exceeds white noise, attitude and model together by.
     """
     judgement, calibration = evidence.judgement, evidence.calibration
     if judgement is None or calibration is None or not judgement.sections['all'].n:

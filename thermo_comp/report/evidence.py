@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what a report is made of, gathered before anything is drawn: from a fit, from bags, or from a
-calibration alone; what is missing is None or empty, and its part of the page is left out.
-"""
+"""Owns what a report is made of: of a fit, of bags, or of a calibration; nothing is drawn here."""
 
 from __future__ import annotations
 
@@ -179,10 +176,7 @@ class Evidence:
         )
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """
-        Give the residual of each axis by rung, shape (n, 3) [m/s^2]; the mean direction that the
-        judged rung sees in a position stands for its attitude.
-        """
+        """Give the residual of each axis by rung, (n, 3) [m/s^2], about its position's mean."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
@@ -211,11 +205,9 @@ def evidence_of_bags(
     """
     Judge bags, with a calibration or without; no bags report on the calibration alone.
 
-    Gravity is the calibration's by default; `window_s` and `tolerance` are as for `evaluate`; an
-    empty `serial` accepts any calibration; `others` are further ones of the unit, for its history.
-
-    Raises CalibrationError for a calibration of another unit; RecordingError if samples are too
-    slow for such windows.
+    `window_s` and `tolerance` are as for `evaluate`; an empty `serial` accepts any calibration;
+    `others` are of the unit's history. Raises CalibrationError for a calibration of another unit;
+    RecordingError if samples are too slow for such windows.
     """
     windows = judgement = None
     said = sorted({bag.source.serial for bag in bags if bag.source.serial})

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the figures of bags: over the time of one, as the paper's Fig. 3, 4, 6 and 7 from the user's
-data, and over all positions: where they point, what is left in each.
-"""
+"""Owns the figures of bags: over time, as the paper's Fig. 3, 4, 6 and 7, and over positions."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the figures of the calibration itself, bias and scale, answer to a step, loop, history; and of
-a fleet of them: what is left unit by unit, and who stands out.
-"""
+"""Owns the figures of a calibration, from its curves to its history, and those of a fleet."""
 
 from __future__ import annotations
 
@@ -138,10 +135,7 @@ def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
 
 
 class Curve(NamedTuple):
-    """
-    Bias [micro-g] and scale [ppm] over the board temperature in one thermal state, against a soak
-    at the reference, shape (n, 6), with their sd; line, hatch and marker are how they are drawn.
-    """
+    """Bias [micro-g] and scale [ppm] in one state, against a soak at the reference, (n, 6)."""
 
     name: str
     line: style.Line

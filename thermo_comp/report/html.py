@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns how things are spelt in pages and figures: numbers, other people's names, and the way into
-HTML by templates that escape every text, under a policy by which nothing can run or be loaded.
-"""
+"""Owns the spelling of pages and figures, and the way into HTML, where nothing can run or load."""
 
 from __future__ import annotations
 
@@ -28,10 +25,7 @@ _LONGEST_MARGIN = 90
 
 
 def render(template: str, *, script: str = '', **context: Any) -> str:
-    """
-    Fill a template that extends ``page.html``, `title` at least; a viewer's script runs by a nonce
-    of this page alone.
-    """
+    """Fill a template that extends ``page.html``; a viewer's script runs by a nonce of its own."""
     nonce, policy = secrets.token_urlsafe(16), _POLICY
     if script:
         policy += f"; script-src 'nonce-{nonce}'; connect-src 'self'"

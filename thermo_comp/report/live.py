@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the live view: the certificate, made anew when its files change, served on the loopback
-interface under its own names only, so that no other site's page can reach it through the browser.
-"""
+"""Owns the live view: a certificate, anew when its files change, served to this machine alone."""
 
 from __future__ import annotations
 
@@ -42,9 +39,7 @@ setInterval(async () => {
 
 
 class LiveReport:
-    """
-    The page of a calibration and bags, as the files are; a bag is read when it changes, and told.
-    """
+    """The page of a calibration and bags, as the files are; what changes is read anew."""
 
     def __init__(
         self,
@@ -134,6 +129,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer with the page or with its version."""
         port = self.server.server_port
         status, kind, text = HTTPStatus.NOT_FOUND, 'plain', 'nothing here\n'
+        # Else another site's page could come here through the browser.
         if self.headers.get('Host') not in (f'{_HOST}:{port}', f'localhost:{port}'):
             status, text = HTTPStatus.FORBIDDEN, 'another host\n'
         elif self.path == '/':

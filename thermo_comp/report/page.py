@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the report as files, one HTML page and figures as PNG, and the list of its figures: what each
-asks, how its answer is read, and when it can be drawn.
-"""
+"""Owns the report as files, a page and PNGs, and the list of its figures: what each one asks."""
 
 from __future__ import annotations
 
@@ -73,9 +70,7 @@ def render_report(
     script: str = '',
     notice: str = '',
 ) -> str:
-    """
-    Make the page, with figures that are drawn already, and a viewer's script and notice, if any.
-    """
+    """Make the page; of a viewer come figures that are drawn already, script and notice."""
     if figures is None:
         figures = drawn_figures(figures_of(evidence))
     info = info or CertificateInfo()

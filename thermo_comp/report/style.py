@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the look of the figures, SVG and PNG: for black and white every line differs from its
-neighbours by its dashes; the colours are those of Okabe and Ito.
-"""
+"""Owns the look of the figures: lines differ by their dashes, and by colours of Okabe and Ito."""
 
 from __future__ import annotations
 
@@ -83,10 +80,7 @@ def new_figure(height: float) -> Figure:
 
 
 def svg(figure: Figure, name: str, label: str) -> str:
-    """
-    Write a figure as an SVG element, whose ids the letters and digits of `name` make unique;
-    `label` is for readers who do not see it.
-    """
+    """Write a figure as an SVG element; `name` makes its ids unique, `label` is for the blind."""
     buffer = io.StringIO()
     nothing = {'Date': None, 'Creator': None, 'Format': None, 'Type': None}
     figure.savefig(buffer, format='svg', metadata=nothing)

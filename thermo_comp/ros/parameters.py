@@ -3,11 +3,9 @@
 """
 Owns the node's parameters: the table of what they are, and the services that set them.
 
-The table is `NodeConfig` itself, a frozen dataclass: what the node runs with at any moment is one
-such object, and a change makes another one or is refused as a whole. rclpy serves a request in one
-go, in the thread of the samples. Here a thread of its own waits for what takes time, the reading
-of a file; what is left for the loop is to exchange one reference. Requests are answered in the
-order in which they came, whatever is wrong with them.
+The table is `NodeConfig`: what the node runs with is one such object, and a change makes another
+or is refused as a whole. A thread of its own waits for what takes time, the reading of a file; the
+loop exchanges one reference. Requests are answered in the order in which they came.
 """
 
 from __future__ import annotations

@@ -3,14 +3,10 @@
 """
 Owns the player: a bag onto the node's live input topics, with `/clock`, paced or flow controlled.
 
-Whatever the topics are called in the bag, they go out under the node's own relative names, so
-remappings and a namespace apply as to a sensor driver. The messages are those of the bag, byte
-for byte, in the bag's order; ROS 1 messages are rewritten in CDR.
-
-Flow control: after `WINDOW` messages of a topic the player waits until every reliable subscriber
-has acknowledged them, so that the queues of the transport hold what is under way. Fast DDS asks
-for acknowledgement with every message only while the publisher's history is full, and otherwise
-every 3 s; hence the small histories, which transient-local durability keeps full.
+Topics go out under the node's own relative names, messages byte for byte in the bag's order; ROS 1
+messages are rewritten in CDR. After `WINDOW` messages of a topic the player waits until every
+reliable subscriber has acknowledged them. Fast DDS asks for that with every message only while the
+history is full, and else every 3 s: hence small ones, which transient-local durability keeps full.
 """
 
 from __future__ import annotations

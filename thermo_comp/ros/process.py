@@ -3,9 +3,8 @@
 """
 Owns what a process sets up before its first node: its end by a signal, its Fast DDS profile.
 
-The middleware's own handlers shut the context down from a thread of theirs, under whatever is
-using it, which seldom ends in a segmentation fault. Here the interpreter only notes the signal; a
-thread asks the loop to stop, whose own thread then takes everything down in order.
+The middleware's own handlers shut the context down under whatever is using it, which seldom ends
+in a segmentation fault. Here a thread asks the loop to stop, which takes everything down in order.
 """
 
 from __future__ import annotations

@@ -115,11 +115,7 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class RegimeSet:
-    """
-    The coefficient set of one regime, with the ranges over which it was fitted.
-
-    Outside a range the regressor is held at the range's edge and the covariance grows.
-    """
+    """The set of one regime; outside its ranges it is held, and the covariance grows."""
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Board temperature [degC].']
     rate_range_k_min: Annotated[tuple[float, float], 'dT_board/dt [K/min].']

@@ -199,7 +199,6 @@ class ColumnTable:
     Columns, ready to be evaluated over states, shape (width, n); a result has (n_columns, n).
 
     Each state is evaluated alone, number by number, so that one has the bits of many.
-    `reference_temperature` is T_ref, `temperature_range_c` where t is held [degC].
     """
 
     def __init__(

@@ -199,12 +199,7 @@ class Correction:
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
-        """
-        Stretch a transition time to what an INS would overlook.
-
-        `given_s`: the time over which the sets are to cross over [s]; 0 = a hard switch. Returns
-        the time that the difference of the two sets needs, in soaks [s].
-        """
+        """Stretch the time [s] in which the sets cross over to what an INS would overlook."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
         static, dynamic = self.curves.values(board)
         gap = dynamic - static
@@ -289,10 +284,8 @@ class Correction:
         """
         Evaluate a, b, c of each axis, shape (3, 3, n), without the noise of a message.
 
-        To what the thermometers, the memory and what is slow leave uncertain comes what the two
-        sets disagree by (`gap`), while the regime is unknown, while they cross over, and in
-        proportion to how far the state lies outside the calibrated ranges. While the regime is
-        unknown either set may be the right one, and the variances of both count.
+        What the sets disagree by (`gap`) counts while they cross over, as far as the state lies
+        outside, and while the regime is unknown: then both variances count.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         rest, over = 1.0 - weight, raw - held

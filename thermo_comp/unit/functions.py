@@ -72,11 +72,7 @@ class _Family(ABC):
 
 @dataclass(frozen=True)
 class Polynomial(_Family):
-    """
-    ``c[0] + c[1] t + c[2] t^2 + ...`` (Eq. (10), with the leading constant where it belongs).
-
-    The first is the value at the reference: 0 for a bias function, 1 for a scale function.
-    """
+    """``c[0] + c[1] t + c[2] t^2 + ...`` (Eq. (10)): c[0] is 0 for a bias, 1 for a scale."""
 
     coefficients: tuple[float, ...]
     kind: Literal['polynomial'] = 'polynomial'

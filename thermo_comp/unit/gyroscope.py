@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the gyroscope of a unit: the bias of its angular rate over the same columns; its scale is 1.
-
-``w = measured - bias``, with the bias of `calibration`'s measurement model: level and curve of
-each regime, and the response. Ranges, reference temperature and thermometers are the unit's.
-"""
+"""Owns the gyroscope of a unit: the bias of its rate over the same columns; its scale is 1."""
 
 from __future__ import annotations
 
@@ -56,10 +51,9 @@ class RateTerm(Column):
 @dataclass(frozen=True)
 class Gyroscope:
     """
-    What temperature does to the angular rate.
+    What temperature does to the angular rate: ``w = measured - bias``, as in `calibration`.
 
-    The parameters of the posterior are axis by axis the level and the free coefficients of the
-    static set, those of the dynamic one, and the weights.
+    Parameters of the posterior: by axis level and coefficients of both sets, then the weights.
     """
 
     bias_rad_s: Annotated[Vector, 'At the reference temperature, in the mean over positions.']

@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns residual statistics: the few numbers that tests, the fit and the report all quote.
-
-A residual is ``corrected - true``. Of a position of unknown attitude only the norm is known to
-be true, so the residual that every bag gives is ``|f| - g``.
-"""
+"""Owns residual statistics: of corrected - true, and of ``|f| - g``, which needs no attitude."""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the covariance of all parameters of a calibration, as a factor that fits into its file.
-
-``covariance = factor @ factor.T + diag(rest)``, single precision in base64.
-"""
+"""Owns the covariance of all parameters: factor @ factor.T + diag(rest), float32 in base64."""
 
 from __future__ import annotations
 
@@ -30,11 +26,7 @@ _FLOAT32 = np.dtype('<f4')
 
 @dataclass(frozen=True)
 class Posterior:
-    """
-    What is uncertain about the parameters, all at once: factor @ factor.T + diag(rest).
-
-    The order of the parameters is that of `ParameterLayout`.
-    """
+    """Covariance of all parameters, by `ParameterLayout`: factor @ factor.T + diag(rest)."""
 
     rank: Annotated[int, Bounds(at_least=0), 'Number of columns of the factor.']
     factor: Annotated[
@@ -89,8 +81,8 @@ class Posterior:
 
 class Block(NamedTuple):
     """
-    Where the parameters of the bias, or of the scale, of one axis stand among all: from the level
-    of each set on its function's, from `response` to before `end` the weights of the response.
+    Where the parameters of the bias, or of the scale, of an axis stand: the levels of both sets,
+    each before its function's, and from `response` to before `end` the weights of the response.
     """
 
     static: int

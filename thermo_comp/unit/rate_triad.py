@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the gyroscope as a triad: a Calibration of scale 1 in which every m/s^2 reads rad/s.
-
-So whatever corrects, predicts or draws an accelerometer does it for the angular rate as well. Such
-a triad lives in memory alone.
-"""
+"""Owns the gyroscope as a triad, in memory alone: scale 1, every m/s^2 of it reads rad/s."""
 
 from __future__ import annotations
 

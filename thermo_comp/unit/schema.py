@@ -88,9 +88,7 @@ def build(hint: type[Value], data: Any, key: str = '') -> Value:
 
 @contextmanager
 def naming(key: str) -> Iterator[None]:
-    """
-    Turn a ValueError whose text starts with a key in backticks into a SchemaError of that key.
-    """
+    """Turn a ValueError that begins with a key in backticks into a SchemaError of that key."""
     try:
         yield
     except SchemaError:

@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the part of the error variance that changes slowly: parameters, and lags that started unseen.
-
-It is evaluated for one state at a time, by stream and batch alike, and held in between, so both
-have the same bits whatever library multiplies.
+Stream and batch evaluate it one state at a time, for the same bits, and hold it in between.
 """
 
 from __future__ import annotations

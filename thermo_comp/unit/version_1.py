@@ -1,10 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the calibration file of version 1: what it said in its own way becomes response and posterior.
-
-There each set had terms of its own in ``T_case - T_board``, in ``dT_board/dt`` and in
-``T_board - L_k``, and each axis of each set a covariance of its own.
+Owns the calibration file of version 1, whose sets had terms of their own in ``T_case - T_board``,
+``dT_board/dt`` and ``T_board - L_k``, and whose axes a covariance each, as response and posterior.
 """
 
 from __future__ import annotations
