@@ -6,7 +6,6 @@ Owns the measurement of reading: bag to columns, ours against rosbags and mcap i
 All read the same counts and temperatures (400 Hz and 2 x 10 Hz) from the same files. `rosbags`
 reads and deserializes each message; `mcap` reads each message and does not decode it at all.
 Rates are counts messages per second of wall time, best of the repeats; what matters are ratios.
-Ours uses two threads beside its own, so on a busy machine compare the CPU times.
 
     python benchmarks/bag_read.py --samples 1000000
 """

@@ -6,10 +6,8 @@ Reading: any bag that another tool wrote gives the columns of its messages in a 
 
 from __future__ import annotations
 
-import gc
 import shutil
 import tempfile
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -436,25 +434,3 @@ def test_a_closed_recording_gives_nothing(tmp_path: Path) -> None:
         reader.close()  # once more does no harm
         with pytest.raises(RecordingError, match=rf'{name}: the recording is closed'):
             next(reader.blocks())
-
-
-def test_readers_that_are_given_up_leave_no_threads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """
-    WHY: a generator given up is closed by the garbage collector wherever that happens to run;
-    one that then waited for its threads stopped the process for good. PROMISE: threads belong to
-    the open recording and end with it.
-    """
-    monkeypatch.setattr('thermo_comp.recording.columns.BLOCK_MESSAGES', 10)
-    path = tmp_path / 'bag.mcap'
-    write_mcap(path, regular_messages(400), chunk_size=500)
-    before = threading.active_count()
-    for _ in range(20):
-        with open_recording(path) as reader:
-            loop: list[object] = [reader.blocks()]
-            next(loop[0])  # type: ignore[call-overload]
-            loop.append(loop)  # a cycle: only the collector can close the generator
-    del loop
-    gc.collect()
-    assert threading.active_count() == before

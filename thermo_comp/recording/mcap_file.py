@@ -11,11 +11,11 @@ Whatever is no message is read by the `mcap` library.
 from __future__ import annotations
 
 import os
-from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from io import BytesIO
 from itertools import pairwise
 from operator import attrgetter
@@ -42,9 +42,6 @@ _FOOTER_BYTES = PREFIX.size + 20 + len(MAGIC)
 _MAX_SUMMARY_BYTES = 1 << 28
 _MAX_SMALL_RECORD = 1 << 22
 _WINDOW_BYTES = 1 << 22
-#: Chunks under way: what two threads read while the caller works on one block.
-_N_AHEAD = 8
-_AHEAD_BYTES = 1 << 26
 _MAX_HELD_BYTES = 1 << 26  # messages of overlapping chunks that are held back at most [bytes]
 #: What ends inside a record, by its opcode, or -1 for the others.
 _CUTS = {
@@ -68,12 +65,11 @@ _new_stream: Any = ReadDataStream  # versions of mcap differ in what of it is ty
 
 
 class McapFile(BagFile):
-    """One open MCAP file; its `spans` hold messages, in their order; `pool` reads ahead."""
+    """One open MCAP file; its `spans` hold messages, in their order."""
 
-    def __init__(self, path: Path, name: Path, pool: Executor) -> None:
+    def __init__(self, path: Path, name: Path) -> None:
         super().__init__(name)
         self.spans: list[Span] = []
-        self._pool = pool
         self._counts: Counter[int] = Counter()
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
@@ -86,34 +82,16 @@ class McapFile(BagFile):
 
     def read(self, channels: Collection[int], work: Work[Done]) -> Iterator[Done]:
         """Read the messages of channels in reading order, and do some work on them."""
-        # What a thread has decompressed it works on, too: it has the bytes in its cache.
-        if all(one.end_ns <= other.start_ns for one, other in pairwise(self.spans)):
-            yield from self._ahead(self.spans, lambda span: work(self._load(span, channels)))
-            return
         order = sorted(range(len(self.spans)), key=lambda row: self.spans[row].start_ns)
         spans = [self.spans[row] for row in order]
-        following = [*(span.start_ns for span in spans[1:]), None]
-        loaded = self._ahead(spans, lambda span: self._load(span, channels))
-        yield from map(work, _in_order(zip(order, loaded, following, strict=True)))
+        loaded = map(partial(self._load, channels), spans)
+        if any(one.end_ns > other.start_ns for one, other in pairwise(self.spans)):
+            following = [*(span.start_ns for span in spans[1:]), None]
+            pieces = zip(order, loaded, following, strict=True)
+            return map(work, _in_order(pieces))
+        return map(work, loaded)
 
-    def _ahead(self, spans: Collection[Span], work: Callable[[Span], Done]) -> Iterator[Done]:
-        """Read, decompress and work ahead in threads; most of it needs no interpreter lock."""
-        # The pool is not this generator's own: one that is given up is closed by the garbage
-        # collector, anywhere, where waiting for a thread may be a deadlock.
-        largest = max((1, *(span.size for span in spans)))
-        waiting: deque[Future[Done]] = deque()
-        try:
-            for span in spans:
-                if len(waiting) >= min(_N_AHEAD, max(1, _AHEAD_BYTES // largest)):
-                    yield waiting.popleft().result()
-                waiting.append(self._pool.submit(work, span))
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()
-
-    def _load(self, span: Span, channels: Collection[int]) -> Messages:
+    def _load(self, channels: Collection[int], span: Span) -> Messages:
         """Read a stretch; records that matter were read when the file was opened."""
         return load(self._read_at, span, lambda *_: None).of_channels(channels).in_order()
 

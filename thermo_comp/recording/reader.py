@@ -12,7 +12,6 @@ from __future__ import annotations
 import re
 from collections import ChainMap, Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -31,7 +30,6 @@ from .mcap_file import McapFile
 from .topics import WHOLE, Topics, select_topics, shown
 from .wire import decode_blocks
 
-_N_LOADERS = 2
 _MAX_BYTES = 1 << 24
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
 #: What is decoded at once of a foreign file.
@@ -84,7 +82,6 @@ class RecordingReader(ExitStack):
         folder = ''
         if found.compression == 'file':
             folder = self.enter_context(TemporaryDirectory(prefix='thermo_comp-'))
-        pool = ThreadPoolExecutor(_N_LOADERS, 'recording')
         notes = [found.note]
         for name in found.files:
             file = name
@@ -95,7 +92,7 @@ class RecordingReader(ExitStack):
             is_packed = found.compression == 'message'
             one: McapFile | ForeignFile
             if found.storage == 'mcap' and not is_packed:
-                one = McapFile(file, name, pool)
+                one = McapFile(file, name)
             else:
                 one = ForeignFile(file, name, is_packed=is_packed)
             self.callback(one.close)
@@ -103,8 +100,6 @@ class RecordingReader(ExitStack):
             if one.truncated is not None:
                 front = f'{name.name}: ' if len(found.files) > 1 else ''
                 notes.append(front + one.truncated)
-        # Ended before the files that its threads read.
-        self.callback(pool.shutdown, wait=True, cancel_futures=True)
         channels: dict[str, list[Topic]] = {}
         for topic in (topic for one in self._files for topic in one.topics.values()):
             channels.setdefault(topic.name, []).append(topic)
