@@ -10,10 +10,10 @@ A column is a numpy array with one row per message. All times are integer nanose
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,10 +36,6 @@ _MOST_JUMPS = 100
 # Of one clock are not so many readings that are stamped so far apart in the median [s].
 _FEWEST_READINGS, _APART_S = 10, 10.0
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
-
-Done = TypeVar('Done')
-#: What is done with messages while their bytes are at hand.
-Work: TypeAlias = Callable[['Messages'], Done]
 
 
 def gather(buffer: Bytes, at: Ints, n_bytes: int) -> Any:

@@ -31,7 +31,7 @@ from mcap.stream_reader import StreamReader
 from ..errors import RecordingError
 from ..files import open_regular
 from .chunks import HEAD_BYTES, PREFIX, DamagedError, Span, load, parse_chunk_head, translated
-from .columns import BagFile, Done, Messages, Topic, Work, join_messages
+from .columns import BagFile, Messages, Topic, join_messages
 
 MAGIC = b'\x89MCAP0\r\n'
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
@@ -80,16 +80,15 @@ class McapFile(BagFile):
             self._map()
             opened.pop_all()
 
-    def read(self, channels: Collection[int], work: Work[Done]) -> Iterator[Done]:
-        """Read the messages of channels in reading order, and do some work on them."""
+    def read(self, channels: Collection[int]) -> Iterator[Messages]:
+        """Read the messages of channels in reading order."""
         order = sorted(range(len(self.spans)), key=lambda row: self.spans[row].start_ns)
         spans = [self.spans[row] for row in order]
         loaded = map(partial(self._load, channels), spans)
         if any(one.end_ns > other.start_ns for one, other in pairwise(self.spans)):
             following = [*(span.start_ns for span in spans[1:]), None]
-            pieces = zip(order, loaded, following, strict=True)
-            return map(work, _in_order(pieces))
-        return map(work, loaded)
+            return _in_order(zip(order, loaded, following, strict=True))
+        return loaded
 
     def _load(self, channels: Collection[int], span: Span) -> Messages:
         """Read a stretch; records that matter were read when the file was opened."""

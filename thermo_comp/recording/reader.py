@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import re
 from collections import ChainMap, Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
 from math import inf
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -25,7 +24,7 @@ from ..files import read_bounded
 from ..plain_yaml import PlainYamlError, load_plain_yaml
 from . import columns
 from .chunks import MAX_CHUNK_BYTES, expand, inflate, inflate_ros1_chunk, translated
-from .columns import ROLES, Block, Done, Input, Messages, RecordingInfo, Role, Topic, Work
+from .columns import ROLES, Block, Input, Messages, RecordingInfo, Role, Topic
 from .mcap_file import McapFile
 from .topics import WHOLE, Topics, select_topics, shown
 from .wire import decode_blocks
@@ -126,12 +125,15 @@ class RecordingReader(ExitStack):
     def _blocks(self, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
         roles = {topic: role for role, topic in self.topics.items()}
 
-        def decoded(topics: Mapping[int, Topic], messages: Messages) -> list[Block]:
-            feeds = {number: (roles[topic.name], topic) for number, topic in topics.items()}
-            return decode_blocks(messages, feeds, self.topics, keep_raw=raw)
+        def decoded() -> Iterator[Block]:
+            for path, topics, messages in self._read(roles, {'cdr', 'ros1'}):
+                feeds = {number: (roles[one.name], one) for number, one in topics.items()}
+                with translated(path):
+                    found = decode_blocks(messages, feeds, self.topics, keep_raw=raw)
+                yield from found
 
         n_read = dict.fromkeys(self.topics, 0)
-        for block in columns.gathered(self._read(roles, {'cdr', 'ros1'}, decoded), n_messages):
+        for block in columns.gathered(decoded(), n_messages):
             self.apart = self.apart or columns.clocks_apart(block)
             for role in n_read:
                 n_read[role] += len(block.log_ns[role])
@@ -147,15 +149,15 @@ class RecordingReader(ExitStack):
 
     def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
         """Read topics, by the bag's own names, as they are, about in order of log time."""
-        return self._read(topics, {'cdr'}, _by_topic)
+        for _, own, messages in self._read(topics, {'cdr'}):
+            for number, topic in own.items():
+                if len(one := messages.of_channels([number])):
+                    yield topic, one.packed()
 
     def _read(
-        self,
-        names: Collection[str],
-        encodings: Collection[str],
-        work: Callable[[Mapping[int, Topic], Messages], list[Done]],
-    ) -> Iterator[Done]:
-        """Do some work on the messages of topics, file by file."""
+        self, names: Collection[str], encodings: Collection[str]
+    ) -> Iterator[tuple[Path, Mapping[int, Topic], Messages]]:
+        """Read the messages of topics, file by file, with the file and its channels."""
         if not self._files:
             raise RecordingError('the recording is closed', self.info.path)
         for file in self._files:
@@ -165,8 +167,8 @@ class RecordingReader(ExitStack):
                     reason = f'its messages are encoded as {shown(topic.encoding)!r}, expected cdr'
                     raise RecordingError(reason, file.path, shown(topic.name))
             with translated(file.path, is_foreign=isinstance(file, ForeignFile)):
-                for found in file.read(own, partial(work, own)) if own else ():
-                    yield from found
+                for messages in file.read(own) if own else ():
+                    yield file.path, own, messages
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
         """Read the bag for whoever walks its time: without the jumps of its clock."""
@@ -301,11 +303,6 @@ def _place_of(file: Path) -> tuple[int, str]:
     return (int(number[1]) if number else 0, file.name)
 
 
-def _by_topic(topics: Mapping[int, Topic], messages: Messages) -> list[tuple[Topic, Messages]]:
-    found = ((topic, messages.of_channels([number])) for number, topic in topics.items())
-    return [(topic, one.packed()) for topic, one in found if len(one)]
-
-
 def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
     if n_read >= n_promised:
         return None
@@ -345,12 +342,8 @@ class ForeignFile(columns.BagFile):
                     kind = f'ros2{one.msgdef.format.name.lower()}'
                     self.definitions[one.msgtype] = kind, one.msgdef.data
 
-    def read(self, channels: Collection[int], work: Work[Done]) -> Iterator[Done]:
-        """Read the messages of channels in reading order, and do some work on them."""
-        yield from map(work, self._messages(channels))
-
-    def _messages(self, channels: Collection[int]) -> Iterator[Messages]:
-        """Read messages of channels, the numbers of the reader's connections."""
+    def read(self, channels: Collection[int]) -> Iterator[Messages]:
+        """Read messages of channels, the numbers of the reader's connections, in reading order."""
         chosen = [self._reader.connections[number] for number in channels]
         known = {(one.topic, one.msgtype): n for n, one in zip(channels, chosen, strict=True)}
         batch: list[tuple[bytes, int, int]] = []
