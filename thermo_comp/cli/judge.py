@@ -60,12 +60,7 @@ def evaluate(
         with table_writer(csv, {}, overwrite=force) as write:
             write(columns_of(judged.windows, list(map(shown_name, bags))))
     drifts = drifts_of(history_of([one for _, one in models]))
-    out.table(
-        ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
-        _sections(result.judgements, micro_g),
-        title=f'|f| - g over {judged.windows.window_s:g} s at rest; outside: of the calibrated '
-        'ranges',
-    )
+    tell_sections(out, result.judgements)
     columns = ['axis', 'static ug', 'dynamic ug']
     title = 'what temperature moves each axis at rest (RMS of its windows)'
     if judged.shifts:
@@ -106,6 +101,16 @@ def evaluate(
         **judged.facts(),
         history=drifts,
         calibrations={name: one.facts() for name, one in result.judgements.items()},
+    )
+
+
+def tell_sections(out: Output, judgements: Mapping[str, Any]) -> None:
+    """Print what each calibration leaves of |f|."""
+    (window_s,) = {one.windows.window_s for one in judgements.values()}
+    out.table(
+        ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
+        _sections(judgements, micro_g),
+        title=f'|f| - g over {window_s:g} s at rest; outside: of the calibrated ranges',
     )
 
 

@@ -20,8 +20,9 @@ from ..errors import ThermoCompError
 from ..files import bag_kind, check_output
 from ..unit.gravity import STANDARD_GRAVITY
 from . import options
+from .judge import tell_sections
 from .options import option
-from .output import Cell, Output, micro_g, picked
+from .output import Output, picked
 
 if TYPE_CHECKING:
     from ..recording.writer import BagWriter
@@ -193,7 +194,6 @@ def demo(
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     from ..arrays import fit
     from ..judging.evaluation import evaluate
-    from ..judging.verdicts import SECTIONS
     from ..recording.reader import inspect_recording
     from ..report.evidence import evidence_of_bags
     from ..report.page import write_report
@@ -241,19 +241,7 @@ def demo(
     result = evaluate([held_out], models, gravity=STANDARD_GRAVITY)
     out.line()
     judged = result.judgements
-    rows: list[tuple[Cell, ...]] = []
-    for section in SECTIONS:
-        parts = [judged[name].sections[section] for name in _MODELS]
-        if parts[0].n:
-            pairs = [(one.rms, one.peak) for one in parts]
-            pairs.insert(0, (parts[-1].raw_rms, parts[-1].raw_peak))
-            cells = [f'{micro_g(rms):>4} / {micro_g(peak):>4}' for rms, peak in pairs]
-            rows.append((section, parts[0].n, *cells))
-    out.table(
-        ('section', 'windows', 'raw', *_MODELS),
-        rows,
-        title=f'|f| error in ug over {judged["node"].windows.window_s:g} s, RMS / max',
-    )
+    tell_sections(out, judged)
     out.line('one set: one cubic for all; two sets: another one in the dynamic regime, as in the')
     out.line('paper; node: two sets and the thermal response that the evidence wants')
     page, figures = output / 'report.html', output / 'figures'

@@ -25,7 +25,7 @@ from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from ..unit.gyroscope import MILLIDEGREE, Gyroscope, RateCurve, RateSet
 from ..unit.prediction import bias_and_scale, ramp_states
 from ..unit.rate_triad import rate_triad
-from .tools import TOOLS, Content, ql, turned
+from .tools import READERS, WRITERS, Content, ql, turned
 
 _GRID = 257
 #: White noise of an imported gyroscope, of which nothing is said [rad/s/sqrt(Hz)].
@@ -43,18 +43,16 @@ def export_calibration(
     up: tuple[float, float, float] | None = None,
 ) -> Content:
     """
-    Write a calibration's static set as parameters of an autopilot, one of `TOOLS`: their `text`,
-    and in the `notes` what they cannot hold.
+    Write a calibration's static set as parameters of one of `WRITERS`: their `text`, and
+    in the `notes` what they cannot hold.
 
     `number`: which set; `device_id`: by which PX4 matches it. At the attitude `up`, a unit vector,
     the drift of the scale is folded into the offset.
     """
-    write = TOOLS[to].write
-    if write is None:
-        raise ValueError(f'`to` must be an autopilot, got {to}')
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')
-    content = _content(calibration, TOOLS[to].reference_c, up)
+    write, reference_c = WRITERS[to]
+    content = _content(calibration, reference_c, up)
     text = write(content, number, device_id)
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
     # Whatever a note holds, it ends with its line.
@@ -138,11 +136,11 @@ def import_calibration(
     noise_density: float = 200.0 * MICRO_G,
 ) -> Calibration:
     """
-    Read the file of one of `TOOLS`, told by what it holds, with the same set in both regimes.
+    Read the file of a tool, told by what it holds, with the same set in both regimes.
     `number` chooses a set or IMU; None takes the only one there is. `full_scale` is in m/s^2.
     """
-    read = (tool.read(text, number) for tool in TOOLS.values())
-    content = next((one for one in read if one is not None), None)
+    found = (read(text, number) for read in READERS)
+    content = next((one for one in found if one is not None), None)
     if content is None:
         raise CalibrationError(
             'no TC_A* (PX4) or INS_TCAL* (ArduPilot) parameters in the text, nor the matrices of '

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the files of other tools, `TOOLS`: how each is read, and those of autopilots written.
+Owns the files of other tools: how each is read, and those of autopilots written.
 
 Autopilots correct each axis' bias by a cubic of the sensor's own temperature, held at the edges of
 a range, in m/s^2 or, of a gyroscope, in rad/s, and nothing else; ``raw`` is already in m/s^2
@@ -24,7 +24,7 @@ A triangle of the other kind, or a full matrix, belongs to a frame that is turne
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -296,19 +296,12 @@ def _array(value: object, key: str, size: int) -> Floats:
     return array.ravel()
 
 
-@dataclass(frozen=True)
-class Tool:
-    """One tool's file: a bias over temperature, written too, or scale and misalignment."""
-
-    read: Callable[[str, int | None], Content | None]  # None of a text that is no such file
-    write: Callable[[Content, int | None, int], str] | None = None
-    reference_c: float | None = None  # where it is fixed
-
-
-TOOLS = {
-    'px4': Tool(_read_px4, _write_px4),
-    'ardupilot': Tool(_read_ardupilot, _write_ardupilot, _ARDUPILOT_REFERENCE_C),
-    'imu_tk': Tool(_read_imu_tk),
-    'imu_calib': Tool(_read_imu_calib),
-    'kalibr': Tool(_read_kalibr),
+#: Each gives None of a text that is no such file.
+READERS: tuple[Callable[[str, int | None], Content | None], ...] = (
+    *(_read_px4, _read_ardupilot, _read_imu_tk, _read_imu_calib, _read_kalibr),
+)
+#: Of autopilots; and the temperature that their cubics count from, where it is fixed.
+WRITERS: Mapping[str, tuple[Callable[[Content, int | None, int], str], float | None]] = {
+    'px4': (_write_px4, None),
+    'ardupilot': (_write_ardupilot, _ARDUPILOT_REFERENCE_C),
 }
