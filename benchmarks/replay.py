@@ -32,7 +32,6 @@ from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.writer import BagWriter
-from thermo_comp.replay import BLOCK_MESSAGES
 from thermo_comp.replay import replay as replay_bag
 from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.calibration_file import load_calibration
@@ -70,17 +69,14 @@ def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
 def read(path: Path) -> int:
     """Read to columns, block by block."""
     with open_recording(path) as reader:
-        return sum(len(block) for block in reader.blocks(n_messages=BLOCK_MESSAGES))
+        return sum(len(block) for block in reader.blocks())
 
 
 def read_and_compensate(path: Path) -> int:
     """Read to columns and correct."""
     compensator = Compensator(calibration())
     with open_recording(path) as reader:
-        return sum(
-            len(process_block(compensator, block).index)
-            for block in reader.blocks(n_messages=BLOCK_MESSAGES)
-        )
+        return sum(len(process_block(compensator, block).index) for block in reader.blocks())
 
 
 def compensate(path: Path) -> tuple[int, float]:
@@ -89,7 +85,7 @@ def compensate(path: Path) -> tuple[int, float]:
     spent = 0.0
     n = 0
     with open_recording(path) as reader:
-        for block in reader.blocks(n_messages=BLOCK_MESSAGES):
+        for block in reader.blocks():
             # The thread's own clock: the reader decompresses ahead in others.
             begin = time.thread_time()
             n += len(process_block(compensator, block).index)

@@ -265,10 +265,9 @@ def test_progress_goes_from_nothing_to_all(tmp_path: Path) -> None:
 def test_memory_does_not_grow_with_the_bag(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Many blocks, so that what is held does not depend on how two of them meet in the threads of
-    # reader and writer, and more than is read ahead, in the short bag, too; and a unit that
-    # converts at this rate, or all samples would be held back.
-    monkeypatch.setattr('thermo_comp.replay.BLOCK_MESSAGES', 1 << 13)
+    # Many blocks in the short bag, too; and a unit that converts at this rate, or all samples
+    # would be held back.
+    monkeypatch.setattr('thermo_comp.recording.columns.BLOCK_MESSAGES', 1 << 13)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)
     calibration = dataclasses.replace(calibration, unit=unit)

@@ -37,8 +37,6 @@ from .unit.calibration import Calibration
 
 OUTPUT_TOPIC = 'imu/data_raw'
 REGIME_TOPIC = 'regime/dynamic'
-#: Messages corrected at once: enough that what is done per block costs little beside them.
-BLOCK_MESSAGES = 1 << 15
 # Readings between these quantiles are no glitches; thermometers have this noise [K].
 _BULK, _NOISE_K = (0.01, 0.99), 0.1
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
@@ -133,7 +131,7 @@ def replay(
             bag = BagWriter(output, metadata=metadata, overwrite=overwrite)
             sink = _messages_of(bag, reader, metadata['serial'], frame_id, all_topics)
         with sink as write:
-            for block in reader.blocks(raw=is_raw, n_messages=BLOCK_MESSAGES):
+            for block in reader.blocks(raw=is_raw):
                 rate = None if block.imu is None else block.imu.angular_velocity
                 corrected = process_block(compensator, block, rate)
                 new = compensator.take_flags()

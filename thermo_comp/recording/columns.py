@@ -26,9 +26,8 @@ Role = str  # ``accel``, or the name of a thermometer
 
 ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 
-#: A block is given out once it has so many messages, where nobody wants another number; a chunk
-#: of usual size has more.
-BLOCK_MESSAGES = 1 << 13
+#: A block is given out once it has so many messages: what is done per block costs little then.
+BLOCK_MESSAGES = 1 << 15
 
 LONGEST_PAUSE_NS = 3600 * 10**9  # what a longer jump of the stamps becomes [ns]
 #: More jumps are no clock; and so many days need a message every so many seconds.
@@ -284,11 +283,10 @@ class Recording(NamedTuple):
     columns: Block
 
 
-def gathered(blocks: Iterable[Block], n_messages: int = 0) -> Iterator[Block]:
+def gathered(blocks: Iterable[Block]) -> Iterator[Block]:
     """Put blocks together until each has so many messages, or the `frame_id` changes."""
     waiting: list[Block] = []
     frame_id: str | None = None
-    n_wanted = n_messages or BLOCK_MESSAGES
     for block in blocks:
         if len(block):
             if frame_id not in {None, block.frame_id}:
@@ -296,7 +294,7 @@ def gathered(blocks: Iterable[Block], n_messages: int = 0) -> Iterator[Block]:
                 waiting = []
             frame_id = block.frame_id
         waiting.append(block)
-        if sum(one.n_messages for one in waiting) >= n_wanted:
+        if sum(one.n_messages for one in waiting) >= BLOCK_MESSAGES:
             yield joined(waiting)
             waiting, frame_id = [], None
     if waiting:

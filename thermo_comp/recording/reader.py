@@ -118,11 +118,11 @@ class RecordingReader(ExitStack):
             dict(ChainMap(*(f.metadata for f in self._files[::-1]), found.custom)),
         )
 
-    def blocks(self, *, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
-        """Read the bag from its beginning, in blocks of about so many messages, or of few (0)."""
-        return self._cut(self._blocks(raw, n_messages))
+    def blocks(self, *, raw: bool = False) -> Iterator[Block]:
+        """Read the bag from its beginning, in blocks."""
+        return self._cut(self._blocks(raw))
 
-    def _blocks(self, raw: bool = False, n_messages: int = 0) -> Iterator[Block]:
+    def _blocks(self, raw: bool = False) -> Iterator[Block]:
         roles = {topic: role for role, topic in self.topics.items()}
 
         def decoded() -> Iterator[Block]:
@@ -133,7 +133,7 @@ class RecordingReader(ExitStack):
                 yield from found
 
         n_read = dict.fromkeys(self.topics, 0)
-        for block in columns.gathered(decoded(), n_messages):
+        for block in columns.gathered(decoded()):
             self.apart = self.apart or columns.clocks_apart(block)
             for role in n_read:
                 n_read[role] += len(block.log_ns[role])
