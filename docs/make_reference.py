@@ -16,7 +16,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from thermo_comp.ros.parameters import parameters_table
+from thermo_comp.ros.parameters import NodeConfig
 from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.schema import Bounds, fields_of, parts_of, plain
 
@@ -276,6 +276,28 @@ def _type(value: dict[str, Any]) -> str:
         if word in value
     ]
     return ' '.join([kind, *bounds])
+
+
+def parameters_table() -> str:
+    """
+    Write the node's parameters as a Markdown table.
+
+    """
+    rows = ['| parameter | type | default | range | what it does |', '|---|---|---|---|---|']
+    for one in dataclasses.fields(NodeConfig):
+        is_text = isinstance(one.default, str)
+        kind, default = (
+            ('string', f"'{one.default}'") if is_text else ('double', f'{one.default:g}')
+        )
+        limits = ''
+        if one.metadata['bounds']:
+            limits = '{:g} .. {:g}'.format(*one.metadata['bounds'])
+        if one.metadata['choices']:
+            limits = ', '.join(f'`{choice}`' for choice in one.metadata['choices'])
+        rows.append(
+            f'| `{one.name}` | {kind} | `{default}` | {limits} | {one.metadata["description"]} |'
+        )
+    return '\n'.join(rows) + '\n'
 
 
 def pages() -> dict[Path, str]:

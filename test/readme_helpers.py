@@ -53,7 +53,7 @@ def refresh() -> None:
     """
     Write the real output of the shown commands, and the table of the parameters, into the README.
     """
-    from thermo_comp.ros.parameters import parameters_table
+    from make_reference import parameters_table
 
     environment = {**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80'}
     with tempfile.TemporaryDirectory() as folder:
@@ -82,5 +82,5 @@ def refresh() -> None:
 
 
 if __name__ == '__main__':
-    sys.path.insert(0, str(ROOT))
+    sys.path[:0] = [str(ROOT), str(ROOT / 'docs')]
     refresh()

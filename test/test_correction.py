@@ -32,7 +32,7 @@ from thermo_comp.unit.calibration import Axes, AxisReference, ResponseTerm, para
 from thermo_comp.unit.columns import bank
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.posterior import posterior_of
-from thermo_comp.unit.uncertainty import SlowUncertainty
+from thermo_comp.unit.prediction import SlowUncertainty
 
 SENSORS = ('case', 'tip')
 UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)

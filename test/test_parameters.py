@@ -16,6 +16,7 @@ import yaml
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 import rclpy
+from make_reference import parameters_table
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -131,7 +132,7 @@ def test_only_whole_numbers_for_float_parameters_are_turned_into_floats() -> Non
 
 
 def test_table_and_help_name_every_parameter() -> None:
-    table, text = parameters.parameters_table(), parameters.parameters_help()
+    table, text = parameters_table(), parameters.parameters_help()
     for entry in fields(NodeConfig):
         assert f'| `{entry.name}` |' in table
         assert f'  {entry.name}:=' in text
@@ -139,7 +140,7 @@ def test_table_and_help_name_every_parameter() -> None:
 
 
 def test_pages_hold_the_generated_table(root: Path) -> None:
-    table = parameters.parameters_table()
+    table = parameters_table()
     header = table.splitlines()[0]
     pages = [root / 'README.md', *(root / 'docs').rglob('*.md')]
     shown = [page for page in pages if header in page.read_text(encoding='utf-8')]

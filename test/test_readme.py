@@ -47,7 +47,7 @@ def test_commands_that_are_not_run_here_exist() -> None:
 
 def test_the_parameters_are_the_node_s() -> None:
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-    from thermo_comp.ros.parameters import parameters_table
+    from make_reference import parameters_table
 
     table = re.search(r'<!-- parameters.*?-->\n(.*?)<!-- end', README, re.DOTALL)
     assert table is not None

@@ -17,8 +17,8 @@ from ..unit.calibration import Calibration
 from ..unit.correction import Correction
 from ..unit.gyroscope import MILLIDEGREE
 from ..unit.metrics import residual_statistics
+from ..unit.prediction import SlowUncertainty
 from ..unit.rate_triad import rate_triad
-from ..unit.uncertainty import SlowUncertainty
 from .windows import Windows, means_by
 
 #: A calibration holds while its error is within this many times what it claims.

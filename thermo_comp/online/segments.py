@@ -27,8 +27,8 @@ from ..thermal.state import BOARD
 from ..thermal.tracker import ThermalTracker
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction
+from ..unit.prediction import SlowUncertainty
 from ..unit.rate_triad import rate_triad
-from ..unit.uncertainty import SlowUncertainty
 from .checks import RateCheck
 from .status import CompensatorConfig, Counters
 

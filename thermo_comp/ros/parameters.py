@@ -160,22 +160,6 @@ def updated(config: NodeConfig, parameters: Iterable[Parameter]) -> NodeConfig:
     return replace(config, **values)
 
 
-def parameters_table() -> str:
-    """Write the parameters as a Markdown table for the documentation."""
-    rows = ['| parameter | type | default | range | what it does |', '|---|---|---|---|---|']
-    for name, entry in _TABLE.items():
-        kind = _TYPES[type(entry.default)].name.lower()
-        default = f"'{entry.default}'" if isinstance(entry.default, str) else f'{entry.default:g}'
-        limits = ''
-        if entry.metadata['bounds']:
-            limits = '{:g} .. {:g}'.format(*entry.metadata['bounds'])
-        if entry.metadata['choices']:
-            limits = ', '.join(f'`{choice}`' for choice in entry.metadata['choices'])
-        description = entry.metadata['description']
-        rows.append(f'| `{name}` | {kind} | `{default}` | {limits} | {description} |')
-    return '\n'.join(rows) + '\n'
-
-
 def parameters_help() -> str:
     """Write the parameters as plain text for a terminal."""
     return '\n'.join(

@@ -96,14 +96,10 @@ class Column:
                 )
 
     @property
-    def is_of_gradient(self) -> bool:
-        """Whether the value is made of the present gradient of `sensor`."""
-        return self.kind in ('now', 'even', 'size') or (self.kind == 'square' and not self.tau_s)
-
-    @property
     def is_of_sensor(self) -> bool:
         """Whether the value is made of `sensor`, now or before."""
-        return self.is_of_gradient or self.kind == 'neighbour'
+        is_of_sensor = self.kind in ('now', 'neighbour', 'even', 'size')
+        return is_of_sensor or (self.kind == 'square' and not self.tau_s)
 
     @property
     def lag(self) -> tuple[str, float] | None:
