@@ -156,8 +156,11 @@ def test_imu_input_with_frame_and_switch_of_the_input(
         assert heard[0].orientation == sent.orientation
         assert heard[0].orientation_covariance.tolist() == sent.orientation_covariance.tolist()
         assert heard[0].linear_acceleration.z == pytest.approx(0.4, rel=1e-12)
-        # A unit in m/s^2 may come as vectors too; the node changes over while it runs.
-        assert peer.set_atomically(input='counts', frame_id='').successful
+        # Vectors are counts, of a calibration in counts; the node changes over while it runs.
+        assert 'unit.input: must be' in peer.set_atomically(input='counts').reason
+        file = saved(calibration())[1].removeprefix('calibration_file:=')
+        both = peer.set_atomically(input='counts', frame_id='', calibration_file=file)
+        assert both.successful, both.reason
         vectors = peer.publisher(Vector3Stamped, 'accel/counts')
         peer.join(node)
         message = stamped(Vector3Stamped(), START_NS + 2, 'vector')

@@ -135,6 +135,9 @@ def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:
         assert "unit.serial: must be 'T-1' (parameter `serial`), got 'T-2'" in result.reason
         (result,) = peer.set_parameters(input='imu')
         assert "unit.input: must be 'm/s^2'" in result.reason
+        save_calibration(of_bias(4.0, unit=Unit('T-1', 'm/s^2', 160.0, 0.01)), third)
+        (result,) = peer.set_parameters(calibration_file=str(third))
+        assert "must be 'counts' (parameter `input` is counts), got 'm/s^2'" in result.reason
         # Another set of thermometers, for which this node has no subscriptions.
         save_calibration(of_bias(5.0, sensors=('case', 'lid')), third)
         (result,) = peer.set_parameters(calibration_file=str(third))

@@ -20,6 +20,7 @@ from sensor_msgs.msg import Imu
 
 from thermo_comp.ros.node import main
 from thermo_comp.ros.round_trip import NodeProcess
+from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 
 
@@ -45,6 +46,10 @@ def unit(tmp_path: Path) -> Path:
         (['calibration_file:={tmp}/text.yaml'], '/text.yaml: expected a mapping'),
         (['calibration_file:={unit}', 'serial:=T-2'], "unit.serial: must be 'T-2' (parameter"),
         (['calibration_file:={unit}', 'input:=imu'], "unit.input: must be 'm/s^2'"),
+        (
+            ['calibration_file:={tmp}/imu.yaml'],
+            "/imu.yaml: unit.input: must be 'counts' (parameter `input` is counts), got 'm/s^2'",
+        ),
         (['calibration_file:={unit}', 'input:=gyro'], '`input` must be one of counts, imu'),
         (['calibration_file:={unit}', 'transition_time:=-1'], '`transition_time` must be between'),
         (
@@ -67,6 +72,7 @@ def test_bad_start(
     (tmp_path / 'text.yaml').write_text('just words')
     nan = dump_calibration(calibration()).replace('bias: 0.0', 'bias: .nan', 1)
     (tmp_path / 'nan.yaml').write_text(nan)
+    save_calibration(calibration(unit=Unit('T-1', 'm/s^2', 160.0, 0.01)), tmp_path / 'imu.yaml')
     code = main(arguments(*(one.format(tmp=tmp_path, unit=unit) for one in overrides)))
     said = capfd.readouterr()
     assert code == 1

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
+from multiprocessing import forkserver
 from typing import Any, Literal
 
 from .. import __version__
@@ -163,9 +164,24 @@ def _fitted(
 
 
 def dask_setup(_worker: object) -> None:
-    """Leave Ctrl-C, which a terminal sends to all, to the first process: a preload of Dask."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Keep a worker quiet: a preload of Dask."""
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Leave Ctrl-C, which a terminal sends to all, to this process; answer it once all run."""
+    heard: list[int] = []
+    # What the server of processes ignores they ignore, too.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    forkserver.ensure_running()
+    signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if heard:
+        raise KeyboardInterrupt
 
 
 @contextmanager
@@ -173,15 +189,23 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
     """Give a client of a cluster: of one that runs, with workers of this version, or its own."""
     import dask
     from distributed import Client
+    from distributed.utils import get_mp_context
 
     # What a worker does on its way down is in the fleet table, in words that its reader knows.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
-    quiet = {'logging.distributed': 'critical', 'distributed.scheduler.http.routes': []}
+    quiet = {
+        'logging.distributed': 'critical',
+        'distributed.scheduler.http.routes': [],
+        'distributed.worker.multiprocessing-method': 'forkserver',
+    }
     local = {'host': '127.0.0.1', 'dashboard_address': '127.0.0.1:0', 'preload': [__name__]}
     with dask.config.set(quiet), ExitStack() as stack:
         if scheduler is None:
-            own = Client(n_workers=n_workers, threads_per_worker=1, processes=True, **local)
-            yield stack.enter_context(own)
+            get_mp_context()
+            with _uninterrupted():
+                own = Client(n_workers=n_workers, threads_per_worker=1, processes=True, **local)
+                stack.enter_context(own)
+            yield own
             return
         versions = {}
         try:

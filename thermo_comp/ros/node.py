@@ -142,11 +142,14 @@ class CompensationNode:
         """Refuse a calibration that is for another unit, input or set of thermometers."""
         unit, heard = loaded.calibration.unit, self._compensator.thermal.inputs[1:]
         message = key = ''
+        taken = {'counts': 'counts', 'imu': 'm/s^2'}[config.input]
         if config.serial and unit.serial != config.serial:
             message = f'must be {config.serial!r} (parameter `serial`), got {unit.serial!r}'
             key = 'unit.serial'
-        elif config.input == 'imu' and unit.input != 'm/s^2':
-            message = f"must be 'm/s^2' (parameter `input` is imu), got {unit.input!r}"
+        elif unit.input != taken:
+            message = (
+                f'must be {taken!r} (parameter `input` is {config.input}), got {unit.input!r}'
+            )
             key = 'unit.input'
         elif loaded.calibration.sensors != heard:
             named, key = ', '.join(loaded.calibration.sensors), 'sensors'
