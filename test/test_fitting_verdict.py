@@ -182,7 +182,7 @@ def test_a_drift_that_temperature_does_not_explain_is_said() -> None:
 
 def test_what_is_worse_than_nothing_on_another_position_is_said() -> None:
     """Temperatures an hour late by another clock: 692 raw, 520 in sample, 878 left out."""
-    assert 'left out are worse than raw' in judged(692.0, 520.0, 9.0, 878.0)['misfit'].message
+    assert 'left out are worse than raw' in judged(692.0, 520.0, 9.0, 878.0)['left out'].message
 
 
 def test_data_without_drift_look_compensated() -> None:

@@ -286,7 +286,7 @@ def judge_result(
         yield _advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and has_temperature:
         why = 'it takes more positions, or temperature does not explain the drift'
-        yield _advice('misfit', f'{text}: positions left out are worse than raw: {why}')
+        yield _advice('left out', f'{text}: positions left out are worse than raw: {why}')
     else:
         yield Finding('residual', 'good', text)
     if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:
