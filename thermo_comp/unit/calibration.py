@@ -48,24 +48,17 @@ SMALLEST_RELATIVE_SCALE = 0.1
 _GRID = 513
 
 Celsius = Annotated[float, Bounds(at_least=-273.15, below=1000.0)]
+Serial = Annotated[str, Bounds(shortest=1, longest=LONGEST_SERIAL)]
+Input = Literal['counts', 'm/s^2']
 
 
 @dataclass(frozen=True)
 class Unit:
     """What is calibrated, and in which unit it speaks."""
 
-    serial: Annotated[
-        str,
-        Bounds(shortest=1, longest=LONGEST_SERIAL),
-        'Serial number of the unit, one printable line.',
-    ]
-    input: Annotated[
-        Literal['counts', 'm/s^2'],
-        'Unit of the raw samples: counts per conversion cycle, or m/s^2.',
-    ]
-    full_scale: Annotated[
-        Positive, 'A sample at or beyond this magnitude is saturated, in input units.'
-    ]
+    serial: Annotated[Serial, 'Serial number of the unit, one printable line.']
+    input: Annotated[Input, 'Unit of the raw samples: counts per conversion cycle, or m/s^2.']
+    full_scale: Annotated[Positive, 'A sample at or beyond this is saturated, in input units.']
     cycle_time_s: Annotated[Positive, 'Length of a conversion cycle = sample interval [s].']
 
     def __post_init__(self) -> None:
@@ -104,9 +97,7 @@ class AxisSet:
     bias_function: Annotated[TemperatureFunction, 'Fs(t), input units; Fs(0) = 0.']
     scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
     delta: Annotated[float, 'Bias of this regime relative to axes.bias, input units.'] = 0.0
-    residual_sd_m_s2: Annotated[
-        NotNegative, 'What this set leaves unexplained, as a slow error.'
-    ] = 0.0
+    residual_sd_m_s2: Annotated[NotNegative, 'What it leaves unexplained, as a slow error.'] = 0.0
 
     def __post_init__(self) -> None:
         check_reference('bias_function', self.bias_function, 0.0)
@@ -148,9 +139,7 @@ class GroupEvidence:
     explains_m_s2: Annotated[NotNegative, 'RMS of what it explains.']
     effective_parameters: Annotated[NotNegative, 'How many of its weights the data determine.']
     log_evidence_change: Annotated[float, 'By how much the log evidence falls without it.']
-    prior_sd: Annotated[
-        tuple[NotNegative, ...], 'Standard deviation of its weights before the data were seen.'
-    ]
+    prior_sd: Annotated[tuple[NotNegative, ...], 'Sd of its weights before the data were seen.']
 
 
 @dataclass(frozen=True)
@@ -221,21 +210,15 @@ class Calibration:
     sensors: Annotated[
         tuple[str, ...], 'Thermometers beside the board; the first one leads in a ramp.'
     ] = ('case',)
-    response: Annotated[
-        tuple[ResponseTerm, ...], 'The thermal response, common to both sets.'
-    ] = ()
+    response: Annotated[tuple[ResponseTerm, ...], 'The response, common to both sets.'] = ()
     board_lag_s: Annotated[
-        Positive,
-        'Time constant of T_board behind T_case: stands in for the gradient (lag times rate) '
-        'while the case sensor is lost.',
+        Positive, 'Lag of T_board behind T_case; times the rate it is the gradient of a lost case.'
     ] = 900.0
     detector: Annotated[DetectorSettings, 'The thermometers and the regime detector.'] = field(
         default_factory=DetectorSettings
     )
     provenance: Provenance = Provenance()
-    evidence: Annotated[
-        tuple[GroupEvidence, ...], 'What each group of columns is worth, by part.'
-    ] = ()
+    evidence: Annotated[tuple[GroupEvidence, ...], 'What each group of columns is worth.'] = ()
     posterior: Annotated[
         Posterior | None, 'Covariance of all parameters; null where it is unknown.'
     ] = None
@@ -244,10 +227,8 @@ class Calibration:
     ] = None
 
     def __post_init__(self) -> None:
-        if self.format_version != FORMAT_VERSION:
-            raise ValueError(
-                f'`format_version` must be {FORMAT_VERSION}, got {self.format_version}'
-            )
+        if (version := self.format_version) != FORMAT_VERSION:
+            raise ValueError(f'`format_version` must be {FORMAT_VERSION}, got {version}')
         self._check_misalignment()
         self._check_sensors()
         for regime in ('static', 'dynamic'):
@@ -296,16 +277,18 @@ class Calibration:
                     largest = max(map(abs, term.range)) * farthest**term.power
                     lost += np.abs(np.multiply(term.scale, largest))
         for name, axis, loss in zip(AXES, own.axes(), lost.tolist(), strict=True):
-            _check_finite(axis.bias_function, t, f'{regime}.{name}')
             least = _smallest(axis.scale_function, t) - loss
             if not least > SMALLEST_RELATIVE_SCALE:
                 raise ValueError(
                     f'`{regime}.{name}.scale_function` must stay above '
                     f'{SMALLEST_RELATIVE_SCALE:g} over its ranges, reaches {least:.4g}'
                 )
-        rates = getattr(self.gyroscope, regime).axes() if self.gyroscope else ()
-        for name, rate in zip(AXES, rates, strict=False):
-            _check_finite(rate.bias_function, t, f'gyroscope.{regime}.{name}')
+        both = (('', own), ('gyroscope.', self.gyroscope and getattr(self.gyroscope, regime)))
+        for of, curves in both:
+            for name, curve in zip(AXES, curves.axes() if curves else (), strict=False):
+                if not math.isfinite(_smallest(curve.bias_function, t)):
+                    key = f'{of}{regime}.{name}.bias_function'
+                    raise ValueError(f'`{key}` must be finite over its range')
 
     def correct(
         self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any
@@ -351,11 +334,6 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
     blocks = lay_out(pairs, len(calibration.response))
     end = blocks[-1].end
     return ParameterLayout(blocks[0::2], blocks[1::2], end, end + 3)
-
-
-def _check_finite(function: TemperatureFunction, t: Floats, key: str) -> None:
-    if not math.isfinite(_smallest(function, t)):
-        raise ValueError(f'`{key}.bias_function` must be finite over its range')
 
 
 def _smallest(function: TemperatureFunction, t: Floats) -> float:

@@ -15,6 +15,7 @@ from .schema import NotNegatives, Positives, Vector
 
 #: A unit of angular rates [rad/s].
 MILLIDEGREE = math.radians(1e-3)
+NIL = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -60,16 +61,10 @@ class Gyroscope:
     static: RateSet
     dynamic: RateSet
     noise_density_rad_s_sqrt_hz: Annotated[Positives, 'White noise of each axis.']
-    slow_noise_rad_s_sqrt_h: Annotated[
-        NotNegatives, 'Random walk of the bias of each axis, per root hour.'
-    ] = (0.0, 0.0, 0.0)
-    residual_sd_rad_s: Annotated[
-        NotNegatives, 'What the curves leave unexplained, as a slow error: a turn-on is one.'
-    ] = (0.0, 0.0, 0.0)
+    slow_noise_rad_s_sqrt_h: Annotated[NotNegatives, 'Walk of the bias, per root hour.'] = NIL
+    residual_sd_rad_s: Annotated[NotNegatives, 'What is left, as a slow error: a turn-on.'] = NIL
     response: Annotated[tuple[RateTerm, ...], 'The thermal response, common to both sets.'] = ()
-    posterior: Annotated[
-        Posterior | None, 'Covariance of all parameters; null where it is unknown.'
-    ] = None
+    posterior: Annotated[Posterior | None, 'Covariance of all parameters; null: unknown.'] = None
 
     def __post_init__(self) -> None:
         if self.posterior is not None:

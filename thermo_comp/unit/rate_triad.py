@@ -12,10 +12,8 @@ import numpy as np
 from . import calibration as unit
 from .calibration import Calibration, RegimeSet, parameter_layout
 from .functions import Polynomial
-from .gyroscope import Gyroscope, RateCurve, RateSet, RateTerm
+from .gyroscope import NIL, Gyroscope, RateCurve, RateSet, RateTerm
 from .posterior import Posterior
-
-_NIL = (0.0, 0.0, 0.0)
 
 
 def rate_triad(calibration: Calibration) -> Calibration:
@@ -41,8 +39,8 @@ def rate_triad(calibration: Calibration) -> Calibration:
         noise_density_m_s2_sqrt_hz=own.noise_density_rad_s_sqrt_hz,
         slow_noise_m_s2_sqrt_h=own.slow_noise_rad_s_sqrt_h,
         misalignment=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-        misalignment_sd=_NIL,
-        response=tuple(unit.ResponseTerm(**vars(term), scale=_NIL) for term in own.response),
+        misalignment_sd=NIL,
+        response=tuple(unit.ResponseTerm(**vars(term), scale=NIL) for term in own.response),
         provenance=unit.Provenance(),
         evidence=(),
         posterior=None,
