@@ -37,6 +37,7 @@ from thermo_comp.recording.writer import BagWriter
 from thermo_comp.ros import player
 from thermo_comp.ros.listener import Recorder
 from thermo_comp.ros.player import opened_player, play
+from thermo_comp.ros.waitloop import wait_until
 
 WINDOW = player.WINDOW['accel']
 
@@ -266,7 +267,7 @@ def test_recorder_keeps_every_message_under_its_stamp(peer: Peer, tmp_path: Path
         imu = peer.publisher(Imu, 'imu/data_raw')
         flag = peer.publisher(Bool, 'regime/dynamic')
         stamped = peer.publisher(DiagnosticArray, 'regime/stamped')
-        assert recorder.wait_until(lambda: recorder.has_publishers, TIMEOUT)
+        assert wait_until(lambda: recorder.has_publishers, TIMEOUT)
         sent = []
         for k in range(500):
             message = Imu()
@@ -274,12 +275,12 @@ def test_recorder_keeps_every_message_under_its_stamp(peer: Peer, tmp_path: Path
             message.linear_acceleration.x = float(k)
             sent.append(message)
             imu.publish(message)
-        assert recorder.wait_until(lambda: recorder.counts['imu/data_raw'] == 500, TIMEOUT)
+        assert wait_until(lambda: recorder.counts['imu/data_raw'] == 500, TIMEOUT)
         flag.publish(Bool(data=True))
-        assert recorder.wait_until(lambda: recorder.counts['regime/dynamic'] == 1, TIMEOUT)
+        assert wait_until(lambda: recorder.counts['regime/dynamic'] == 1, TIMEOUT)
         assert recorder.newest('regime/dynamic').data
         stamped.publish(DiagnosticArray())
-        assert recorder.wait_until(lambda: recorder.counts['regime/stamped'] == 1, TIMEOUT)
+        assert wait_until(lambda: recorder.counts['regime/stamped'] == 1, TIMEOUT)
         assert recorder.counts == {'imu/data_raw': 500, 'regime/dynamic': 1, 'regime/stamped': 1}
     with AnyReader([tmp_path / 'out']) as reader:
         rows = [(c.topic, log_ns, bytes(data)) for c, log_ns, data in reader.messages()]
@@ -308,11 +309,11 @@ def test_record_ends_when_told_or_when_nothing_comes(peer: Peer, tmp_path: Path)
     topics = {'imu/data_raw': Imu}
     path = tmp_path / 'out.mcap'
     with Recorder(path, topics=topics) as recorder:
-        assert recorder.wait_until(lambda: recorder.counts['imu/data_raw'] >= 20, TIMEOUT)
+        assert wait_until(lambda: recorder.counts['imu/data_raw'] >= 20, TIMEOUT)
     stop.set()
     thread.join(TIMEOUT)
     with Recorder(tmp_path / 'no.mcap', topics={'nobody/is/there': Imu}) as recorder:
-        assert not recorder.wait_until(lambda: False, 0.2)
+        assert not wait_until(lambda: False, 0.2)
         assert recorder.counts == {'nobody/is/there': 0}
     with pytest.raises(OutputError, match=r'out.mcap'), Recorder(path, topics=topics):
         pass
@@ -329,9 +330,9 @@ def test_a_recorder_says_that_the_disk_is_full(
     def run() -> None:
         with Recorder(tmp_path / 'out', topics={'imu/data_raw': Imu}) as recorder:
             imu = peer.publisher(Imu, 'imu/data_raw')
-            assert recorder.wait_until(lambda: recorder.has_publishers, TIMEOUT)
+            assert wait_until(lambda: recorder.has_publishers, TIMEOUT)
             imu.publish(Imu())
-            recorder.wait_until(lambda: recorder.counts['imu/data_raw'] > 0, TIMEOUT)
+            wait_until(lambda: recorder.counts['imu/data_raw'] > 0, TIMEOUT)
 
     with pytest.raises(OutputError, match='No space left on device'):
         run()

@@ -97,8 +97,7 @@ class RateCheck:
     def __init__(self, cycle_s: float, counts_cycles: bool = True) -> None:
         self._cycle_s, self._counts_cycles = cycle_s, counts_cycles
         self._allowance = max(BURST_SAMPLES, BURST_S / cycle_s)
-        #: Whether more samples have come than conversions can make.
-        self.is_too_fast = False
+        self.is_too_fast = False  # more samples have come than conversions can make
         self.ratio = 1.0  # samples per calibrated cycle over the last second or so
         self._level = 0.0
         self._last: tuple[int, int] | None = None
@@ -146,18 +145,14 @@ class GravityCheck:
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
-        #: Whether the last windows all missed it by more than the tolerance.
-        self.is_refuted = False
+        self.is_refuted = False  # the last windows all missed it by more than the tolerance
         self._n_alike = 0
         self._is_against = False
         self._forces: list[Sequence[float]] = []
         self._begin_ns = self._last_ns = 0
         self._last_mean: list[float] | None = None
-        self._residual = 0.0
-        self._variance = 0.0
         self._weight = 0.0
-        self._n_windows = 0
-        self._is_still = False
+        self.result: GravityResidual | None = None  # so far; None before the first still window
 
     def wants(self, stamp_ns: int) -> bool:
         """Say whether a sample is far enough from the last one to tell something new."""
@@ -190,12 +185,13 @@ class GravityCheck:
         last, self._last_mean = self._last_mean, mean
         # Two means of n samples differ by noise, too: at most four standard deviations of it.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
-        self._is_still = (
+        is_still = (
             scatter <= SCATTER_FACTOR**2 * noise_variance
             and last is not None
             and max(abs(a - b) for a, b in zip(mean, last, strict=True)) <= change
         )
-        if not self._is_still:
+        if not is_still:
+            self.result = self.result and self.result._replace(is_still=False)
             return
         size = math.hypot(*mean)
         # The calibration's error is common to the samples of a window, their noise averages out.
@@ -205,9 +201,10 @@ class GravityCheck:
         decay = 1.0 - 1.0 / MEMORY_WINDOWS
         self._weight = self._weight * decay + 1.0
         gain = 1.0 / self._weight
-        self._residual += gain * (size - self.gravity - self._residual)
-        self._variance += gain * (variance - self._variance)
-        self._n_windows += 1
+        residual, sd, n, _ = self.result or (0.0, 0.0, 0, False)
+        residual += gain * (size - self.gravity - residual)
+        sd = math.sqrt(sd**2 + gain * (variance - sd**2))
+        self.result = GravityResidual(residual, sd, n + 1, is_still)
 
     def _judge(self, miss: float, sd: float) -> None:
         is_against = miss > self._tolerance + REFUTING_SIGMAS * sd
@@ -215,11 +212,3 @@ class GravityCheck:
         self._is_against = is_against
         if self._n_alike >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
             self.is_refuted = is_against
-
-    @property
-    def result(self) -> GravityResidual | None:
-        """The residual so far; None before the first still window."""
-        if not self._n_windows:
-            return None
-        sd = math.sqrt(self._variance)
-        return GravityResidual(self._residual, sd, self._n_windows, self._is_still)

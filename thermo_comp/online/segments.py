@@ -44,13 +44,10 @@ class Segment(NamedTuple):
     """A run of time over which the correction is linear, and what the gate says of its samples."""
 
     start_ns: int
-    #: Not the rest of one that the end of a block, or a call from outside, has cut.
-    is_new: bool
-    #: Whether samples come too fast to be conversions; and what their rate adds to their noise.
-    is_too_fast: bool
-    noise_excess: float
-    #: Thermal states at both ends.
-    start: tuple[float, ...]
+    is_new: bool  # not the rest of one that the end of a block, or a call from outside, has cut
+    is_too_fast: bool  # samples come too fast to be conversions
+    noise_excess: float  # what their rate adds to their noise
+    start: tuple[float, ...]  # thermal states at both ends
     end: tuple[float, ...]
     #: What parameters and starts leave uncertain of each axis; of the angular rate's behind them.
     slow: list[float]

@@ -35,12 +35,7 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownBag:
-    """
-    A bag over the time since `start_ns`, `index` of all.
-
-    After a reading each, at `time`: rates [K/s], and the acceleration of the sensor that leads
-    [K/s^2], NaN where not known yet.
-    """
+    """A bag since `start_ns`: rates [K/s] and the leader's acceleration, NaN where not known."""
 
     index: int
     bag: ReducedBag

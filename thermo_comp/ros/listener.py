@@ -11,7 +11,6 @@ was received.
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -39,7 +38,6 @@ from .waitloop import RawSubscription, WaitLoop, own_node, type_name
 OUTPUTS = {'imu/data_raw': Imu, 'regime/dynamic': Bool, STAMPED_TOPIC: DiagnosticArray}
 #: Time between two looks at what is published, and between two blocks [s].
 LOOK_S, BLOCK_S = 0.5, 1.0
-WAIT_S = 0.02  # time between two looks at what is waited for [s]
 
 _ALL = HistoryPolicy.KEEP_ALL
 _RELIABLE = QoSProfile(history=_ALL, reliability=ReliabilityPolicy.RELIABLE)
@@ -145,15 +143,6 @@ class Recorder(_Listener):
         came = (messages[-1] for own, messages, _ in reversed(self._came) if own == name)
         data = next(came, None)
         return None if data is None else deserialize_message(data, self._topics[name])
-
-    def wait_until(self, is_done: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until it is as wanted; False after the time-out [s]."""
-        deadline = time.monotonic() + timeout_s
-        while not is_done():
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(WAIT_S)
-        return True
 
 
 def _stamps(messages: list[bytes]) -> Ints:

@@ -16,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
@@ -33,14 +34,13 @@ from ..recording.columns import Block, Input, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics
 from .relay import INPUTS
-from .waitloop import own_node
+from .waitloop import own_node, wait_until
 
 NODE_NAME = 'thermo_comp_player'
 
 #: Messages of a topic under way at most; so many are kept to be sent again.
 WINDOW: dict[Role, int] = defaultdict(lambda: 50, accel=200)
 CLOCK_PERIOD = 0.01  # wall time between two messages on `/clock` [s]
-LOOK = 0.02  # time between two looks for subscribers [s]
 #: Time between two looks at what is acknowledged; that takes Fast DDS some 5 ms [s].
 ACKNOWLEDGEMENT_NAP = 0.0005
 #: Time the subscribers are given to find the player too where nobody tells when they have [s].
@@ -73,9 +73,7 @@ def play(
 ) -> PlayReport:
     """Play a bag, as `opened_player`, when all topics have subscribers, after `wait_s` at most."""
     with opened_player(path, rate, topics, input, ros_args) as player:
-        deadline = time.monotonic() + wait_s
-        while player.unheard() and time.monotonic() < deadline:
-            time.sleep(LOOK)
+        wait_until(lambda: not player.unheard(), wait_s)
         if wait_s > 0.0:
             time.sleep(SETTLING)
         return player.run(progress)
@@ -178,14 +176,11 @@ class Player:
 
     def _await_acknowledgement(self, role: Role) -> None:
         publisher = self._publishers[role]
-        deadline = time.monotonic() + PATIENCE
         # Asked again and again: waiting inside rclpy would keep this process's other threads out.
-        while not publisher.wait_for_all_acked(Duration()):
-            if time.monotonic() > deadline:
-                raise ThermoCompError(
-                    f'{publisher.topic_name}: a subscriber took nothing for {PATIENCE:g} s'
-                )
-            time.sleep(ACKNOWLEDGEMENT_NAP)
+        is_done = partial(publisher.wait_for_all_acked, Duration())
+        if not wait_until(is_done, PATIENCE, ACKNOWLEDGEMENT_NAP):
+            name = publisher.topic_name
+            raise ThermoCompError(f'{name}: a subscriber took nothing for {PATIENCE:g} s')
 
 
 def _in_order(block: Block) -> list[tuple[float, int, Role, bytes]]:

@@ -30,6 +30,7 @@ from ..unit.calibration_file import load_calibration
 from .listener import OUTPUTS, Recorder
 from .node import NODE_NAME
 from .player import PlayReport, opened_player
+from .waitloop import wait_until
 
 #: How long node and recorder may take to find each other, or to take what comes last: a message
 #: that Fast DDS has to repeat is 3 s late, on a busy machine several times [s].
@@ -131,18 +132,16 @@ def round_trip(
             # once it is heard on the last one it sends on all of them.
             return not node.is_alive or (recorder.has_publishers and bool(account()))
 
-        if not recorder.wait_until(is_connected, PATIENCE_S) or not node.is_alive:
+        if not wait_until(is_connected, PATIENCE_S) or not node.is_alive:
             raise ThermoCompError(' '.join(node.said.split()) or 'the node was not found')
 
         def throttle(n: int) -> None:
             """Wait for the node, which tells how far it is ten times a second."""
-            recorder.wait_until(lambda: n - int(account()['samples in']) <= IN_FLIGHT, ANSWER_S)
+            wait_until(lambda: n - int(account()['samples in']) <= IN_FLIGHT, ANSWER_S)
 
         with opened_player(bag, rate, ros_args=ros_args) as player:
             awaited = ['accel', *thermometers]
-            recorder.wait_until(
-                lambda: not player.unheard(awaited) and _answers(player.node), PATIENCE_S
-            )
+            wait_until(lambda: not player.unheard(awaited) and _answers(player.node), PATIENCE_S)
             played = player.run(progress, throttle)
 
         def is_complete() -> bool:
@@ -152,7 +151,7 @@ def round_trip(
             found = [max(played.n_messages.values()), *(counts[topic] for topic in OUTPUTS)]
             return not node.is_alive or expected == [str(count) for count in found]
 
-        recorder.wait_until(is_complete, PATIENCE_S)
+        wait_until(is_complete, PATIENCE_S)
         if not node.is_alive:
             raise ThermoCompError(f'the node ended: {" ".join(node.said.split())}')
         return played, recorder.counts

@@ -301,6 +301,16 @@ def own_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
         context.try_shutdown()
 
 
+def wait_until(is_done: Callable[[], object], timeout_s: float, nap_s: float = 0.02) -> bool:
+    """Look now and then whether it is as wanted; False after the time-out [s]."""
+    deadline = time.monotonic() + timeout_s
+    while not is_done():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(nap_s)
+    return True
+
+
 def type_name(message_type: Any) -> str:
     """Name a message type as ROS tools and bags do."""
     return f'{message_type.__module__.partition(".")[0]}/msg/{message_type.__name__}'

@@ -42,13 +42,10 @@ _CHUNK = 2048
 class Excess(NamedTuple):
     """How far a thermal state lies outside the calibrated ranges; 0 inside."""
 
-    #: Of the set of the regime, signed [K] and [K/s].
-    temperature: float
-    rate: float
-    #: Of the gradient that is farthest outside, signed [K].
-    gradient: float
-    #: All sizes in half ranges, added.
-    relative: float
+    temperature: float  # of the set of the regime, signed [K]
+    rate: float  # the same [K/s]
+    gradient: float  # the one that is farthest outside, signed [K]
+    relative: float  # all sizes in half ranges, added
 
 
 class Curves:

@@ -61,7 +61,7 @@ class Gyroscope:
     static: RateSet
     dynamic: RateSet
     noise_density_rad_s_sqrt_hz: Annotated[Positives, 'White noise of each axis.']
-    slow_noise_rad_s_sqrt_h: Annotated[NotNegatives, 'Walk of the bias, per root hour.'] = NIL
+    slow_noise_rad_s_sqrt_h: Annotated[NotNegatives, 'Random walk, per root hour.'] = NIL
     residual_sd_rad_s: Annotated[NotNegatives, 'What is left, as a slow error: a turn-on.'] = NIL
     response: Annotated[tuple[RateTerm, ...], 'The thermal response, common to both sets.'] = ()
     posterior: Annotated[Posterior | None, 'Covariance of all parameters; null: unknown.'] = None
