@@ -56,7 +56,7 @@ def test_arrays_have_the_bits_of_a_replayed_bag(
     out = fitted.correct(recording.time_s, recording.counts, **recording.temperatures)
     result = replay(bag, fitted, tmp_path / 'out.mcap')
     written = read_recording(
-        tmp_path / 'out.mcap', Topics(imu='imu/data_raw'), 'imu', require=['accel']
+        tmp_path / 'out.mcap', Topics(imu='imu/data_raw', input='imu'), require=['accel']
     ).columns
     np.testing.assert_array_equal(out.specific_force, written.accel)
     np.testing.assert_array_equal(

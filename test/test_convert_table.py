@@ -16,6 +16,7 @@ from thermo_comp.convert.log import NO_STAMP, write_log
 from thermo_comp.convert.table import Format, Stamp, exact_ns, layout, read_parquet, read_text
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
+from thermo_comp.recording.topics import Topics
 from thermo_comp.unit.schema import build
 
 ROWS_ALONE = Stamp(rate_hz=1.0)
@@ -218,7 +219,7 @@ def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> 
         report = write_log(table_log(written(stamps), chart), tmp_path / 'bag.mcap', force=True)
         left_out = report.findings['out_of_range'].count + report.findings['non_numeric'].count
         assert (report.messages['accel'], left_out) == (40, len(stamps) - 40)
-        bag = read_recording(tmp_path / 'bag.mcap', input='imu', require=('accel',))
+        bag = read_recording(tmp_path / 'bag.mcap', Topics(input='imu'), require=('accel',))
         found = bag.columns.accel_stamp_ns
         assert found.tolist() == [stamp * scale for stamp in good]
     with pytest.raises(RecordingError, match=r'before 1970 or after January 2038|holds numbers'):

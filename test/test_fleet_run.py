@@ -128,7 +128,7 @@ def test_bags_that_cannot_be_read_any_more_take_no_result_away(
     kept = [(path, path.stat().st_mtime_ns, path.read_bytes()) for path in bags]
     for path in bags:
         path.write_bytes(b'')
-    for changed in (options, replace(options, input='counts')):
+    for changed in (options, replace(options, topics=Topics(input='counts'))):
         second = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', changed, client=client)
         (row,) = second.rows
         assert row['verdict'] == 'failed'

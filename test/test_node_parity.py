@@ -89,8 +89,8 @@ def output_of(path: Path) -> tuple[Block, list[bool], list[bytes]]:
         ]
         wanted = [c for c in reader.connections if c.topic.endswith(STAMPED_TOPIC)]
         stamped = [bytes(data) for _, _, data in reader.messages(wanted)]
-    topics = Topics(imu=OUTPUT_TOPIC)
-    return read_recording(path, topics, 'imu', require=('accel',)).columns, flags, stamped
+    topics = Topics(imu=OUTPUT_TOPIC, input='imu')
+    return read_recording(path, topics, require=('accel',)).columns, flags, stamped
 
 
 def assert_same(live: Path, offline: Path) -> None:
@@ -138,7 +138,7 @@ def test_imu_in_another_frame(tmp_path: Path) -> None:
     unit = replace(unit, axes=replace(unit.axes, **axes))
     args = ['-p', 'input:=imu', '-p', 'frame_id:=tilted']
     assert run(unit, tmp_path / 'bag.mcap', tmp_path, *args, frame_id='tilted') > 0
-    given = read_recording(tmp_path / 'bag.mcap', input='imu', require=('accel',)).columns
+    given = read_recording(tmp_path / 'bag.mcap', Topics(input='imu'), require=('accel',)).columns
     found, _, _ = output_of(tmp_path / 'live.mcap')
     given = given.imu.take(np.flatnonzero(np.isin(given.accel_stamp_ns, found.accel_stamp_ns)))
     is_rate = given.angular_velocity_covariance[:, 0] != -1.0

@@ -189,7 +189,7 @@ def test_imu_and_the_bags_own_names(peer: Peer, tmp_path: Path, rng: np.random.G
         force = rng.standard_normal((300, 3))
         writer.write_imu('/drone/imu/raw', stamps, force, covariance, 'imu', imu=rest)
     heard = peer.listen(Imu, 'imu/uncompensated', UNLIMITED, raw=True)
-    report = play(tmp_path / 'bag', rate=0.0, topics=Topics(imu='imu/raw'), input='imu')
+    report = play(tmp_path / 'bag', rate=0.0, topics=Topics(imu='imu/raw', input='imu'))
     peer.wait_for(lambda: len(heard) == 300, '300 samples')
     assert heard == messages_of(tmp_path / 'bag')
     assert list(report.n_messages) == ['/imu/uncompensated']
@@ -292,7 +292,9 @@ def test_recorder_keeps_every_message_under_its_stamp(peer: Peer, tmp_path: Path
     assert flagged[1] == unstamped[1] == 7 * 10**9 + 499
     assert deserialize_message(unstamped[2], DiagnosticArray) == DiagnosticArray()
     assert deserialize_message(flagged[2], Bool).data
-    block = read_recording(tmp_path / 'out', Topics(imu='imu/data_raw'), 'imu', require=('accel',))
+    block = read_recording(
+        tmp_path / 'out', Topics(imu='imu/data_raw', input='imu'), require=('accel',)
+    )
     assert len(block.columns) == 500
 
 

@@ -131,7 +131,7 @@ class TestGrowing:
 
         found: dict[str, list[bytes]] = {}
         n_looks = 0
-        for news in growing_blocks(growing, Topics(), 'auto', wait):
+        for news in growing_blocks(growing, Topics(), wait):
             n_looks += news is None
             if news is not None:
                 block, info = news
@@ -146,10 +146,10 @@ class TestGrowing:
 
     def test_what_is_no_bag_is_said(self, tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match='no such file'):
-            next(growing_blocks(tmp_path / 'no.mcap', Topics(), 'auto', lambda _: True))
+            next(growing_blocks(tmp_path / 'no.mcap', Topics(), lambda _: True))
         (tmp_path / 'text.mcap').write_text('hello, this is no bag')
         with pytest.raises(RecordingError, match=r'text\.mcap'):
-            list(growing_blocks(tmp_path / 'text.mcap', Topics(), 'auto', lambda _: False))
+            list(growing_blocks(tmp_path / 'text.mcap', Topics(), lambda _: False))
 
     def test_a_whole_bag_becomes_one_for_each_position(
         self, session: Path, cli: Cli, tmp_path: Path

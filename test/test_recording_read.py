@@ -320,7 +320,7 @@ def test_auto_prefers_counts_that_are_there(tmp_path: Path) -> None:
     write_mcap(tmp_path / 'imu.mcap', regular_messages(8, IMU_IN))
     assert read(tmp_path / 'both.mcap').info.input == 'counts'
     assert read(tmp_path / 'imu.mcap').info.input == 'imu'
-    chosen = read_recording(tmp_path / 'both.mcap', input='imu')
+    chosen = read_recording(tmp_path / 'both.mcap', Topics(input='imu'))
     assert chosen.info.input == 'imu'
     assert chosen.columns.imu is not None
 

@@ -142,7 +142,7 @@ def test_topics_that_are_not_there_or_are_something_else(tmp_path: Path) -> None
     messages = regular_messages(8)
     write_mcap(path, messages)
     with pytest.raises(RecordingError, match=r'counts: no such topic; the bag has /accel/counts '):
-        open_recording(path, Topics(counts='my/counts'), input='counts')
+        open_recording(path, Topics(counts='my/counts', input='counts'))
     with pytest.raises(
         RecordingError, match=r'or x/imu: no such topic.*--topic counts=TOPIC or --topic imu='
     ):

@@ -120,8 +120,8 @@ def output_of(path: Path) -> tuple[Block, list[tuple[int, bool]]]:
             assert stamp.sec * 10**9 + stamp.nanosec == log_ns
             stamped.append((log_ns, status.message == 'dynamic'))
     assert stamped == flags
-    topics = Topics(imu=OUTPUT_TOPIC)
-    return read_recording(path, topics, 'imu', require=('accel',)).columns, flags
+    topics = Topics(imu=OUTPUT_TOPIC, input='imu')
+    return read_recording(path, topics, require=('accel',)).columns, flags
 
 
 def test_equals_the_stream_bit_for_bit(tmp_path: Path) -> None:
@@ -240,7 +240,7 @@ def test_another_unit_is_refused_unless_the_user_says_so(tmp_path: Path) -> None
 def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path: Path) -> None:
     bag = thermal_test(tmp_path / 'bag', minutes=1.0, imu=True)
     with pytest.raises(CalibrationError, match=r'takes counts.*holds sensor_msgs/Imu'):
-        replay(bag, rich_calibration(), tmp_path / 'out', input='imu')
+        replay(bag, rich_calibration(), tmp_path / 'out', topics=Topics(input='imu'))
     # Without being told, it looks for what the calibration is for.
     with pytest.raises(RecordingError, match='accel/counts'):
         replay(bag, rich_calibration(), tmp_path / 'out')

@@ -102,7 +102,7 @@ def test_a_third_thermometer_explains_what_the_others_do_not_see(
         output = folder / 'corrected.mcap'
         replay(held_out, calibration, output)
         corrected = read_recording(
-            output, Topics(imu='imu/data_raw'), 'imu', require=('accel',)
+            output, Topics(imu='imu/data_raw', input='imu'), require=('accel',)
         ).columns
         truth = runs[-1].truth
         index = np.searchsorted(runs[-1].accel_stamp_ns, corrected.accel_stamp_ns)

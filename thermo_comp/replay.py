@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from math import inf
 from operator import itemgetter
@@ -28,7 +28,7 @@ from .files import shown_name
 from .online.batch import CompensatedBlock, process_block
 from .online.compensator import HELD, SWAPPED, Compensator
 from .online.status import STAMPED_TOPIC, STAMPED_TYPE, CompensatorConfig, Counters, stamped_flag
-from .recording.columns import Block, ImuColumns, Input, Messages, RecordingInfo, Role
+from .recording.columns import Block, ImuColumns, Messages, RecordingInfo, Role
 from .recording.reader import RecordingReader, open_recording
 from .recording.topics import Topics
 from .recording.writer import TABLES, BagWriter, WriteRows, table_writer
@@ -77,11 +77,12 @@ def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None
         )
 
 
-def input_for(calibration: Calibration, asked: Input) -> Input:
+def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
     """Choose what is read for a calibration: for ``auto``, counts if it is in counts, else Imu."""
-    if asked != 'auto':
-        return asked
-    return 'counts' if calibration.unit.input == 'counts' else 'imu'
+    topics = topics or Topics()
+    if topics.input != 'auto':
+        return topics
+    return replace(topics, input='counts' if calibration.unit.input == 'counts' else 'imu')
 
 
 def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
@@ -96,7 +97,6 @@ def replay(
     *,
     config: CompensatorConfig | None = None,
     topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
     serial: str | None = None,
     frame_id: str = '',
     keep_inputs: bool = False,
@@ -111,8 +111,8 @@ def replay(
     topic at their log times, but none that bears an output's name.
     """
     compensator = Compensator(calibration, config)
-    wanted = input_for(calibration, input)
-    with open_recording(path, topics, wanted, require=needed_roles(calibration)) as reader:
+    wanted = topics_for(calibration, topics)
+    with open_recording(path, wanted, require=needed_roles(calibration)) as reader:
         check_unit(calibration, reader.info, serial)
         metadata = {
             'serial': calibration.unit.serial,

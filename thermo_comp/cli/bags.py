@@ -24,7 +24,7 @@ _AS_THE_NODE = 'As the parameter of the node, in s.'
 
 def info(
     path: Path = argument('Bag or calibration file.', metavar='BAG|YAML'),
-    topics: Any = options.topics_part,
+    topics: Any = options.reading_part,
     out: Output = options.out,
 ) -> None:
     """
@@ -141,7 +141,7 @@ def replay(
     transition_time: float = option(_AS_THE_NODE, CompensatorConfig.transition_time_s, min=0.0),
     temperature_timeout: float = option(_AS_THE_NODE, CompensatorConfig.temperature_timeout_s),
     case_timeout: float = option(_AS_THE_NODE, CompensatorConfig.case_timeout_s),
-    reading: dict[str, Any] = options.reading,
+    topics: Any = options.reading,
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -172,7 +172,7 @@ def replay(
             load_calibration(calibration),
             output,
             config=config,
-            **reading,
+            topics=topics,
             serial=serial,
             frame_id=frame_id,
             keep_inputs=keep_inputs,
@@ -213,7 +213,7 @@ def play(
         'Seconds of the bag per second; 0 = as fast as it is taken.', 1.0, min=0.0
     ),
     wait: float = option('Longest wait for a subscriber on every topic, in s.', 10.0, min=0.0),
-    reading: dict[str, Any] = options.reading,
+    topics: Any = options.reading,
     out: Output = options.out,
 ) -> None:
     """
@@ -234,7 +234,9 @@ def play(
     from ..ros.player import play as run
 
     with out.progress('playing') as done:
-        report = run(bag, rate=rate, wait_s=wait, **reading, ros_args=context.obj, progress=done)
+        report = run(
+            bag, rate=rate, wait_s=wait, topics=topics, ros_args=context.obj, progress=done
+        )
     for name in report.unheard:
         out.note(f'nobody listened to {name}')
     for name in report.lossy:

@@ -53,7 +53,7 @@ def fit(
     offset: float | None = options.OFFSET,
     columns: Path | None = option('Column map of the tables, as for convert.', metavar='YAML'),
     rate_hz: float | None = options.TABLE_RATE,
-    reading: dict[str, Any] = options.reading_part,
+    topics: Any = options.reading_part,
     force: bool = options.FORCE,
     verbose: bool = option('List the positions that were found, too.', False, '--verbose', '-v'),
     out: Output = options.out,
@@ -86,7 +86,7 @@ def fit(
         raise options.usage('--certificate-info fills the page of --report: give that, too')
     # Until the command ends.
     bags = context.with_resource(as_bags(out, bags, columns, rate_hz))
-    sources, kind = fit_sources(bags, **reading)
+    sources, kind = fit_sources(bags, topics)
     info = None
     if certificate_info is not None:
         from ..report.certificate import load_certificate_info
@@ -161,7 +161,7 @@ def fleet_fit(
     earlier: list[Path] | None = option(
         'fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'
     ),
-    reading: dict[str, Any] = options.reading,
+    topics: Any = options.reading,
     out: Output = options.out,
 ) -> None:
     """
@@ -183,7 +183,7 @@ def fleet_fit(
     from ..fleet.work import FleetOptions
 
     with options.usage_of():
-        wanted = FleetOptions(fit=FitOptions(**settings), **reading, certificates=certificates)
+        wanted = FleetOptions(fit=FitOptions(**settings), topics=topics, certificates=certificates)
     before = [row for path in earlier or () for row in read_parquet(path)]
     with out.progress('fitting') as done:
         result = fit_fleet(

@@ -26,7 +26,7 @@ def evaluate(
     ),
     judging: dict[str, Any] = options.judging,
     csv: Path | None = option('File for the windows, one a line.', metavar='FILE'),
-    reading: dict[str, Any] = options.reading_part,
+    topics: Any = options.reading_part,
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -53,7 +53,7 @@ def evaluate(
     is_named = len({path.stem for path in calibration}) == len(calibration)
     models = [(one.stem if is_named else str(one), load_calibration(one)) for one in calibration]
     with out.progress('evaluating') as done:
-        result = run(bags, models, **judging, **reading, progress=done)
+        result = run(bags, models, **judging, topics=topics, progress=done)
     out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)
     judged = result.judgements[models[0][0]]
     if csv is not None:
@@ -144,7 +144,7 @@ def report(
     figures: Path | None = option('Folder for the figures as PNG files.', metavar='DIR'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
     judging: dict[str, Any] = options.judging,
-    reading: dict[str, Any] = options.reading_part,
+    topics: Any = options.reading_part,
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -175,7 +175,7 @@ def report(
         info = load_certificate_info(certificate_info, loaded.unit.serial if loaded else None)
     with out.progress('reading') as done:
         window_s = judging['window_s']
-        opened = open_bags(paths, known[:1], **reading, window_s=window_s, progress=done)
+        opened = open_bags(paths, known[:1], topics=topics, window_s=window_s, progress=done)
     with options.usage_of():
         evidence = evidence_of_bags(opened, loaded, **judging, others=known[1:])
     out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in opened)
@@ -199,7 +199,7 @@ def view(
     browser: bool = option('Open it in the default browser, too.', False, '--browser'),
     gravity: float | None = options.place,
     serial: str | None = options.SERIAL,
-    reading: dict[str, Any] = options.reading,
+    topics: Any = options.reading,
     quiet: bool = options.QUIET,
 ) -> None:
     """
@@ -221,7 +221,7 @@ def view(
     live = LiveReport(
         calibration,
         bags or [],
-        reading=reading,
+        topics=topics,
         read=lambda info: out.told([(info.path, info.chosen, info.truncated)]),
         gravity=gravity,
         serial=serial,

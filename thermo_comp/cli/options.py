@@ -122,7 +122,8 @@ def names(
     return found
 
 
-def _topics(
+def _reading(
+    input_: Input = INPUT,
     names: dict[str, str] = names,
     begin: float | None = option(
         'Read each bag from there on: seconds from its first sample, or a stamp.',
@@ -137,22 +138,16 @@ def _topics(
     with usage_of('--from, --to: '):
         part = Part(begin, end)
     with usage_of('--topic: '):
-        return Topics.named(names, part)
+        return Topics.named(names, part=part, input=input_)
 
 
-topics_part = expanded(_topics)
-
-
-@expanded
-def reading(input_: Input = INPUT, names: dict[str, str] = names) -> dict[str, Any]:
-    """Give keywords of what reads a bag."""
-    return {'topics': _topics(names, None, None), 'input': input_}
+reading_part = expanded(_reading)
 
 
 @expanded
-def reading_part(input_: Input = INPUT, topics: Any = topics_part) -> dict[str, Any]:
-    """Give keywords of what reads a bag or a part of it."""
-    return {'topics': topics, 'input': input_}
+def reading(input_: Input = INPUT, names: dict[str, str] = names) -> Any:
+    """Make what says where the inputs stand in a bag."""
+    return _reading(input_, names, None, None)
 
 
 @expanded

@@ -42,7 +42,7 @@ def record(
         'Serial of the unit, for the bags.', callback=options.check_serial
     ),
     offset: float | None = options.OFFSET,
-    reading: dict[str, Any] = options.reading,
+    topics: Any = options.reading,
     out: Output = options.out,
 ) -> None:
     """
@@ -85,12 +85,12 @@ def record(
     with SignalWatch() as signals, closing(bags), ExitStack() as stack:
         signals.on_signal(over.set)
         if bag is not None:
-            news = growing_blocks(bag, **reading, wait=over.wait)
+            news = growing_blocks(bag, topics=topics, wait=over.wait)
         else:
             options.require_ros()
             from ..ros.listener import LiveTopics
 
-            live = stack.enter_context(LiveTopics(**reading, ros_args=context.obj))
+            live = stack.enter_context(LiveTopics(topics=topics, ros_args=context.obj))
             news, problems = live.blocks(over.wait), lambda: live.problems
             out.line('listening; Ctrl-C ends it with whole bags')
             sys.stdout.flush()  # whoever reads this through a pipe waits for it

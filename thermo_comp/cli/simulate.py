@@ -275,7 +275,7 @@ def _equals_offline(recorded: Path, bag: Path, calibration: 'Calibration') -> bo
     from ..replay import replay
 
     def columns(path: Path) -> tuple[Any, ...]:
-        found = read_recording(path, Topics(imu=_OUTPUT), 'imu', require=['accel']).columns
+        found = read_recording(path, Topics(imu=_OUTPUT, input='imu'), require=['accel']).columns
         beside = found.imu and found.imu.linear_acceleration_covariance
         return found.accel_stamp_ns, found.accel, beside
 

@@ -43,8 +43,8 @@ def bag_log(
         usual = given or getattr(Topics(), role)
         chosen.append(said_choice(name, role, usual, among) if name else '')
     # A name that no topic has stands for a thermometer that is not there.
-    topics = Topics.named({role: name or '/none' for role, name in found.items()})
-    recording = read_recording(path, topics, 'imu', require=('accel',))
+    names = {role: name or '/none' for role, name in found.items()}
+    recording = read_recording(path, Topics.named(names, input='imu'), require=('accel',))
     columns = recording.columns
     return ForeignLog(
         str(path),

@@ -48,9 +48,7 @@ class FitSource:
 
 
 def fit_sources(
-    paths: Sequence[str | Path],
-    topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
+    paths: Sequence[str | Path], topics: Topics | None = None
 ) -> tuple[list[FitSource], Input]:
     """
     Prepare recordings for a fit; each is opened once now, and streamed when the fit asks.
@@ -62,7 +60,7 @@ def fit_sources(
     kinds: dict[str, str] = {}
     names: dict[str, str] = {}
     for path in map(Path, paths):
-        source, info = recording_source(path, topics, input)
+        source, info = recording_source(path, topics)
         kinds[info.input or 'counts'] = str(path)
         sources.append(replace(source, sha256=digest(path)))
         twin = names.setdefault(str(sources[-1].sha256), str(path))
@@ -79,21 +77,20 @@ def fit_sources(
 def recording_source(
     path: str | Path,
     topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
     *,
     require: Collection[Role] = _SAMPLES,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[FitSource, RecordingInfo]:
     """Make a source of a recording: looked at now, and opened anew for each pass."""
     path = Path(path)
-    with open_recording(path, topics, input, require=require) as reader:
+    with open_recording(path, topics, require=require) as reader:
         info, topic = reader.info, reader.topics.get('accel')
     latest, total = reader, info.topics[topic][1] if topic else 0
 
     def blocks() -> Iterator[Block]:
         nonlocal latest
         n_read = 0
-        with open_recording(path, topics, input, require=require) as latest:
+        with open_recording(path, topics, require=require) as latest:
             for block in latest.blocks_on_one_clock():
                 yield block
                 n_read += len(block)

@@ -19,7 +19,6 @@ from .. import __version__
 from ..errors import FitError, RecordingError, ThermoCompError
 from ..fitting import FitOptions, ReducedBag, fit_bags, reduce_bag
 from ..fitting.sources import digest, recording_source
-from ..recording.columns import Input
 from ..recording.topics import Topics
 from ..text import one_line
 from ..unit.calibration_file import dump_calibration
@@ -37,11 +36,10 @@ def sha256(content: str | bytes) -> str:
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """What the user says of all units alike; serial and input are those of the bags."""
+    """What the user says of all units alike; serial and input unit are those of the bags."""
 
     fit: FitOptions
     topics: Topics | None = None
-    input: Input = 'auto'
     certificates: bool = True
 
     @property
@@ -93,9 +91,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
         try:
             with storage.here(name, files) as path:
                 hashes[name] = digest(path)
-                source, info = recording_source(
-                    path, options.topics, options.input, require=('accel', 'board')
-                )
+                source, info = recording_source(path, options.topics, require=('accel', 'board'))
                 how = replace(options.fit, input=_UNIT_OF[info.input])
                 bags[name] = reduce_bag(replace(source, sha256=hashes[name]), how)
         except RecordingError as error:  # noqa: PERF203 - no bag stops the others

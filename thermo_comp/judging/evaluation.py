@@ -19,10 +19,10 @@ from ..errors import RecordingError
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sources import digest, recording_source
-from ..recording.columns import Input, Role
+from ..recording.columns import Role
 from ..recording.stillness import STILL_SD
 from ..recording.topics import Topics
-from ..replay import check_unit, input_for, needed_roles
+from ..replay import check_unit, needed_roles, topics_for
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration, Source
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
@@ -50,7 +50,6 @@ def open_bags(
     calibrations: Sequence[Calibration] = (),
     *,
     topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
     window_s: float = WINDOW_S,
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
@@ -63,7 +62,7 @@ def open_bags(
     known: dict[str, Any] = {}
     if calibrations:
         unit, require = calibrations[0].unit, needed_roles(*calibrations)
-        input = input_for(calibrations[0], input)  # noqa: A001 - as above
+        topics = topics_for(calibrations[0], topics)
         density = max(calibrations[0].noise_density_m_s2_sqrt_hz) / STANDARD_GRAVITY
         noise = _NOISES / np.sqrt(unit.cycle_time_s) * density
         known = {'full_scale': unit.full_scale, 'still_sd': max(STILL_SD, noise)}
@@ -73,7 +72,7 @@ def open_bags(
         def told(part: float) -> None:
             progress((len(found) + part) / len(paths))
 
-        source, info = recording_source(path, topics, input, require=require, progress=told)
+        source, info = recording_source(path, topics, require=require, progress=told)
         usual = {'full_scale': None if info.input == 'imu' else COUNTS_FULL_SCALE}
         source = replace(source, sha256=digest(Path(path)))
         bag = reduce_source(source, window_s=sum_length(window_s), **(usual | known))
@@ -106,7 +105,6 @@ def evaluate(
     window_s: float = WINDOW_S,
     tolerance: float | None = None,
     topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
     serial: str | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Evaluation:
@@ -121,9 +119,7 @@ def evaluate(
     """
     models = [one for _, one in calibrations]
     gravity = models[0].gravity_m_s2 if gravity is None else gravity
-    bags = open_bags(
-        paths, models, topics=topics, input=input, window_s=window_s, progress=progress
-    )
+    bags = open_bags(paths, models, topics=topics, window_s=window_s, progress=progress)
     for bag in bags:
         for one in models:
             check_unit(one, bag.info, serial)

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import OutputError, RecordingError
 from ..files import MCAP, check_output
-from .columns import Block, Input, RecordingInfo, Role
+from .columns import Block, RecordingInfo, Role
 from .reader import open_recording
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics
 from .writer import BagWriter
@@ -35,10 +35,7 @@ News = tuple[Block, RecordingInfo | None]
 
 
 def growing_blocks(
-    path: Path,
-    topics: Topics,
-    input: Input,  # noqa: A002 - the parameter's public name
-    wait: Callable[[float], bool],
+    path: Path, topics: Topics, wait: Callable[[float], bool]
 ) -> Iterator[News | None]:
     """
     Give what is new in a bag, and None at the end of each look, until the bag is whole;
@@ -51,7 +48,7 @@ def growing_blocks(
     while True:
         began = time.monotonic()
         try:
-            reader = open_recording(path, topics, input, require=())
+            reader = open_recording(path, topics, require=())
         except RecordingError:
             # A recorder creates its files before it has anything to write, or whole records.
             before, size = size, _size(path)

@@ -24,7 +24,7 @@ from ..files import read_bounded
 from ..plain_yaml import PlainYamlError, load_plain_yaml
 from . import columns
 from .chunks import MAX_CHUNK_BYTES, expand, inflate, inflate_ros1_chunk, translated
-from .columns import ROLES, Block, Input, Messages, RecordingInfo, Role, Topic
+from .columns import ROLES, Block, Messages, RecordingInfo, Role, Topic
 from .mcap_file import McapFile
 from .topics import WHOLE, Topics, select_topics, shown
 from .wire import decode_blocks
@@ -40,19 +40,14 @@ class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
 
-    ``auto`` prefers the counts; roles that are required are an error where they are absent. `info`
+    Roles that are required are an error where they are absent. `info`
     is what the bag says of itself; once all blocks are read, its `truncated` names what did not
     come. `topics` are the bag's own names, `definitions` encoding and text of message types.
     Raises RecordingError for what is no bag, a damaged one, a missing or ambiguous topic.
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        topics: Topics | None = None,
-        input: Input = 'auto',  # noqa: A002 - the parameter's public name
-        *,
-        require: Collection[Role] = ROLES,
+        self, path: str | Path, topics: Topics | None = None, *, require: Collection[Role] = ROLES
     ) -> None:
         super().__init__()
         path, topics = Path(path), topics or Topics()
@@ -62,7 +57,7 @@ class RecordingReader(ExitStack):
             self.info = self._open(path)
             self.definitions = {k: d for one in self._files for k, d in one.definitions.items()}
             with translated(path):
-                found = select_topics(self.info.topics, topics, input, require)
+                found = select_topics(self.info.topics, topics, require)
             self.topics: Mapping[Role, str] = found[0]
             self.info = replace(self.info, input=found[1], chosen=found[2])
         except BaseException as error:
@@ -208,14 +203,10 @@ open_recording = RecordingReader
 
 
 def read_recording(
-    path: str | Path,
-    topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
-    *,
-    require: Collection[Role] = ROLES,
+    path: str | Path, topics: Topics | None = None, *, require: Collection[Role] = ROLES
 ) -> columns.Recording:
     """Read a whole bag into memory; as `open_recording`, and RecordingError for damaged data."""
-    with open_recording(path, topics, input, require=require) as reader:
+    with open_recording(path, topics, require=require) as reader:
         blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), {}, ROLES)
         return columns.Recording(reader.info, columns.joined(blocks))
 

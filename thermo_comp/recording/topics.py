@@ -74,7 +74,7 @@ WHOLE = Part()  # all of a bag
 @dataclass(frozen=True, slots=True)
 class Topics:
     """
-    Where the inputs stand in a bag, and which part of it is read.
+    Where the inputs stand in a bag, which of counts and Imu is read, and which part of it.
     A name matches with or without its leading slash and, where only one topic fits, with any
     namespace in front. Where a usual name is not there, the bag's only topic of the type is taken.
     Further thermometers are found beside the board's, ``temperature/<name>``, or named.
@@ -86,11 +86,13 @@ class Topics:
     case: str = 'temperature/case'
     further: Mapping[str, str] = field(default_factory=dict)
     part: Part = WHOLE
+    input: Input = 'auto'  # which prefers the counts
 
     @classmethod
-    def named(cls, names: Mapping[str, str], part: Part = WHOLE) -> Topics:
+    def named(cls, names: Mapping[str, str], **others: Any) -> Topics:
         """Take topics by ``counts``, ``imu``, ``board``, ``case`` or ``temperature/<name>``."""
-        roles, further = {}, {}
+        roles: dict[str, Any] = {}
+        further = {}
         for name, topic in names.items():
             own = name.removeprefix('temperature/')
             if not topic.strip('/'):
@@ -103,7 +105,7 @@ class Topics:
                 raise ValueError(
                     f'`{name}` is no input; expected {", ".join(_TYPES)} or temperature/NAME'
                 )
-        return cls(**roles, further=further, part=part)
+        return cls(**roles, further=further, **others)
 
 
 _USUAL = Topics()
@@ -126,10 +128,7 @@ def said_choice(name: str, key: str, wanted: str, among: str = 'only') -> str:
 
 
 def select_topics(
-    present: Present,
-    topics: Topics,
-    input: Input,  # noqa: A002 - the parameter's public name
-    require: Collection[Role],
+    present: Present, topics: Topics, require: Collection[Role]
 ) -> tuple[dict[Role, str], Literal['counts', 'imu'] | None, str | None]:
     """
     Find the topics that feed the roles, as far as they have messages, what the accelerometer's is,
@@ -140,7 +139,7 @@ def select_topics(
         raise RecordingError('the bag holds no messages')
     found: dict[Role, str] = {}
     keys: dict[Role, str] = {}
-    inputs = ['counts', 'imu'] if input == 'auto' else [input]
+    inputs = ['counts', 'imu'] if topics.input == 'auto' else [topics.input]
     for role, own in {'accel': inputs, 'board': ['board'], 'case': ['case']}.items():
         names = {key: name for key in own if (name := _find(present, topics, key)) is not None}
         key = next((key for key, name in names.items() if present[name][1]), next(iter(names), ''))

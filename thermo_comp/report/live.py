@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -17,6 +17,7 @@ from ..errors import ThermoCompError
 from ..fitting import ReducedBag
 from ..judging.evaluation import open_bags
 from ..recording.columns import RecordingInfo
+from ..recording.topics import Topics
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence, evidence_of_bags
 from .page import ReportFigure, drawn_figures, figures_of, render_report
@@ -46,12 +47,11 @@ class LiveReport:
         calibration: Path,
         bags: Sequence[Path] = (),
         read: Callable[[RecordingInfo], None] = lambda _: None,
-        reading: Mapping[str, Any] | None = None,
+        topics: Topics | None = None,
         **judging: Any,
     ) -> None:
         self._calibration, self._bags = calibration, list(bags)
-        # For `open_bags` and `evidence_of_bags`.
-        self._read, self._reading, self._judging = read, reading or {}, judging
+        self._read, self._topics, self._judging = read, topics, judging
         self._opened: dict[Path, tuple[str, ReducedBag]] = {}
         self._lock = threading.Lock()
         self._version = self._notice = ''
@@ -89,7 +89,7 @@ class LiveReport:
         for path in self._bags:
             signature = _signature(path)
             if self._opened.get(path, ('',))[0] != signature:
-                (bag,) = open_bags([path], [calibration], **self._reading)
+                (bag,) = open_bags([path], [calibration], topics=self._topics)
                 self._opened[path] = (signature, bag)
                 self._read(bag.info)
         bags = [self._opened[path][1] for path in self._bags]

@@ -26,7 +26,7 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
 from ..online.status import STAMPED_TOPIC
-from ..recording.columns import Input, Messages, Role, Topic
+from ..recording.columns import Messages, Role, Topic
 from ..recording.growing import News
 from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics, is_thermometer
 from ..recording.wire import decode_blocks
@@ -154,9 +154,9 @@ def _stamps(messages: list[bytes]) -> Ints:
 class LiveTopics(_Listener):
     """Listens to the node's inputs: a topic is subscribed to once somebody publishes it."""
 
-    def __init__(self, topics: Topics, input: Input, ros_args: Sequence[str] = ()) -> None:  # noqa: A002
+    def __init__(self, topics: Topics, ros_args: Sequence[str] = ()) -> None:
         super().__init__('thermo_comp_record', ros_args)
-        self._topics, self._input = topics, input
+        self._topics = topics
         self._feeds: dict[Role, Topic] = {}
         self.problems: tuple[str, ...] = ()  # why nothing comes, one sentence each
 
@@ -199,7 +199,7 @@ class LiveTopics(_Listener):
         inputs = {
             getattr(self._topics, key): kind
             for key, kind in (('counts', VECTOR3_STAMPED), ('imu', IMU))
-            if self._input in (key, 'auto') and (chosen is None or chosen.type == kind)
+            if self._topics.input in (key, 'auto') and (chosen is None or chosen.type == kind)
         }
         if not any(self._hear('accel', name, kind, problems) for name, kind in inputs.items()):
             problems.append(f'nobody publishes {" or ".join(map(resolved, inputs))}')

@@ -30,7 +30,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
 from ..errors import ThermoCompError
-from ..recording.columns import Block, Input, RecordingInfo, Role
+from ..recording.columns import Block, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics
 from .relay import INPUTS
@@ -67,12 +67,11 @@ def play(
     rate: float = 1.0,
     wait_s: float = 10.0,
     topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002 - the parameter's public name
     ros_args: Sequence[str] = (),
     progress: Callable[[float], None] = lambda _: None,
 ) -> PlayReport:
     """Play a bag, as `opened_player`, when all topics have subscribers, after `wait_s` at most."""
-    with opened_player(path, rate, topics, input, ros_args) as player:
+    with opened_player(path, rate, topics, ros_args) as player:
         wait_until(lambda: not player.unheard(), wait_s)
         if wait_s > 0.0:
             time.sleep(SETTLING)
@@ -81,17 +80,13 @@ def play(
 
 @contextmanager
 def opened_player(
-    path: str | Path,
-    rate: float,
-    topics: Topics | None = None,
-    input: Input = 'auto',  # noqa: A002
-    ros_args: Sequence[str] = (),
+    path: str | Path, rate: float, topics: Topics | None = None, ros_args: Sequence[str] = ()
 ) -> Iterator[Player]:
     """Open a bag to be played, `rate` seconds of it per second, 0 as fast as they are taken."""
     if not rate >= 0.0:
         raise ValueError(f'`rate` must be zero or positive, got {rate}')
     with (
-        open_recording(path, topics, input, require=('accel',)) as reader,
+        open_recording(path, topics, require=('accel',)) as reader,
         own_node(NODE_NAME, ros_args) as node,
     ):
         yield Player(node, reader, rate)
