@@ -14,11 +14,11 @@ import inspect
 import json
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from thermo_comp.ros.parameters import NodeConfig
 from thermo_comp.unit.calibration import Calibration
-from thermo_comp.unit.schema import Bounds, fields_of, parts_of, plain
+from thermo_comp.unit.schema import Bounds, fields_of, plain
 
 ROOT = Path(__file__).resolve().parent.parent
 TYPES = {str: 'string', int: 'integer', float: 'number', bool: 'boolean', type(None): 'null'}
@@ -152,7 +152,7 @@ def _schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         _define(hint, definitions)
         return {'$ref': f'#/$defs/{hint.__name__}'}
-    origin, arguments = parts_of(hint)
+    origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         result = _schema(arguments[0], definitions)
         for note in arguments[1:]:

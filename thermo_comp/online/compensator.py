@@ -4,12 +4,9 @@
 Owns (counts, temperatures) -> (specific force, covariance, regime, status), streaming and batch.
 
 A reading takes effect at the first sample whose stamp is not before its own and that comes after
-it; so the result depends on stamps and order of arrival, not on when the code happened to run,
-and a node that got everything in order publishes the bits that the offline replay writes.
-
-Each segment begins with a look at what the samples say of themselves: their rate, and, from the
-segment's first sample, |f| against gravity while the platform stands. So the checks cost nothing
-per sample, and a batch comes to the same verdicts.
+it: stamps and order of arrival tell the result, and a node that got everything in order publishes
+the bits of the offline replay. Each segment begins with a look at the rate of the samples and, by
+its first one, at |f| against gravity: the checks cost nothing per sample, and a batch agrees.
 """
 
 from __future__ import annotations

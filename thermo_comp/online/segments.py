@@ -3,13 +3,10 @@
 """
 Owns the segments: from temperature readings to runs of time over which the correction is linear.
 
-Between two thermal events the bias and the scale of each axis move linearly in time. An event is
-a temperature reading or, while none comes, the end of a one-second segment; there the correction
-is evaluated in full (at the segment's start and end), so a sample costs a few operations, follows
-the temperature without a staircase, and a batch needs the full evaluation once per segment.
-
-What parameters and the starts of the lags leave uncertain changes slowly: it is evaluated at the
-first segment that begins in each span of ten seconds of the stamps, and held.
+An event is a temperature reading or, while none comes, the end of a one-second segment. At both
+ends of a segment the correction is evaluated in full, so a sample costs a few operations, follows
+the temperature without a staircase, and a batch needs one evaluation per segment. What changes
+slowly is evaluated at the first segment in each ten seconds of the stamps.
 """
 
 from __future__ import annotations

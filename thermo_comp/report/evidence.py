@@ -56,12 +56,9 @@ class Evidence:
     """
     All that a report says; what is missing is None or empty.
 
-    `serial` is the unit's, or what is known instead; `windows` are at rest, of all bags, and
-    `judgement` what they tell of the calibration; `steps` what each step of the model leaves on
-    the windows of the fit; `left_out`, by `Windows.position`, the RMS of ``|f| - g`` with what the
-    other positions alone say of the unit [m/s^2]; `findings` what speaks against calibration or
-    bags, `checks` what the fit looked at and found good; `history` the unit's calibrations by
-    date, where there are several. A fit is shown on its own bags.
+    `windows` are at rest, of all bags, `judgement` what they tell; `steps` what each step of the
+    model leaves, `left_out`, by `Windows.position`, the RMS of ``|f| - g`` by what the others say
+    of the unit [m/s^2]; `findings` speak against calibration or bags, `checks` found them good.
     """
 
     serial: str

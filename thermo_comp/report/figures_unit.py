@@ -115,11 +115,8 @@ def _draw_less_line(
 
 def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     """
-    Average what is left over each soak of each position: its windows in the static regime.
-
-    Returns temperatures, shape (n,), and bias [micro-g] and scale [ppm] against the calibration,
-    shape (n, 6), as if all of the residual were one of them; the scale is NaN of an axis that has
-    less than half of gravity.
+    Average what is left in each soak of each position: temperatures (n,), bias [micro-g] and scale
+    [ppm] (n, 6), as if all were one of them; NaN of an axis with less than half of gravity.
     """
     windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
     if windows is None or residual is None:

@@ -1,13 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way of the samples through the node: in the order of arrival, compensated, published.
+Owns the way of the samples through the node: in the order of arrival, however the wake-ups fell.
 
-A wake-up takes what has arrived of all inputs, samples first, and works through it in the order
-of arrival. So it does not matter how the wake-ups fell.
-
-An input has one source. A message does not tell whose it is, so while there are two nothing of
-that input is used, nor the first messages after it, which may still be of the one that left.
+A message does not tell whose it is, so while an input has two sources nothing of it is used, nor
+the first messages after it, which may still be of the one that left.
 
 A sample is read and an Imu is written at fixed places of their plain form, little-endian CDR:
 4 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with

@@ -3,9 +3,8 @@
 """
 Owns the round trip: bag -> player -> DDS -> node process -> DDS -> recorder -> bag, without loss.
 
-Everything on the way is what runs on a robot; only the QoS differs: subscriptions reliable and
-without a limit of depth. And the player waits for the node: a reliable reader that is full lets a
-sample be sent again, later than the temperatures behind it, in another order than the bag's.
+Only the QoS differs from a robot's: reliable, without a limit of depth. And the player waits for
+the node: what a full reader has to be sent again comes later than the temperatures behind it.
 """
 
 from __future__ import annotations

@@ -3,10 +3,9 @@
 """
 Owns the loop around a node's wait sets, and everything that leaves rclpy's documented API.
 
-rclpy's executor builds a wait set, a generator and a coroutine for each message, which costs ten
-times the compensation itself, and converts it. Here messages stay serialized, and while samples
-flow a wake-up waits for them alone and empties their queue; services and ordinary subscriptions
-are looked at now and then. Timers, clients and middleware events are nobody's.
+rclpy's executor costs ten times the compensation itself. Here messages stay serialized, and while
+samples flow a wake-up waits for them alone and empties their queue; services and ordinary
+subscriptions are looked at now and then. Timers, clients and middleware events are nobody's.
 
 Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
 `take_message`, `get_publisher_count`, `service_take_request` and `publish_raw` of handles, and the

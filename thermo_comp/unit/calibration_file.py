@@ -3,9 +3,8 @@
 """
 Owns the calibration file: YAML to a validated Calibration and back.
 
-The reader takes any bytes at all and answers with a Calibration or a CalibrationError that names
-the file and the key: size, nesting and the YAML features it accepts are bounded before anything
-is built (no aliases, so no alias bombs; no tags, so no objects; no duplicate keys).
+Any bytes at all give a Calibration or a CalibrationError that names file and key: size, nesting
+and YAML features are bounded before anything is built (no aliases, tags or duplicate keys).
 """
 
 from __future__ import annotations

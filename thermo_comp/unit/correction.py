@@ -238,12 +238,10 @@ class Correction:
         noise_excess: npt.ArrayLike,
     ) -> Floats:
         """
-        Lay a line from the state at the beginning of a segment to that at its end, or many.
+        Lay a line from the states at the beginning of segments to those at their ends.
 
-        Of the error variance a, b, c of each axis come in that change slowly, shape (9, n).
-
-        Returns per axis bias, its change, scale, its change; then per axis a, b, c of the error
-        variance, with noise of one message grown by its excess: shape (21,) or (21, n).
+        `slow` is of the error variance a, b, c by axis, shape (9, n). Returns by axis bias, its
+        change, scale, its change, then a, b, c, with a message's grown noise: (21,) or (21, n).
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size

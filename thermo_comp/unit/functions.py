@@ -3,11 +3,9 @@
 """
 Owns a function of temperature: polynomial, cubic spline or exponential, normalised at t = 0.
 
-Every function takes ``t = T_board - T_ref`` [K], and gives one temperature the bits of many: only
-``+ - * /`` in a fixed order are used, and `math.exp` number by number. Each is linear in its free
-coefficients, so `basis` gives both the regressors of the fit and the derivatives that carry the
-parameter covariance (Eq. (9) and (10) of the paper, which asks for polynomials, splines and
-exponentials).
+Of ``t = T_board - T_ref`` [K] one gets the bits of many: only ``+ - * /`` in a fixed order, and
+`math.exp` number by number. Each is linear in its free coefficients, so `basis` gives the fit's
+regressors and what carries the parameter covariance (Eq. (9) and (10) of the paper).
 """
 
 from __future__ import annotations

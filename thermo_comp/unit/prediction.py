@@ -72,10 +72,8 @@ class SlowUncertainty:
         self, states: Floats, mean_of: Callable[[Floats], Floats]
     ) -> tuple[Floats, Floats]:
         """
-        Say what the parameters leave uncertain of the bias at each of many states, shape (n, w).
-
-        Returns the variance of the bias, and that of its distance from a mean over states, as
-        `mean_of` takes it of rows, shapes (n, 3) [m^2/s^4].
+        Say what the parameters leave uncertain of the bias at states (n, w): its variance, and
+        that of its distance from `mean_of` rows, shapes (n, 3) [m^2/s^4].
         """
         columns = states.T
         phi = self._correction.table.values(columns)
@@ -96,11 +94,7 @@ def _products(bias: Floats, scale: Floats) -> Floats:
 def in_a_soak(
     calibration: Calibration, temperature: float | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """
-    Evaluate a soak, at the reference temperature by default, shapes (3,).
-
-    Returns bias [m/s^2] and its sd, scale [input units per m/s^2] and its relative sd.
-    """
+    """Give bias [m/s^2] and its sd, scale [units per m/s^2] and its relative sd, shapes (3,)."""
     at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
     states = ramp_states(calibration, at)
     bias, scale = bias_and_scale(calibration, states)

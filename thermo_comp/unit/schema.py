@@ -124,7 +124,7 @@ def _build(hint: Any, data: Any, key: str) -> Any:
         return _scalar(hint, data, key)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return _object(hint, data, key)
-    origin, arguments = parts_of(hint)
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         value = _build(arguments[0], data, key)
         for bounds in arguments[1:]:
@@ -139,11 +139,6 @@ def _build(hint: Any, data: Any, key: str) -> Any:
     if origin is tuple:
         return _sequence(arguments, data, key)
     return _either(arguments, data, key)
-
-
-def parts_of(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Take a hint apart that is neither a plain type nor a dataclass."""
-    return typing.get_origin(hint), typing.get_args(hint)
 
 
 @lru_cache(maxsize=256)

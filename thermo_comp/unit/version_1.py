@@ -74,20 +74,14 @@ class _OfSet:
         check_ranges(self, 'gradient_range_k', 'memory_range_k')
 
 
-@dataclass(frozen=True)
-class _OfFile:
-    """What the top level had."""
-
-    memory_time_constants_s: tuple[Positive, ...] = ()
-
-
 def read_version_1(data: dict[str, Any]) -> Calibration:
     """Build a Calibration from the plain values of a file of version 1, or raise SchemaError."""
     for key in _NEW_KEYS:
         if key in data:
             raise SchemaError(key, 'unknown key in a file of version 1')
     data = deepcopy(data)
-    lags = _cut(data, _OfFile).memory_time_constants_s
+    key = 'memory_time_constants_s'
+    lags = build(tuple[Positive, ...], data.pop(key, []), key)
     edges = [_cut(data, _OfSet, regime) for regime in REGIMES]
     axes = [[_cut(data, _OfAxis, regime, one) for one in AXES] for regime in REGIMES]
     calibration = build(Calibration, {**data, 'format_version': FORMAT_VERSION})
