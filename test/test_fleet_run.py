@@ -10,13 +10,16 @@ import csv
 import json
 import os
 import signal
+import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import ROOT
 from fleet_helpers import OPTIONS, damage, write_unit
 
 from thermo_comp.cli.app import run as run_command
@@ -162,6 +165,34 @@ def test_an_interrupted_run_goes_on_where_it_was(client: Any, tmp_path: Path) ->
     assert len(result.rows) == 3
     assert result.n_done in (2, 3)
     assert json.loads((out / 'units/A/u0/result.json').read_text())['is_final']
+
+
+def children_of(pid: int) -> list[int]:
+    return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
+
+
+def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path: Path) -> None:
+    # WHY: each worker that was being imported, and then Dask, printed one.
+    write_unit(tmp_path / 'bags' / 'u', 1, 1)
+    words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'thermo_comp', *words],
+        cwd=tmp_path,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    pause = threading.Event()
+    # The first worker is a child of the server of processes.
+    while not any(map(children_of, children_of(process.pid))):
+        assert process.poll() is None
+        pause.wait(0.01)
+    # As a terminal does, to all of them.
+    os.killpg(process.pid, signal.SIGINT)
+    said, _ = process.communicate(timeout=60)
+    assert (process.returncode, said) == (130, '')
 
 
 class TestScheduler:

@@ -197,7 +197,7 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
     local = {'host': '127.0.0.1', 'dashboard_address': '127.0.0.1:0', 'preload': [__name__]}
     with dask.config.set(quiet), ExitStack() as stack:
         if scheduler is None:
-            get_mp_context()
+            get_mp_context().set_forkserver_preload(['distributed', __name__])
             with _uninterrupted():
                 own = Client(n_workers=n_workers, threads_per_worker=1, processes=True, **local)
                 stack.enter_context(own)
