@@ -55,7 +55,8 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
     run = simulate(unit, parse_cyclogram(program), directions[0], rate_hz=1.0)
     truth = run.truth
     time_s = np.arange(window_s / 2.0, truth.grid_s[-1], window_s)
-    t = np.interp(time_s, truth.grid_s, truth.temperature('board')) - 20.0
+    board = truth.temperatures[:, unit.network.nodes.index('board')]
+    t = np.interp(time_s, truth.grid_s, board) - 20.0
     powers = np.column_stack((np.ones_like(t), t, t * t))
     K = np.array(unit.scale_factor)
     sd = np.array(unit.noise_density) * 1e-6 * STANDARD_GRAVITY * K / np.sqrt(window_s)

@@ -9,15 +9,20 @@ from dataclasses import replace
 import numpy as np
 
 from thermo_comp.simulation.campaign import Cyclogram
-from thermo_comp.simulation.run import SimulatedRun
+from thermo_comp.simulation.run import SimulatedRun, Truth
 from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.typing import Bools, Floats
+
+
+def of_part(truth: Truth, node: str) -> Floats:
+    """Give the temperature [degC] of one part on the thermal grid."""
+    return truth.temperatures[:, truth.unit.network.nodes.index(node)]
 
 
 def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> Bools:
     """Tell where, on the thermal grid, the board really takes up or gives off heat."""
     truth = run.truth
-    rate = np.gradient(truth.temperature(truth.unit.board.node), truth.grid_s)
+    rate = np.gradient(of_part(truth, truth.unit.board.node), truth.grid_s)
     return np.asarray(np.abs(rate) * 60.0 > threshold_k_min)
 
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import ROOT
+from simulation_helpers import of_part
 
 from thermo_comp.simulation.campaign import PLAN_NAMES, Position, parse_cyclogram, plan
 from thermo_comp.simulation.drift import FlowEffect, PartHistory, SlipEffect
@@ -164,7 +165,7 @@ def test_a_switched_load_heats_its_part() -> None:
         simulate(one, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth
         for one in (loaded, unit)
     )
-    warmer = on.temperature('board') - off.temperature('board')
+    warmer = of_part(on, 'board') - of_part(off, 'board')
     np.testing.assert_allclose(warmer[: int(spell)], 0.0, atol=1e-9)
     # 0.5 W through 0.4 W/K to the case and about 4 W/K to the air.
     to_air = next(link.conductance for link in unit.network.links if link.a == 'air')

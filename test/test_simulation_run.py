@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import welch
-from simulation_helpers import ideal_regime, noiseless, rippled
+from simulation_helpers import ideal_regime, noiseless, of_part, rippled
 
 from thermo_comp.simulation.campaign import Cyclogram, parse_cyclogram, positions
 from thermo_comp.simulation.drift import PartEffect
@@ -190,7 +190,7 @@ def test_thermometers_have_their_rate_and_noise(unit: UnitModel, rate_hz: float)
     assert run.case_stamp_ns[0] == START_NS
     assert run.board_stamp_ns[0] == START_NS + round(0.5e9 / rate_hz)
     true = np.interp(
-        (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, run.truth.temperature('case')
+        (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, of_part(run.truth, 'case')
     )
     error = run.case - true
     # 540 readings at the least of 5 mK: the mean to 0.2 mK, the deviation to 3 %; five of each.

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from simulation_helpers import of_part
 
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import fit_sources
@@ -61,7 +62,7 @@ def record(path: Path, run: SimulatedRun, *, has_lid: bool) -> Path:
         bag.write_temperature('temperature/case', run.case_stamp_ns, run.case)
         if has_lid:
             since = (run.case_stamp_ns - run.accel_stamp_ns[0]) * 1e-9 + truth.cycle_s[0]
-            lid = np.interp(since, truth.grid_s, truth.temperature('lid'))
+            lid = np.interp(since, truth.grid_s, of_part(truth, 'lid'))
             lid += 0.01 * rng.standard_normal(len(lid))
             bag.write_temperature('temperature/lid', run.case_stamp_ns, lid)
         bag.write_counts('accel/counts', run.accel_stamp_ns, run.counts.astype(float))

@@ -74,8 +74,8 @@ class Judgement:
     @property
     def exit_code(self) -> int:
         """0 for a calibration that was shown to hold, unless its gyroscope does not; else 1."""
-        is_rate_wrong = self.rate is not None and self.rate.is_wrong
-        return 0 if self.is_valid and not is_rate_wrong else 1
+        is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
+        return 0 if self.is_valid and not is_wrong else 1
 
     @property
     def headline_rms(self) -> float:

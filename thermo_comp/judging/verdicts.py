@@ -113,11 +113,6 @@ class RateJudgement:
     reason: str
     sections: Sections
 
-    @property
-    def is_wrong(self) -> bool:
-        """Whether the gyroscope was shown not to hold."""
-        return self.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
-
     def __str__(self) -> str:
         """Give the verdict with its numbers, as every command prints it."""
         return f'angular rate: {self.kind.value}: {self.reason}'

@@ -46,12 +46,12 @@ class Windows:
     Each is `window_s` long, and begins at `start_ns`; `time` is its middle since the bag's first
     sample [s], `count` and `mean` are of its raw samples. A position is a still interval, counted
     through all bags. The rate is the board's [K/s]. Dynamic are those in which the dynamic set
-    prevails, inside those that lie inside the calibrated ranges as a whole; swapped those in which
-    the board leads the case. `raw` is the specific
-    force by the constants at the reference temperature, `force` that by the calibration, shapes
-    (n, 3); `claimed_sd` is claimed for the norm of `force`: the calibration's error and the white
-    noise of the mean, which is `noise_sd` alone. `gyro` has rows of the angular rate, raw and
-    corrected, its claimed variances, and the thermal state; empty without a gyroscope.
+    prevails, inside those that lie inside the calibrated ranges as a whole, swapped those in which
+    the board leads the case. `raw` is the specific force by the constants at the reference
+    temperature, `force` that by the calibration, shapes (n, 3); `claimed_sd` is claimed for the
+    norm of `force`: the calibration's error and the white noise of the mean, which is `noise_sd`
+    alone. `gyro` has rows of the angular rate, raw and corrected, its claimed variances, and the
+    thermal state; empty without a gyroscope.
     """
 
     window_s: float
@@ -96,8 +96,6 @@ class Windows:
 
 def sum_length(window_s: float) -> float:
     """Choose the longest part of a window in which the thermal state moves little."""
-    if not 0.0 < window_s < np.inf:
-        raise ValueError(f'`window_s` must be positive, got {window_s:g}')
     return window_s / float(np.ceil(window_s / reduction.WINDOW_S))
 
 

@@ -40,10 +40,10 @@ class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
 
-    Roles that are required are an error where they are absent. `info`
-    is what the bag says of itself; once all blocks are read, its `truncated` names what did not
-    come. `topics` are the bag's own names, `definitions` encoding and text of message types.
-    Raises RecordingError for what is no bag, a damaged one, a missing or ambiguous topic.
+    Roles that are required are an error where they are absent. `info` is what the bag says of
+    itself; once all blocks are read, its `truncated` names what did not come. `topics` are the
+    bag's own names, `definitions` encoding and text of message types. Raises RecordingError for
+    what is no bag, a damaged one, a missing or ambiguous topic.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from ..unit.gyroscope import MILLIDEGREE
 from .campaign import Cyclogram, Position
 from .drift import PartHistory, drift_of
-from .network import AIR, ThermalResponse
+from .network import ThermalResponse
 from .unit import Stream, SwitchedLoad, UnitModel, first_charge, generator, white
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
@@ -66,11 +66,6 @@ class Truth:
         share = (place - left)[:, None]
         result: Floats = (1.0 - share) * grid[left] + share * grid[left + 1]
         return result
-
-    def temperature(self, node: str) -> Floats:
-        """Return the temperature [degC] of one part, or `AIR`, on the thermal grid, (m,)."""
-        nodes = self.unit.network.nodes
-        return self.air if node == AIR else self.temperatures[:, nodes.index(node)]
 
 
 @dataclass(frozen=True, eq=False)
