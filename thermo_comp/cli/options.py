@@ -170,15 +170,14 @@ def place(
 @expanded
 def judging(
     gravity: float | None = place,
-    window_s: float = option('Length of a window at rest, in s.', 60.0, '--window', metavar='S'),
+    window_s: float = option(
+        'Length of a window at rest, in s.', 60.0, '--window', metavar='S', min=1e-3, max=86400.0
+    ),
     tolerance: str | None = option('Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
 ) -> dict[str, Any]:
     """Give keywords of what judges."""
-    return locals() | {
-        'window_s': positive(window_s, '--window'),
-        'tolerance': acceleration(tolerance, '--tolerance'),
-    }
+    return locals() | {'tolerance': acceleration(tolerance, '--tolerance')}
 
 
 @expanded
@@ -214,13 +213,6 @@ def acceleration(text: str | None, name: str) -> float | None:
     """Read an acceleration with its unit [m/s^2]; None where none is given."""
     with usage_of(f'{name}: '):
         return None if text is None else parse_acceleration(text)
-
-
-def positive(value: float, name: str) -> float:
-    """Refuse a number that is not positive and finite."""
-    if not 0.0 < value < float('inf'):
-        raise usage(f'{name} must be positive, got {value:g}')
-    return value
 
 
 def require_ros() -> None:

@@ -144,10 +144,9 @@ def record(
 def _duration(text: str) -> float:
     """Read a duration with its unit, like ``45min``, ``1.5h`` or ``30s`` [s]."""
     found = re.fullmatch(r'\s*(\d+\.?\d*|\.\d+)\s*(h|min|s)\s*', text)
-    if found is None:
+    if found is None or not float(found[1]):
         raise options.usage(f'--soak: expected a duration like 45min, 1.5h or 30s, got {text!r}')
-    seconds = float(found[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[found[2]]
-    return options.positive(seconds, '--soak')
+    return float(found[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[found[2]]
 
 
 def _tell(out: Output, account: 'Account', problems: Sequence[str], told: dict[str, str]) -> None:

@@ -85,6 +85,7 @@ class McapOutput:
         self._tail: list[Messages] = []
         self._at = 0
         self._stream = path.open('xb', buffering=0)
+        self.close = self._stream.close  # as it is
         self._put(MAGIC)
         self._put_record(records.Header('ros2', f'thermo_comp {__version__}'))
         if metadata:
@@ -143,10 +144,6 @@ class McapOutput:
         os.fsync(self._stream.fileno())
         self.close()
         return found
-
-    def close(self) -> None:
-        """Close the file as it is."""
-        self._stream.close()
 
     def _information(self) -> dict[str, Any]:
         """Build metadata.yaml as Jazzy has it."""
