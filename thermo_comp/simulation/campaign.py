@@ -154,12 +154,10 @@ class Position:
 
 def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     """
-    Return the positions of a test in the order of their recording.
-
-    'chamber-18' (18 positions of 9.5 h), 'chamber-9' (9 of 3 h), 'tumble' (18 of 20 min at room
-    temperature), 'tumble-3', 'tumble-1' (the same and 3 or 1 of 3 h in the chamber) or 'held-out'
-    (3 positions with other ramps and attitudes, for judging). `seed` is that of the attitudes and
-    of the room's temperature.
+    Return the positions of a test in the order of their recording: 'chamber-18' (of 9.5 h each),
+    'chamber-9' (3 h), 'tumble' (18 of 20 min at room temperature), 'tumble-3', 'tumble-1' (the
+    same and 3 or 1 of 3 h in the chamber) or 'held-out' (3 with other ramps and attitudes).
+    `seed` is that of the attitudes and of the room's temperature.
     """
     if name not in PLAN_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')

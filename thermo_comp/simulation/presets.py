@@ -313,13 +313,9 @@ def unit_preset(name: str, seed: int = 0) -> UnitModel:
     Return one specimen of a kind of unit; another one for every seed, which is not negative.
 
     'thermostatted' (quartz triad in an oven, the converter's board outside: the board's drift
-    dominates), 'bare-quartz' (no oven: the magnet's scale tempco dominates), 'mems', or a triad
-    with one kind of physics beside tempcos that lag: 'own-lags' (a time constant for each head),
-    'between' (heads between case and board), 'products' (expansion coefficients that change with
-    temperature), 'hysteresis' (joints that slip), 'even' (errors even in the heat flow),
-    'convection' (heat that flows through gas, and a leakage), 'switched-load' (electronics that
-    heat by turns), 'paper' (a load while the ambient changes), 'slow-noise' (a bias that walks),
-    'plain' (no thermal error at all), 'demo' (the sample unit: paper and lags).
+    dominates), 'bare-quartz' (no oven: the magnet's scale tempco dominates), 'mems', 'demo' (the
+    sample unit: paper and lags), or a triad with one kind of physics beside tempcos that lag, as
+    the table in docs/accuracy.md tells them.
     """
     if name not in UNIT_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(UNIT_NAMES)}, got {name!r}')
