@@ -60,7 +60,7 @@ _EARNED = 3.0
 # No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
 _LEAST_SIGMA = 1e-8
 # Of the noise of a window, what a column may add unseen before it counts.
-_OPEN = 4.0
+_OPEN = 2.0
 # Windows more sds off than this lose weight.
 _FAR_SDS, _FARTHEST_SDS = 3.0, 1e3
 # A fifth of a normal sample lies farther off than so many sds.
