@@ -5,7 +5,9 @@ Owns still intervals: raw samples -> short cells (count, mean, variance) -> wher
 
 Two tests are relative to the bag's own quiet level: the variance inside a cell (vibration,
 handling) and the step between neighbouring cells (a turn, a knock): a step starts a new interval,
-because a shift of one microradian is already one micro-g. Two are absolute, because a flight has a
+because a shift of one microradian is already one micro-g. Temperature moves a unit at rest, too:
+what the cells around do in one direction, slower than the Earth turns, is a drift and no step. Two
+are absolute, because a flight has a
 quietest tenth, too: a sensor at rest scatters by no more than its noise, and does not turn.
 """
 
@@ -14,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
 
@@ -28,6 +31,8 @@ _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
+# A drift is the median step of so many around, and no faster than this [parts of g per s].
+_DRIFT_STEPS, _DRIFT = 9, 5e-5
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # how many windows a cell lasts where the samples are slow
 _LONGEST_CELL_NS = 86400e9  # stamps may lie anywhere; no unit rests in one cell for a day
@@ -218,10 +223,14 @@ def still_intervals(
     # A sensor that reads the same number for long is no measure of its noise: toggling between two
     # neighbours has a variance of a quarter step squared. A tenth-percentile of a chi-square
     # variance lies a little below its mean; 1.3 covers it for cells of 32 samples.
+    drift = _drift(cells, believable)
     level = np.quantile(cells.variance[believable], 0.1, axis=0)
     limit = ratio * np.maximum(1.3 * level, 0.25 * cells.quantum**2)
+    # What drifts by d within a cell has a variance of d^2 / 12, give or take what noise makes of it.
+    within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
+    limit = limit + within**2 / 6.0 if len(within) else limit
     quiet = believable & (cells.variance <= limit).all(axis=1)
-    broken = ~_is_joined(cells, quiet)
+    broken = ~_is_joined(cells, quiet, drift)
     # A cell beside a moving one, or on either side of a step, holds the edge of the motion.
     moved = ~quiet
     near = moved.copy()
@@ -283,9 +292,25 @@ def _is_turning(cells: Cells) -> Bools:
     return np.asarray(shakes | (np.abs(cells.rate - level) > _STILL_RATE).any(axis=1))
 
 
-def _is_joined(cells: Cells, quiet: Bools) -> Bools:
-    """Whether cell i + 1 continues cell i, shape (n - 1,): no gap in time, no step in the mean."""
-    step = np.diff(cells.mean, axis=0)
+def _drift(cells: Cells, believable: Bools) -> Floats:
+    """Say what of the step behind each cell is a drift of all around it, shape (n - 1, 3)."""
+    both = believable[1:] & believable[:-1] & (np.diff(cells.index) == 1)
+    step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
+    half = _DRIFT_STEPS // 2
+    if len(step) <= half:
+        return np.zeros_like(step)
+    around = np.pad(step, ((half, half), (0, 0)), mode='reflect')
+    drift = np.median(sliding_window_view(around, _DRIFT_STEPS, axis=0), axis=-1)
+    largest = _DRIFT * cells.cell_s * _one_g(cells)
+    return np.asarray(np.clip(drift, -largest, largest))
+
+
+def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
+    """
+    Whether cell i + 1 continues cell i, shape (n - 1,): no gap in time, no step in the mean but
+    for the drift.
+    """
+    step = np.diff(cells.mean, axis=0) - drift
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():
         return np.zeros(len(step), dtype=bool)
