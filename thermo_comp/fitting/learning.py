@@ -280,7 +280,7 @@ def _settle(
 ) -> tuple[Posterior, Prior]:
     """Repeat the fixed point; silent columns keep their width, kept ones may not leave, (2, m)."""
     for k in range(rounds):
-        posterior = regression.solve(state, prior, n_steps=2)
+        posterior = regression.solve(state, prior, n_steps=0)
         state = posterior.state
         layout, sd, told = posterior.layout, prior.widths, told_of(posterior)
         power = np.sum(state.weights**2, axis=1)

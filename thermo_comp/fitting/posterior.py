@@ -312,7 +312,7 @@ class Regression(Design):
     ) -> Posterior:
         """
         Find the mode under a prior, in so many steps or, where it is far, in as many as it takes;
-        one step only looks where a state is.
+        one step only looks where a state is, and none goes where that points, unseen.
         """
         layout = self.layout(prior.widths > 0.0)
         precision = self.precision(prior, layout)
@@ -337,13 +337,14 @@ class Regression(Design):
         # What takes no part any more is 0.
         state, equations, gradient, size = look(self._moved(state, np.zeros(layout.n), layout))
         far = _FAR * self.windows.mean.size
-        last = max(n_steps, _MOST_STEPS) - 1 if n_steps > 1 else 0
+        last = max(n_steps, _MOST_STEPS) - 1 if n_steps != 1 else 0
         for k in range(last + 1):
             factor = Factor(equations.hessian + information, layout)
             step = factor.solve(gradient)
             promised = 0.5 * float(step @ gradient)
             is_enough = k == last or (k >= n_steps - 1 and promised < far)
             if promised < tolerance or is_enough:
+                state = state if n_steps else self._moved(state, step, layout)
                 break
             for _ in range(_MOST_TRIES):
                 if damping:
