@@ -134,6 +134,52 @@ def test_new_rests_make_an_old_calibration_better():
     assert np.all(np.abs(bias) < 4.0 * np.hypot(sd_of_levels(new), sd_of_levels(old)))
 
 
+def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
+    # WHY: who updates in the field has an hour at the temperature of the day, and no data sheet.
+    # WHAT: biases that moved by 200 ug are found although nobody said that they might have; the
+    # calibration holds where the old one did, and leaves there what that left before.
+    moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
+    old = fitted(9).calibration
+
+    def aged(record: SimulatedRun) -> SimulatedRun:
+        by = np.rint(moved * np.array([axis.scale_factor for axis in old.axes]))
+        return replace(record, counts=record.counts + by.astype(record.counts.dtype))
+
+    rests = [Position(f'r{k}', day, up) for k, up in enumerate(positions(6, 77))]
+    later = [source(aged(record)) for record in arrays(KIND.sibling(9, 0.15), rests, 999)]
+    new = fit(later, replace(OPTIONS, serial='unit-9', prior=old)).calibration
+    for now, before in zip(new.regime_sets(), old.regime_sets(), strict=True):
+        assert now.temperature_range_c == before.temperature_range_c
+        assert now.rate_range_k_min == before.rate_range_k_min
+    for now, before in zip(new.response, old.response, strict=True):
+        assert now.range[0] <= before.range[0]
+        assert now.range[1] >= before.range[1]
+    left = [
+        left_by(calibration, changed(record))
+        for calibration, changed in ((old, lambda one: one), (old, aged), (new, aged))
+        for record in test_of(9, 9, 10)
+    ]
+    assert left[1] > 10.0 * left[0]
+    # Six rests of ten minutes tell a level to half of the noise of a minute, at the worst.
+    assert left[2] < 1.5 * left[0]
+
+
+def left_by(calibration: Calibration, record: SimulatedRun) -> float:
+    """RMS of |f| - g in means of a minute."""
+    origin = record.accel_stamp_ns[0]
+    board, case = (
+        ((stamp[::8] - origin) * 1e-9, value[::8])
+        for stamp, value in ((record.board_stamp_ns, record.board),
+                             (record.case_stamp_ns, record.case))
+    )  # fmt: skip
+    time = (record.accel_stamp_ns - origin) * 1e-9
+    force = calibration.correct(time, record.counts, board=board, case=case).specific_force
+    n = round(60.0 / float(np.median(np.diff(time))))
+    means = force[: len(force) // n * n].reshape(-1, n, 3).mean(axis=1)
+    left = np.linalg.norm(means, axis=1) - STANDARD_GRAVITY
+    return float(np.sqrt(np.nanmean(left**2)))
+
+
 def test_population_refuses_what_is_not_alike():
     first, second, third = siblings()
     with pytest.raises(FitError, match='need 3 for a population'):

@@ -139,3 +139,21 @@ def test_the_shortest_rest_is_yours_to_say(rng):
         reduce_bag(source(accel), FitOptions(gravity=GRAVITY, input='m/s^2', min_rest_s=60.0))
     with pytest.raises(ValueError, match='`min_rest_s` must be positive'):
         FitOptions(gravity=GRAVITY, min_rest_s=0.0)
+
+
+def test_a_ramp_moves_no_unit_at_rest(rng):
+    # WHY: a quiet unit of 60 ug/K in a ramp of 2 K/min changes by 60 ug from one cell of 30
+    # samples at 1 Hz to the next, 60 times the noise of their means, and has not moved.
+    # WHAT: it is one position; a knock of 0.1 mrad within the ramp still makes it two.
+    time = np.arange(7200.0)
+    stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
+    ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG
+    ramp -= 300.0 * 2e-3 * MG * (1.0 - np.exp(-np.clip(time - 1800.0, 0.0, None) / 300.0))
+    for knock, n_rests in ((0.0, 1), (0.1, 2)):
+        accel = np.array((0.0, 0.0, GRAVITY)) + 5e-3 * MG * rng.standard_normal((7200, 3))
+        accel[:, :2] += ramp[:, None] + knock * MG * (time[:, None] > 3000.0)
+        nothing = np.zeros(0)
+        block = ImuBlock(stamps, accel, nothing.astype(np.int64), nothing,
+                         nothing.astype(np.int64), nothing)  # fmt: skip
+        bag = reduce_bag(FitSource('slow', lambda block=block: [block]), OPTIONS)
+        assert len(bag.intervals) == n_rests

@@ -42,7 +42,7 @@ def fit(
         'Calibration to begin with: of the type, or an old one.', metavar='YAML'
     ),
     ageing_bias: str | None = option(
-        "What the biases may have changed by since the prior's: 50ug, 0.1mg."
+        "What the biases may have changed by since the prior's: 50ug; else what the bags show."
     ),
     ageing_scale: float = option(
         'What the scale may have changed by since, in ppm.', 0.0, metavar='PPM'

@@ -62,8 +62,9 @@ def build_calibration(
     unit: Unit,
     residuals: Sequence[ResidualRow] = (),
     findings: Sequence[Finding] = (),
+    known: Calibration | None = None,
 ) -> Calibration:
-    """Write a posterior as a calibration."""
+    """Write a posterior as a calibration; it holds where a prior did, too, `known`."""
     model, prior, state = windows.model, learnt.prior, learnt.posterior.state
     layout = learnt.claim.layout
     taken = (layout.weights[:, 0, len(model.sets.levels()) :] >= 0).any(axis=0)
@@ -76,13 +77,21 @@ def build_calibration(
     rate_margin = _RATE_MARGIN if is_seen else _UNSEEN_RATE
     rates = _widened(windows.rate * 60.0, _LINEAR_REACH, rate_margin)
     slow = _slow_error(windows, learnt).tolist()
+    earlier = (None, None) if known is None else known.regime_sets()
     static, dynamic = (
-        RegimeSet(temperatures, rates, *(_blank(family, sd) for sd in slow))
-        for family in model.sets.families
+        RegimeSet(
+            temperatures if one is None else union((temperatures, one.temperature_range_c)),
+            rates if one is None else union((rates, one.rate_range_k_min)),
+            *(_blank(family, sd) for sd in slow),
+        )
+        for family, one in zip(model.sets.families, earlier, strict=True)
     )
+    seen = [_column_range(model.columns[k], windows.raw[:, k]) for k in used]
     columns = [
-        replace(model.columns[k], range=_column_range(model.columns[k], windows.raw[:, k]))
-        for k in used
+        replace(
+            model.columns[k], range=one if known is None else union((one, model.columns[k].range))
+        )
+        for k, one in zip(used, seen, strict=True)
     ]
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     blank = Calibration(
@@ -101,7 +110,7 @@ def build_calibration(
             if not k or any(name == column.sensor for column in columns)
         ),
         response=blank_terms(columns),
-        board_lag_s=_board_lag(windows),
+        board_lag_s=known.board_lag_s if known else _board_lag(windows),
         detector=model.detector,
         provenance=Provenance(
             created=datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ'),
@@ -262,6 +271,12 @@ def _column_range(column: Column, values: Floats) -> tuple[float, float]:
     if column.kind == 'even':
         return column.range
     return _widened(values, _LINEAR_REACH**column.order, 0.01)
+
+
+def union(ranges: Iterable[tuple[float, float]]) -> tuple[float, float]:
+    """Return the range from the lowest to the highest of some."""
+    lower, upper = zip(*ranges, strict=True)
+    return min(lower), max(upper)
 
 
 def _widened(values: Floats, reach: float, margin: float) -> tuple[float, float]:

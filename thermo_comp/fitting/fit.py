@@ -214,7 +214,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     )
     try:
         calibration = build_calibration(
-            windows, regression, learnt, bags, _unit(bags, options), residuals, findings
+            windows, regression, learnt, bags, _unit(bags, options), residuals, findings, known
         )
         calibration, rates = add_gyroscope(calibration, windows, bags, options)
     except ValueError as error:

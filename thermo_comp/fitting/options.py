@@ -74,7 +74,8 @@ class FitOptions:
     static_curve, dynamic_curve: one of `CURVES`; None takes the model's own
     groups, forced: groups of columns that may take part (None: all); that stay whatever they earn
     prior: what is known beforehand, of the type or of this unit; its columns are the model
-    ageing_bias, ageing_scale: sd of what each has changed by since the prior [m/s^2], [1]
+    ageing_bias, ageing_scale: sd of what each has changed by since the prior [m/s^2], [1]; both 0:
+        what the bags show
     serial: unit serial; None takes the sources'
     input: unit of the samples
     full_scale: magnitude of a saturated sample; None takes 32767 for counts, and for m/s^2 the

@@ -21,7 +21,7 @@ from ..errors import FitError
 from ..typing import Floats
 from ..unit.calibration import Calibration, Provenance, RegimeSet, Source, parameter_layout
 from ..unit.columns import Column
-from .assembly import blank_terms, file_parameters, parameters_of, with_parameters
+from .assembly import blank_terms, file_parameters, parameters_of, union, with_parameters
 from .options import FitOptions
 from .posterior import Regression
 from .start import ConstantCalibration
@@ -34,6 +34,8 @@ UNITS_NEEDED = 3
 # part of the scatter counts for each parameter by itself, and parts of it more may be added.
 _ALONE = 0.01
 _MORE_ALONE = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
+# Ageing that nobody has stated, of biases [parts of g] and of scales, is what the bags show.
+_AGEINGS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
 # Correlations are believed to this part of a variance.
 _EXACT = 1e-6
 
@@ -89,22 +91,31 @@ def known_of(
     K = constants_of(calibration).scale
     covariance = calibration.posterior.covariance()
     places = parameter_layout(calibration)
-    for axis in range(3):
-        for block, sd in (
-            (places.bias[axis], options.ageing_bias * K[axis]),
-            (places.scale[axis], options.ageing_scale),
-        ):
-            levels = [block.static, block.dynamic]
-            covariance[np.ix_(levels, levels)] += sd * sd
-    diagonal = np.diag(covariance)
-    floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
+
+    def grown(bias_sd: float, scale_sd: float) -> Floats:
+        result = covariance.copy()
+        for axis in range(3):
+            for block, sd in (
+                (places.bias[axis], bias_sd * K[axis]),
+                (places.scale[axis], scale_sd),
+            ):
+                levels = [block.static, block.dynamic]
+                result[np.ix_(levels, levels)] += sd * sd
+        return result
+
+    stated = options.ageing_bias, options.ageing_scale
+    tried = [(grown(*stated), more) for more in _MORE_ALONE]
+    if not any(stated):
+        tried += [(grown(one * options.gravity, one), 0.0) for one in _AGEINGS]
     layout = regression.layout(regression.windows.parts)
     to_file = file_parameters(regression, layout, state, sets, range(len(calibration.response)))
-    root = np.sqrt(floor)
-    scaled, correlation = to_file / root[:, None], covariance / np.outer(root, root)
     mean = regression.vector(state, layout)[: layout.n_unit]
     result = []
-    for more in _MORE_ALONE:
+    for known, more in tried:
+        diagonal = np.diag(known)
+        floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
+        root = np.sqrt(floor)
+        scaled, correlation = to_file / root[:, None], known / np.outer(root, root)
         wider = correlation + (_EXACT + more) * np.eye(len(root))
         precision = scaled.T @ np.linalg.solve(wider, scaled)
         result.append(Known(mean, (precision + precision.T) / 2.0))
@@ -135,7 +146,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     for one in calibrations:
         for column, key in zip(prior_columns(one), _unranged(prior_columns(one)), strict=True):
             keys.setdefault(key, []).append(column.range)
-    like = _like(calibrations, [replace(key, range=_union(own)) for key, own in keys.items()])
+    like = _like(calibrations, [replace(key, range=union(own)) for key, own in keys.items()])
     K = np.array([constants_of(one).scale for one in calibrations])
     mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
     told = [_told(one, like, mean_K) for one in calibrations]
@@ -200,8 +211,8 @@ def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Cal
             replace(own, residual_sd_m_s2=float(sd))
             for own, sd in zip(regime.axes(), np.median(slow, axis=0), strict=True)
         )
-        temperatures = _union([one.temperature_range_c for one in each])
-        rates = _union([one.rate_range_k_min for one in each])
+        temperatures = union([one.temperature_range_c for one in each])
+        rates = union([one.rate_range_k_min for one in each])
         regimes.append(RegimeSet(temperatures, rates, x, y, z))
     return replace(
         first,
@@ -218,7 +229,3 @@ def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Cal
         posterior=None,
         gyroscope=None,
     )
-
-
-def _union(ranges: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    return min(r[0] for r in ranges), max(r[1] for r in ranges)

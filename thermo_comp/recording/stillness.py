@@ -226,7 +226,7 @@ def still_intervals(
     drift = _drift(cells, believable)
     level = np.quantile(cells.variance[believable], 0.1, axis=0)
     limit = ratio * np.maximum(1.3 * level, 0.25 * cells.quantum**2)
-    # What drifts by d within a cell has a variance of d^2 / 12, give or take what noise makes of it.
+    # A drift of d within a cell has a variance of d^2 / 12, give or take what noise makes of it.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
     limit = limit + within**2 / 6.0 if len(within) else limit
     quiet = believable & (cells.variance <= limit).all(axis=1)
