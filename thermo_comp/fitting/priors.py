@@ -93,7 +93,7 @@ def known_of(
     places = parameter_layout(calibration)
 
     def grown(bias_sd: float, scale_sd: float) -> Floats:
-        result = covariance.copy()
+        result: Floats = covariance.copy()
         for axis in range(3):
             for block, sd in (
                 (places.bias[axis], bias_sd * K[axis]),
