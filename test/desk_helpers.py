@@ -26,9 +26,10 @@ MADE = (
     *('freezer.mcap', 'log.csv', 'tumble.txt', 'flight.ulg', 'flight.bin', 'bags/fleet'),
     'bags/unit42',
 )
-_FOREIGN = {
-    'xsens_acc.calib': '1 0 0\n0 1 0\n0 0 1\n\n2e-3 0 0\n0 2e-3 0\n0 0 2e-3\n\n1\n2\n3\n',
-    'accel_calib.yaml': 'SM: [1.02, 0, 0, 0, 0.99, 0, 0.01, 0, 1.01]\nbias: [0.1, 0, 0.2]\n',
+_EXPORTS = {
+    'autopilot.params': 'px4',
+    'xsens_acc.calib': 'imu_tk',
+    'accel_calib.yaml': 'imu_calib',
 }
 
 
@@ -90,10 +91,9 @@ class Desk:
             path.write_text(
                 re.sub(r'serial: .*?([,}\n])', rf'serial: {path.stem}\1', text, count=1)
             )
-        elif name in _FOREIGN:
-            path.write_text(_FOREIGN[name])
-        elif name == 'autopilot.params':
-            self._cli('export', self._make('unit42.yaml'), '--to', 'px4', '-o', path, '-q')
+        elif name in _EXPORTS:
+            to = ('--to', _EXPORTS[name])
+            self._cli('export', self._make('unit42.yaml'), *to, '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
             # Short: some examples play it as slowly as it was recorded.
             self._cli('simulate', '--profile', '20 2s', '-o', path, '-q')

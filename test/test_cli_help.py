@@ -124,7 +124,8 @@ class TestExchange:
             (('--to', 'ardupilot', '--number', '0'), r'`number` must be 1\.\.3, got 0'),
             (('--to', 'px4', '--up', '0', '0', '2'), r'`up` must be a unit vector'),
             (('--to', 'ardupilot', '--device-id', '7'), r'--device-id is for PX4'),
-            (('--to', 'imu_tk'), r'imu_tk'),
+            (('--to', 'imu_tk', '--up', '0', '0', '1'), r'--up is for PX4 and ArduPilot'),
+            (('--to', 'betaflight'), r'betaflight'),
         ],
     )
     def test_export_s_usage(

@@ -12,11 +12,12 @@ from typing import get_args
 
 import numpy as np
 import pytest
+import yaml
 from builders import term
 
-from thermo_comp.cli.convert import Autopilot
+from thermo_comp.cli.convert import Tool
 from thermo_comp.convert.exchange import export_calibration, import_calibration
-from thermo_comp.convert.tools import WRITERS
+from thermo_comp.convert.tools import TOOLS
 from thermo_comp.errors import CalibrationError
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
 from thermo_comp.unit.functions import CubicSpline, Polynomial
@@ -25,7 +26,6 @@ from thermo_comp.unit.prediction import bias_and_scale, ramp_states
 from thermo_comp.unit.rate_triad import rate_triad
 
 ONE = Polynomial((1.0,))
-AUTOPILOTS = get_args(Autopilot)
 
 
 def calibration_of(bias: list[Polynomial], **change: object) -> Calibration:
@@ -55,7 +55,7 @@ def cubic() -> Calibration:
     )
 
 
-@pytest.mark.parametrize('to', AUTOPILOTS)
+@pytest.mark.parametrize('to', TOOLS)
 def test_foreign_text_makes_no_live_line(cubic: Calibration, to: str) -> None:
     # WHY: a serial with a line break set a parameter of the vehicle.
     clean = export_calibration(cubic, to).text
@@ -174,6 +174,7 @@ def test_the_angular_rate_goes_both_ways(cubic: Calibration) -> None:
     assert import_calibration(zeros, serial='7').gyroscope is None
     off = px4.text.replace('TC_G_ENABLE\t1', 'TC_G_ENABLE\t0')
     assert import_calibration(off, serial='7').gyroscope is None
+    assert 'angular rate: is lost' in export_calibration(unit, 'kalibr').notes
     with pytest.raises(CalibrationError, match='TC_G0_X3_1: is missing'):
         import_calibration(px4.text.replace('TC_G0_X3_1', 'TC_G0_Y3_1'), serial='7')
 
@@ -275,6 +276,17 @@ def test_impossible_arguments_are_refused(cubic: Calibration) -> None:
         export_calibration(cubic, 'px4', up=(0.0, 0.0, 9.81))
 
 
+@pytest.fixture
+def tumbled() -> Calibration:
+    axes = Axes(
+        AxisReference(373.0, 32800.0), AxisReference(381.0, 32650.0), AxisReference(369.0, 32790.0)
+    )
+    plain = calibration_of([Polynomial((0.0,))] * 3, unit=Unit('7', 'counts', 65536.0, 0.01))
+    return replace(
+        plain, axes=axes, misalignment=((1.0, 0.0, 0.0), (0.02, 1.0, 0.0), (-0.03, 0.05, 1.0))
+    )
+
+
 def ours(calibration: Calibration, raw: np.ndarray) -> np.ndarray:
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     x = (raw - [axis.bias for axis in axes]) / [axis.scale_factor for axis in axes]
@@ -292,6 +304,46 @@ def turn(notes: tuple[str, ...]) -> np.ndarray:
 
 
 RAW = np.array([[36400.0, 33100.0, 33300.0], [32500.0, 29000.0, 32000.0], [1.0, 65535.0, 30000.0]])
+
+
+def test_imu_tk_formula_gives_our_correction(tumbled: Calibration) -> None:
+    # X' = T K (X - B), as imu_tk's header has it; its reader takes 9 + 9 + 3 numbers in rows.
+    file = export_calibration(tumbled, 'imu_tk')
+    numbers = [float(cell) for cell in file.text.split()]
+    T, K = np.reshape(numbers[:9], (3, 3)), np.reshape(numbers[9:18], (3, 3))
+    assert np.all(np.diag(T) == 1.0)
+    assert np.all(np.tril(T, -1) == 0.0)
+    assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
+    theirs = (RAW - numbers[18:]) @ (T @ K).T
+    # Six digits of the angles are written: 1e-6 of 90 m/s^2.
+    np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12
+    )
+
+
+def test_imu_calib_and_kalibr_formulas_give_our_correction(tumbled: Calibration) -> None:
+    data = yaml.safe_load(export_calibration(tumbled, 'imu_calib').text)
+    theirs = RAW @ np.reshape(data['SM'], (3, 3)).T - data['bias']
+    np.testing.assert_allclose(theirs, ours(tumbled, RAW), rtol=1e-10)
+    imu = yaml.safe_load(export_calibration(tumbled, 'kalibr', number=1).text)['imu1']
+    # Kalibr predicts the reading: M a + b.
+    part = imu['accelerometers']
+    reading = ours(tumbled, RAW) @ np.array(part['M']).T + part['bias']
+    np.testing.assert_allclose(reading, RAW, rtol=1e-12)
+    assert np.all(np.triu(part['M'], 1) == 0.0)
+    assert (imu['model'], imu['update_rate']) == ('scale-misalignment', 100.0)
+
+
+@pytest.mark.parametrize('to', ['imu_tk', 'imu_calib', 'kalibr'])
+def test_tumble_round_trip(tumbled: Calibration, to: str) -> None:
+    file = export_calibration(tumbled, to)
+    back = import_calibration(file.text, serial='7')
+    assert back.unit.input == 'counts'
+    # The triangle of imu_tk is turned there and back.
+    np.testing.assert_allclose(ours(back, RAW), ours(tumbled, RAW), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(back.misalignment, tumbled.misalignment, atol=1e-12)
+    assert any('holds at 20 degC' in note for note in file.notes)
 
 
 def test_a_file_that_imu_tk_saved_is_read() -> None:
@@ -355,5 +407,5 @@ def test_px4_rates_of_different_degree_keep_their_own_reference(cubic: Calibrati
             assert ours == pytest.approx(theirs, abs=1e-12)
 
 
-def test_the_command_offers_what_is_written() -> None:
-    assert tuple(WRITERS) == AUTOPILOTS
+def test_the_command_offers_every_tool() -> None:
+    assert get_args(Tool) == tuple(TOOLS)

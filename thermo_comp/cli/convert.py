@@ -21,7 +21,7 @@ from .output import Output, picked
 if TYPE_CHECKING:
     from ..convert.log import ForeignLog
 
-Autopilot = Literal['px4', 'ardupilot']
+Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
 #: What may be said of each kind of input.
 _OPTIONS = {
@@ -185,10 +185,12 @@ def _read(out: Output, path: Path, **given: Any) -> 'ForeignLog':
 
 def export(
     path: Path = argument('Calibration of the unit.', metavar='YAML'),
-    to: Autopilot = option('Whose parameters to write.', ...),
+    to: Tool = option('Whose file to write.', ...),
     output: Path = option('File to write.', ..., '--output', '-o'),
     number: int | None = option(
-        'Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1).', min=0
+        'Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
+        'Kalibr (0).',
+        min=0,
     ),
     device_id: int = option("PX4's id of the sensor (TC_An_ID), which it matches by.", 0),
     up: tuple[float, float, float] | None = option(
@@ -200,20 +202,25 @@ def export(
     out: Output = options.out,
 ) -> None:
     """
-    Write a calibration as parameters of an autopilot.
+    Write a calibration as a file of another tool.
 
-    PX4 and ArduPilot keep a cubic of temperature per axis' offset. What the
-    calibration holds beyond that is lost, and said with what it costs.
+    PX4 and ArduPilot keep a cubic of temperature per axis' offset; imu_tk
+    (.calib), imu_calib and Kalibr (YAML) keep bias, scale and misalignment at
+    one temperature, the reference. What the calibration holds beyond that is
+    lost, and said with what it costs.
 
     Example:
       thermo_comp export unit42.yaml --to px4 -o unit42.params
       thermo_comp export unit42.yaml --to ardupilot --up 0 0 1 -o unit42.parm
+      thermo_comp export unit42.yaml --to imu_tk -o unit42.calib
     """
     from ..convert.exchange import export_calibration
     from ..unit.calibration_file import load_calibration
 
     if device_id and to != 'px4':
         raise options.usage('--device-id is for PX4')
+    if up is not None and to not in ('px4', 'ardupilot'):
+        raise options.usage('--up is for PX4 and ArduPilot')
     check_output(output, PARAMETERS, overwrite=force, others=[path])
     calibration = load_calibration(path)
     with options.usage_of():

@@ -4,8 +4,8 @@
 Owns exchange with other tools: what lies between one's file and a calibration.
 
 All say ``a = A (N - b)`` of a reading N. Autopilots let b depend on temperature and keep A at 1,
-the tools for tumbles keep both constant. What a calibration holds beyond an autopilot's cubics is
-named in the notes of an export, with the error that its loss leaves.
+the tools for tumbles keep both constant. What a calibration holds beyond that is named in the
+notes of an export, with the error that its loss leaves.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from ..typing import Floats
 from ..unit import calibration as unit
 from ..unit.calibration import Calibration
 from ..unit.functions import Polynomial
-from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
 from ..unit.gyroscope import MILLIDEGREE, Gyroscope, RateCurve, RateSet
 from ..unit.prediction import bias_and_scale, ramp_states
 from ..unit.rate_triad import rate_triad
-from .tools import READERS, WRITERS, Content, ql, turned
+from .tools import TOOLS, Content, Tool, ql, turned
 
 _GRID = 257
 #: White noise of an imported gyroscope, of which nothing is said [rad/s/sqrt(Hz)].
@@ -43,63 +43,88 @@ def export_calibration(
     up: tuple[float, float, float] | None = None,
 ) -> Content:
     """
-    Write a calibration's static set as parameters of one of `WRITERS`: their `text`, and
-    in the `notes` what they cannot hold.
+    Write a calibration's static set as the file of one of `TOOLS`: its `text`, and in the `notes`
+    what it cannot hold.
 
-    `number`: which set; `device_id`: by which PX4 matches it. At the attitude `up`, a unit vector,
-    the drift of the scale is folded into the offset.
+    `number`: which set or IMU, where the file numbers them; `device_id`: by which PX4 matches it.
+    At the attitude `up`, a unit vector, the drift of the scale is folded into the offset.
     """
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')
-    write, reference_c = WRITERS[to]
-    content = _content(calibration, reference_c, up)
-    text = write(content, number, device_id)
+    content = _content(calibration, TOOLS[to], up)
+    text = TOOLS[to].write(content, number, device_id)
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
-    # Whatever a note holds, it ends with its line.
-    head = [f'# {one_line(said)}\n' for said in (title, *content.notes)]
+    # Whatever a note holds, it ends with its line; imu_tk's reader knows no comments.
+    head = [] if to == 'imu_tk' else [f'# {one_line(said)}\n' for said in (title, *content.notes)]
     return replace(content, text=''.join(head) + text)
 
 
 def _content(
-    calibration: Calibration, reference_c: float | None, up: tuple[float, float, float] | None
+    calibration: Calibration, tool: Tool, up: tuple[float, float, float] | None
 ) -> Content:
-    """Take from a calibration what an autopilot's file can hold, and note the rest."""
+    """Take from a calibration what a tool's file can hold, and note the rest."""
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     sets = calibration.static.axes()
     K = np.array([axis.scale_factor for axis in axes])
     level = np.array([axis.bias + one.delta for axis, one in zip(axes, sets, strict=True)])
     range_c = calibration.static.temperature_range_c
     temperature = np.linspace(*range_c, _GRID)
-    t = temperature - calibration.reference_temperature_c
+    own_reference_c = calibration.reference_temperature_c
+    t = temperature - own_reference_c
     bias = np.array([one.bias_function.value(t) for one in sets]) / K[:, None]
     scale = np.array([one.scale_function.value(t) for one in sets]) - 1.0
     scale_drift = float(np.max(np.abs(scale)))
-    reference_c = calibration.reference_temperature_c if reference_c is None else reference_c
-    d = temperature - reference_c
-    loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
-    cubics, misfit = _cubics(d, (level / K)[:, None] + bias + loads[:, None] * scale)
+    reference_c = own_reference_c if tool.reference_c is None else tool.reference_c
+    matrix, cubics = np.array(calibration.misalignment), np.zeros((3, 4))
     notes: list[str] = []
-    rate_bias = None
-    if misfit > 0.01 * MICRO_G:
-        notes.append(f'bias functions replaced by cubics, off by {misfit / MICRO_G:.2g} ug')
-    if scale_drift > 1e-8:
-        rest = 'folded into the offset at one attitude' if up else 'lost'
-        notes.append(f'scale over temperature is {rest}: up to {1e6 * scale_drift:.2g} ppm')
-    worst = float(np.max(np.abs(calibration.misalignment - np.eye(3))))
-    if worst:
-        notes.append(f'misalignment is lost: up to {1e6 * worst:.3g} urad')
+    rate_notes, rate_bias = [], None
+    if tool.is_thermal:
+        d = temperature - reference_c
+        loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
+        offset = (level / K)[:, None] + bias + loads[:, None] * scale
+        cubics, misfit = _cubics(d, offset)
+        if misfit > 0.01 * MICRO_G:
+            notes.append(f'bias functions replaced by cubics, off by {misfit / MICRO_G:.2g} ug')
+        if scale_drift > 1e-8:
+            rest = 'folded into the offset at one attitude' if up else 'lost'
+            notes.append(f'scale over temperature is {rest}: up to {1e6 * scale_drift:.2g} ppm')
+        worst = float(np.max(np.abs(matrix - np.eye(3))))
+        if worst:
+            notes.append(f'misalignment is lost: up to {1e6 * worst:.3g} urad')
+        matrix = np.eye(3)
+        if calibration.gyroscope is not None:
+            triad = rate_triad(calibration)
+            rate, _ = bias_and_scale(triad, ramp_states(triad, temperature))
+            rate_bias, misfit = _cubics(d, rate.T)
+            if misfit > 1e-3 * MILLIDEGREE:
+                off = f'{misfit / MILLIDEGREE:.2g} mdeg/s'
+                rate_notes.append(f'replaced by cubics, off by {off}')
+            rate_notes += _losses(triad)
+    else:
+        matrix /= K
+        cubics[:, 0] = level
+        drift = (
+            f'over the calibrated range the bias moves by up to '
+            f'{spoken(float(np.max(np.abs(bias))))}, the scale by {1e6 * scale_drift:.2g} ppm'
+        )
+        if not calibration.needs_temperature:
+            drift = 'what temperature does is not known'
+        notes.append(f'it holds at {reference_c:g} degC: {drift}')
+        rate_notes = ['is lost'] * (calibration.gyroscope is not None)
     notes += _losses(calibration)
-    if calibration.gyroscope is not None:
-        triad = rate_triad(calibration)
-        rate, _ = bias_and_scale(triad, ramp_states(triad, temperature))
-        rate_bias, misfit = _cubics(d, rate.T)
-        if misfit > 1e-3 * MILLIDEGREE:
-            off = f'{misfit / MILLIDEGREE:.2g} mdeg/s'
-            notes.append(f'angular rate: replaced by cubics, off by {off}')
-        notes += [f'angular rate: {one}' for one in _losses(triad)]
+    notes += [f'angular rate: {one}' for one in rate_notes]
     if calibration.unit.input == 'counts':
-        notes.append('offsets are counts divided by K: the driver must scale by these K')
-    return Content(np.eye(3), cubics, reference_c, range_c, notes, rate_bias=rate_bias)
+        notes.append(
+            'offsets are counts divided by K: the driver must scale by these K'
+            if tool.is_thermal
+            else 'it is for counts, as the calibration is'
+        )
+    noise = (
+        max(calibration.noise_density_m_s2_sqrt_hz),
+        max(calibration.slow_noise_m_s2_sqrt_h),
+        1.0 / calibration.unit.cycle_time_s,
+    )
+    return Content(matrix, cubics, reference_c, range_c, notes, noise=noise, rate_bias=rate_bias)
 
 
 def _cubics(d: Floats, offset: Floats) -> tuple[Floats, float]:
@@ -136,10 +161,10 @@ def import_calibration(
     noise_density: float = 200.0 * MICRO_G,
 ) -> Calibration:
     """
-    Read the file of a tool, told by what it holds, with the same set in both regimes.
+    Read the file of one of `TOOLS`, told by what it holds, with the same set in both regimes.
     `number` chooses a set or IMU; None takes the only one there is. `full_scale` is in m/s^2.
     """
-    found = (read(text, number) for read in READERS)
+    found = (tool.read(text, number) for tool in TOOLS.values())
     content = next((one for one in found if one is not None), None)
     if content is None:
         raise CalibrationError(

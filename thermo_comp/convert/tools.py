@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the files of other tools: how each is read, and those of autopilots written.
+Owns the files of other tools, `TOOLS`: how each is written and read.
 
 Autopilots correct each axis' bias by a cubic of the sensor's own temperature, held at the edges of
 a range, in m/s^2 or, of a gyroscope, in rad/s, and nothing else; ``raw`` is already in m/s^2
@@ -24,7 +24,7 @@ A triangle of the other kind, or a full matrix, belongs to a frame that is turne
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,6 +61,8 @@ class Content:
     range_c: tuple[float, float]
     notes: list[str]  # what is lost, or lacks
     source: str = ''  # the tool and the set that was read
+    # White [m/s^2/sqrt(Hz)], walk [m/s^2/sqrt(h)], samples per second, on the way out.
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rate_bias: Floats | None = None  # as `bias`, of the angular rate [rad/s]
     text: str = ''  # the file, once it is written
 
@@ -206,9 +208,15 @@ def _choose(found: set[int], number: int | None, is_in_use: Callable[[int], bool
 
 def ql(matrix: Floats) -> tuple[Floats, Floats]:
     """Take a matrix apart into a rotation and a lower triangle with a positive diagonal."""
-    rotation, upper = np.linalg.qr(matrix[::-1, ::-1])
+    rotation, lower = _qr(matrix[::-1, ::-1])
+    return rotation[::-1, ::-1], lower[::-1, ::-1]
+
+
+def _qr(matrix: Floats) -> tuple[Floats, Floats]:
+    """Take a matrix apart into a rotation and an upper triangle with a positive diagonal."""
+    rotation, upper = np.linalg.qr(matrix)
     signs = np.diag(np.sign(np.diag(upper)))
-    return (rotation @ signs)[::-1, ::-1], (signs @ upper)[::-1, ::-1]
+    return rotation @ signs, signs @ upper
 
 
 def turned(rotation: Floats) -> list[str]:
@@ -220,6 +228,37 @@ def turned(rotation: Floats) -> list[str]:
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     angles = f'{roll:.6g} {pitch:.6g} {yaw:.6g}'
     return [f'the frames differ: tf from theirs to ours has roll, pitch, yaw {angles} rad']
+
+
+def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str:
+    """Write the three blocks of imu_tk's ``.calib``; its reader knows no comments."""
+    rotation, upper = _qr(content.matrix)
+    scale = np.diag(upper)
+    content.notes.extend(turned(rotation.T))
+    return ''.join(
+        ''.join(' '.join(map(repr, row)) + '\n' for row in block.tolist()) + '\n'
+        for block in (upper / scale, np.diag(scale), content.bias[:, :1])
+    )
+
+
+def _write_imu_calib(content: Content, _number: int | None, _device_id: int) -> str:
+    """Write imu_calib's YAML: the matrix row by row, the bias behind it."""
+    bias = content.matrix @ content.bias[:, 0]
+    return f'SM: {content.matrix.ravel().tolist()}\nbias: {bias.tolist()}\n'
+
+
+def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
+    """Write the accelerometer's part of an IMU in Kalibr's YAML."""
+    white, walk, rate = content.noise
+    rows = ''.join(f'    - {row}\n' for row in np.linalg.inv(content.matrix).tolist())
+    content.notes.append('Kalibr finds the bias anew each time and overlooks the key `bias`')
+    content.notes.append('topic and gyroscope are yours to add')
+    return (
+        f'imu{number or 0}:\n  model: scale-misalignment\n  update_rate: {rate:.9g}\n'
+        f'  accelerometer_noise_density: {white!r}\n'
+        f'  accelerometer_random_walk: {walk / 60.0!r}\n'
+        f'  accelerometers:\n    M:\n{rows}    bias: {content.bias[:, 0].tolist()}\n'
+    )
 
 
 def _read_imu_tk(text: str, _number: int | None) -> Content | None:
@@ -296,12 +335,20 @@ def _array(value: object, key: str, size: int) -> Floats:
     return array.ravel()
 
 
-#: Each gives None of a text that is no such file.
-READERS: tuple[Callable[[str, int | None], Content | None], ...] = (
-    *(_read_px4, _read_ardupilot, _read_imu_tk, _read_imu_calib, _read_kalibr),
-)
-#: Of autopilots; and the temperature that their cubics count from, where it is fixed.
-WRITERS: Mapping[str, tuple[Callable[[Content, int | None, int], str], float | None]] = {
-    'px4': (_write_px4, None),
-    'ardupilot': (_write_ardupilot, _ARDUPILOT_REFERENCE_C),
+@dataclass(frozen=True)
+class Tool:
+    """One tool's file: a bias over temperature, or scale and misalignment."""
+
+    write: Callable[[Content, int | None, int], str]
+    read: Callable[[str, int | None], Content | None]  # None of a text that is no such file
+    is_thermal: bool = False
+    reference_c: float | None = None  # where it is fixed
+
+
+TOOLS = {
+    'px4': Tool(_write_px4, _read_px4, is_thermal=True),
+    'ardupilot': Tool(_write_ardupilot, _read_ardupilot, True, _ARDUPILOT_REFERENCE_C),
+    'imu_tk': Tool(_write_imu_tk, _read_imu_tk),
+    'imu_calib': Tool(_write_imu_calib, _read_imu_calib),
+    'kalibr': Tool(_write_kalibr, _read_kalibr),
 }
