@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from operator import attrgetter
 from struct import pack
 from typing import NamedTuple
 
@@ -54,7 +53,6 @@ class Dropped:
 
 
 DROPPED = tuple(one.name for one in fields(Dropped))
-_dropped = attrgetter(*DROPPED)
 
 
 @dataclass(slots=True)
@@ -71,7 +69,7 @@ class Counters(Dropped):
     @property
     def n_in(self) -> int:
         """Samples that came in."""
-        n_dropped: int = sum(_dropped(self))
+        n_dropped: int = sum(getattr(self, name) for name in DROPPED)
         return self.n_out + n_dropped
 
 

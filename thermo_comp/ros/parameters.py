@@ -37,8 +37,6 @@ _LONGEST_REASON = 1000  # of a reason, which may repeat what came in
 
 _DEFAULTS = CompensatorConfig()
 
-_TYPES = {str: Parameter.Type.STRING, float: Parameter.Type.DOUBLE}
-
 
 def _parameter(
     default: Any, description: str, bounds: tuple[float, float] | None = None, **more: Any
@@ -142,7 +140,7 @@ def descriptor(name: str) -> ParameterDescriptor:
     entry = _TABLE[name]
     described = ParameterDescriptor(
         name=name,
-        type=_TYPES[type(entry.default)].value,
+        type=Parameter.Type.from_parameter_value(entry.default).value,
         description=entry.metadata['description'],
         read_only=entry.metadata['is_fixed'],
     )
