@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -231,6 +231,31 @@ def test_no_temperature_gives_nine_parameters() -> None:
     assert result.calibration.response == ()
     assert any(one.name == 'temperature' for one in result.findings)
     assert np.abs(pulls(result, replace(PLAIN, drift=()))).max() < 4.0
+
+
+def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(
+    rng: np.random.Generator,
+) -> None:
+    # WHY: both were fitted without a word. A triad that temperature spares has its constants.
+    records = records_of(PLAIN, positions(9, 1), 4)
+    bias, scale, M = PLAIN.bias_at_reference, PLAIN.scale_factor, np.array(PLAIN.M)
+
+    def fit_of(correct: Callable[[Floats], Floats], **options: object) -> FitResult:
+        blocks = [replace(one, accel=correct(one.accel)) for one in map(block_of, records)]
+        sources = [FitSource(str(k), lambda one=one: [one]) for k, one in enumerate(blocks)]
+        options |= {'gravity': STANDARD_GRAVITY, 'groups': ('curve',)}
+        return fit(sources, FitOptions(**options))  # type: ignore[arg-type]
+
+    def force(counts: Floats) -> Floats:
+        # What a compensator gives has no steps, and its noise hides those of the counts.
+        return ((counts - bias) / scale) @ M.T + 5e-4 * rng.standard_normal(counts.shape)
+
+    raw = fit_of(lambda counts: counts)
+    assert raw.residuals[-1].raw.rms / MICRO_G < 5.0
+    with pytest.raises(FitError, match=r'nothing to correct: over \d\d K .*--allow compensated'):
+        fit_of(force, input='m/s^2')
+    with pytest.raises(FitError, match='nothing to correct'):
+        fit_of(lambda counts: np.rint(4e5 * force(counts)), full_scale=8388607.0)
 
 
 def test_bags_with_and_without_temperature_contradict_themselves() -> None:

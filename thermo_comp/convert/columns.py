@@ -31,6 +31,9 @@ Triple = tuple[Column, Column, Column]
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Between two samples lies more than the first [s], and less than the second: so times are told.
 _STEPS_S = (5e-5, 0.5)
+#: Or up to this [s], where blocks of so many samples rest with so much of a turn [rad] in the one
+#: between, which lasts milliseconds otherwise.
+_SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
 _GIVE_MAP = 'give a column map: --columns MAP'
 
@@ -182,11 +185,11 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
             path=path,
         )
     first = int(width in (4, 7))
-    stamp = _stamp(path, table.values[0] if first else None, rate_hz)
     x, y, z = first, first + 1, first + 2
     accel = np.column_stack([table.values[column] for column in (x, y, z)])
-    # Stillness asks for the order of the samples, and hardly for their times.
-    still = find_stillness(np.arange(len(accel)) * 10**7, accel)
+    stamp = _stamp(path, table.values[0] if first else None, rate_hz, accel)
+    # Stillness asks for the order of the samples, and hardly for their times; rests may be short.
+    still = find_stillness(np.arange(len(accel)) * 10**9, accel)
     believed, reason = believed_unit(still.magnitude)
     if believed == 'unknown':
         raise RecordingError(f'{reason}: {_GIVE_MAP}', path=path)
@@ -209,7 +212,7 @@ def spoken_columns(columns: ColumnMap) -> str:
     return ', '.join(said)
 
 
-def _stamp(path: Path, times: Floats | None, rate_hz: float | None) -> Stamp:
+def _stamp(path: Path, times: Floats | None, rate_hz: float | None, accel: Floats) -> Stamp:
     """Tell the unit of times by how often samples come."""
     if times is None:
         if rate_hz is None:
@@ -221,7 +224,18 @@ def _stamp(path: Path, times: Floats | None, rate_hz: float | None) -> Stamp:
     step = float(np.median(steps)) if len(steps) else 0.0
     is_time = len(steps) > 0 and (steps > 0.0).mean() > 0.9
     # From the largest unit on: a step of 5 is no time in seconds, but one in ms.
+    longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
     for unit, exponent in STAMP_EXPONENTS.items():
-        if is_time and _STEPS_S[0] < step * 10.0 ** (exponent - 9) < _STEPS_S[1]:
+        if is_time and _STEPS_S[0] < step * 10.0 ** (exponent - 9) < longest:
             return Stamp(0, unit)
     raise RecordingError(f'its first column is no time that rises: {_GIVE_MAP}', path=path)
+
+
+def _turns_at_once(accel: Floats) -> bool:
+    """Whether the unit rests in another attitude faster than a hand turns it in milliseconds."""
+    blocks = accel[: len(accel) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, 3)
+    mean = blocks.mean(axis=1)
+    size = np.linalg.norm(mean, axis=1, keepdims=True)
+    rests = (blocks.std(axis=1) < _QUIET * size).all(axis=1)
+    turn = np.linalg.norm((mean / size)[2:] - (mean / size)[:-2], axis=1)
+    return bool((rests[2:] & rests[:-2] & (turn > _TURN)).any())

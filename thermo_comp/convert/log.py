@@ -264,7 +264,7 @@ def _write(
 
 def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     """Find where a recording (n, 3) rests, from its noise alone, however shortly."""
-    reduced = CellAccumulator(_CELL_S, None)
+    reduced = CellAccumulator(_CELL_S, None, least=_MIN_SAMPLES)
     for first in range(0, len(accel), _RUN_ROWS):
         run = slice(first, first + _RUN_ROWS)
         reduced.add(stamp_ns[run], accel[run])

@@ -205,12 +205,13 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
             if found.posterior.log_evidence > learnt.posterior.log_evidence + _CLOSING_EARNED:
                 windows, regression, learnt = others, again, found
     residuals, left_out = residual_rows(windows, regression, learnt)
+    state = learnt.posterior.state
+    K = state.kappa * start.scale
+    constants, raw = (K, state.bias, state.skew), residuals[-1].raw.rms
+    found_none = verdict.judge_constants(windows, up, constants, raw, options)
+    findings += enforce(found_none, options)
     findings += verdict.judge_result(
-        learnt.posterior.state.kappa * start.scale,
-        residuals,
-        learnt.prior.offset_sd,
-        options,
-        windows.has_temperature,
+        K, residuals, learnt.prior.offset_sd, options, windows.has_temperature
     )
     try:
         calibration = build_calibration(

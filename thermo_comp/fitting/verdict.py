@@ -39,6 +39,9 @@ _SATURATED_NEEDED, _SATURATED_ADVISED = 0.05, 0.001
 _UNSEEN = 3.0
 # An axis that is alive differs from itself within so many samples.
 _DEAD_SAMPLES = 1000
+# No triad is built with nine constants as small as the first, in parts of one, and moves |f| by
+# less than the second over so many kelvins: what reads like this has been compensated.
+_COMPENSATED, _COMPENSATED_DRIFT, _COMPENSATED_K = 1e-4, 2e-5, 20.0
 
 
 @dataclass(frozen=True)
@@ -262,6 +265,34 @@ def can_tell_misalignment(up: Floats) -> bool:
     if len(distinct) < POSITIONS_FOR_MISALIGNMENT:
         return False
     return geometry(distinct, with_misalignment=True) <= _WORST_GEOMETRY
+
+
+def judge_constants(
+    windows: ThermalWindows,
+    up: Floats,
+    constants: Sequence[Floats],
+    raw: float,
+    options: FitOptions,
+) -> Iterator[Finding]:
+    """
+    Refuse what nothing is left of to correct: `constants` are K, bias [m/s^2] and M's elements,
+    `raw` is what |f| - g has with these alone, RMS [m/s^2].
+    """
+    K, bias, skew = constants
+    span = float(np.ptp(windows.temperature)) if windows.has_temperature else 0.0
+    scale = float(np.abs(K / (1.0 if options.input == 'm/s^2' else K.mean()) - 1.0).max())
+    worst, skewed = float(np.abs(bias).max()), float(np.abs(skew).max())
+    least = max(scale, worst / options.gravity, skewed)
+    is_none = least < _COMPENSATED and raw < _COMPENSATED_DRIFT * options.gravity
+    if is_none and span > _COMPENSATED_K and can_tell_misalignment(up):
+        yield Finding(
+            'compensated',
+            'refusal',
+            f'there is nothing to correct: over {span:.0f} K |f| moves by {raw / MICRO_G:.1f} ug '
+            f'RMS, scales differ by {1e6 * scale:.1f} ppm, biases reach {worst / MICRO_G:.1f} ug '
+            f'and misalignments {1e6 * skewed:.1f} urad: the samples have been compensated '
+            'already, and the calibration must be made on raw ones',
+        )
 
 
 def judge_result(

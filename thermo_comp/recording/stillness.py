@@ -74,13 +74,18 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces samples to cells of `cell_s`, or of 30 samples if that is longer, while they stream by;
-    a whole number of cells fills `window_s`, or one of `STRETCHES` of them.
+    Reduces samples to cells of `cell_s`, or of `least` samples if that is longer, while they
+    stream by; a whole number of cells fills `window_s`, or one of `STRETCHES` of them.
     """
 
     def __init__(
-        self, cell_s: float, full_scale: float | None, window_s: float | None = None
+        self,
+        cell_s: float,
+        full_scale: float | None,
+        window_s: float | None = None,
+        least: int = _MIN_SAMPLES,
     ) -> None:
+        self._least = least
         self._asked_cell_s, self._window_s, self._full_scale = cell_s, window_s, full_scale
         self._cell_ns = self._start_ns = 0
         self._last_ns: int | None = None
@@ -156,7 +161,7 @@ class CellAccumulator:
 
     def _begin(self, stamp_ns: Ints, samples: Floats) -> None:
         step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
-        least = min(max(self._asked_cell_s * 1e9, _MIN_SAMPLES * step, 1.0), _LONGEST_CELL_NS)
+        least = min(max(self._asked_cell_s * 1e9, self._least * step, 1.0), _LONGEST_CELL_NS)
         self._cell_ns = round(least if self._window_s is None else _part_of(self._window_s, least))
         self._start_ns = int(stamp_ns[0])
         self._shift = samples[0].copy()
