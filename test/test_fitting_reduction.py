@@ -16,6 +16,7 @@ from thermo_comp.fitting import FitOptions, FitSource, normal_gravity
 from thermo_comp.fitting.reduction import Readings, ReducedBag, reduce_source
 from thermo_comp.fitting.sensors import learn_detector, learn_thermometer, quantum_of
 from thermo_comp.recording.stillness import CellAccumulator, still_intervals
+from thermo_comp.simulation.campaign import positions
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 
 START_NS = 1_700_000_000_123_456_789
@@ -68,6 +69,24 @@ def test_chunks_do_not_matter(rng: np.random.Generator) -> None:
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
         np.testing.assert_array_equal(one.board.value, other.board.value)
+
+
+@pytest.mark.parametrize('rest_s', [30, 45])
+def test_short_rests_of_slow_samples_are_found(rng: np.random.Generator, rest_s: int) -> None:
+    # WHY: at 1 Hz a cell was half a minute; one mean was taken of all attitudes, 0.07 m/s^2 long.
+    ups = np.repeat(positions(18, 1), rest_s, axis=0)
+    samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
+    none, empty = np.empty(0, np.int64), np.empty(0)
+    tumble = ArrayBlock(stamps(len(samples), 1.0), samples, none, empty, none, empty)
+    bag = reduced([tumble], min_rest_s=None, full_scale=None)
+    assert len(bag.intervals) >= 18
+    for one in bag.intervals:
+        size = np.linalg.norm(one.mean, axis=1)
+        # 5 ug of each sample, in windows of ten and the short ones behind them.
+        np.testing.assert_allclose(size, 9.8, rtol=2e-5)
+    # A long rest has cells as long as before.
+    alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])
+    assert reduced([alone], full_scale=None).window_s == 30.0
 
 
 def test_windows_are_means_of_their_samples(rng: np.random.Generator) -> None:

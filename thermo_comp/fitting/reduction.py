@@ -26,7 +26,7 @@ from ..recording.columns import RecordingInfo
 from ..recording.stillness import CellAccumulator, Cells
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..typing import Floats, Ints
-from .coverage import best_rests
+from .coverage import best_rests, directions, distinct_directions, rough_centre
 from .sources import FitSource, angular_velocity
 
 #: Usual length of a window [s].
@@ -38,6 +38,9 @@ _SHORTEST_READING_INTERVAL_S = 0.2
 _LEAST_FILLED = 0.9
 # What is tried, the strictest first: lengths of the shortest rest [s], ratios of variances.
 _MIN_RESTS_S = (3.0, 2.0, 1.0)
+# Of samples so slow that a cell lasts this long [s], shorter ones may find more rests: of so many
+# samples, for so many attitudes.
+_SLOW_CELL_S, _FEW_SAMPLES, _ENOUGH = 3.0, 5, 6
 _RATIOS = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
 
 
@@ -128,15 +131,17 @@ def reduce_source(
     still_sd: float = stillness.STILL_SD,
     full_scale: float | None,
     fewest_windows: int = 1,
+    least: int = stillness.MIN_SAMPLES,
 ) -> ReducedBag:
     """
     Stream one source and keep its sufficient statistics.
 
     `still_sd` is the largest scatter at rest [parts of g]. Without `min_rest_s` rests last 3 s;
     where a recording has so many short ones that they tell bias and scale, how short, and how
-    quiet beside the quietest, is what tells these best.
+    quiet beside the quietest, is what tells these best. Cells have the `least` samples, or fewer
+    where these are slow and rarely rest as long.
     """
-    cells = CellAccumulator(min(cell_s, window_s), full_scale, window_s)
+    cells = CellAccumulator(min(cell_s, window_s), full_scale, window_s, least)
     readings: dict[str, list[Readings]] = {}
     n_samples = 0
     n_impossible: Counter[str] = Counter()
@@ -159,6 +164,21 @@ def reduce_source(
     found, reader = cells.finish(), source.reader()
     ranges = _rests(found, min_rest_s, still_sd)
     per_window = max(1, round(window_s / found.cell_s)) if found.cell_s else 1
+    n_still = sum(upper - lower for lower, upper in ranges)
+    if least > _FEW_SAMPLES and found.cell_s > _SLOW_CELL_S and 2 * n_still < len(found.count):
+        closer = reduce_source(
+            source,
+            window_s=window_s,
+            cell_s=cell_s,
+            min_rest_s=min_rest_s,
+            still_sd=still_sd,
+            full_scale=full_scale,
+            fewest_windows=fewest_windows,
+            least=_FEW_SAMPLES,
+        )
+        means = np.array([one.mean.mean(axis=0) for one in closer.intervals]).reshape(-1, 3)
+        if len(distinct_directions(directions(means, rough_centre(means)))) >= _ENOUGH:
+            return closer
     return ReducedBag(
         source=source,
         start_ns=found.start_ns,
@@ -181,7 +201,7 @@ def reduce_source(
         n_dropped=found.n_dropped,
         n_saturated=found.n_saturated,
         n_cells=len(found.count),
-        n_still_cells=sum(upper - lower for lower, upper in ranges),
+        n_still_cells=n_still,
         # A bag of which no sample counts has windows of the usual length, and none of them.
         window_s=round(per_window * found.cell_s, 6) or window_s,
         cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,

@@ -36,7 +36,7 @@ _DRIFT_STEPS, _DRIFT = 9, 5e-5
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # how many windows a cell lasts where the samples are slow
 _LONGEST_CELL_NS = 86400e9  # stamps may lie anywhere; no unit rests in one cell for a day
-_MIN_SAMPLES = 30
+MIN_SAMPLES = 30
 _LARGEST = 1e100  # a sample beyond has a square that is no number; it is none itself
 _WORD = 32768.0  # the middle of words of 16 bits
 _STUCK = 0.3  # noise below this many quanta leaves a sensor on one number for long
@@ -83,7 +83,7 @@ class CellAccumulator:
         cell_s: float,
         full_scale: float | None,
         window_s: float | None = None,
-        least: int = _MIN_SAMPLES,
+        least: int = MIN_SAMPLES,
     ) -> None:
         self._least = least
         self._asked_cell_s, self._window_s, self._full_scale = cell_s, window_s, full_scale
@@ -319,7 +319,10 @@ def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():
         return np.zeros(len(step), dtype=bool)
-    spread = 1.4826 * np.median(np.abs(step[both]), axis=0)
+    # Of many short rests most steps are turns, and no measure.
+    spread = np.minimum(
+        1.4826 * np.median(np.abs(step[both]), axis=0), STILL_SD / _STEP_SDS * _one_g(cells)
+    )
     square = cells.variance / cells.count[:, None]
     noise = np.sqrt(np.maximum(2.0 * np.median(square[quiet], axis=0), square[1:] + square[:-1]))
     # One that mostly reads the same number goes from one to the next in a step that is no knock.
