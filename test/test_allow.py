@@ -30,6 +30,11 @@ def jumped(rest: Rest) -> None:
     rest.add(20.0 * MG * np.array(rest.level) / GRAVITY, from_s=300.0)
 
 
+def compensated(rest: Rest) -> None:
+    rest.accel = rest.level + 0.01 * (rest.accel - rest.level)
+    rest.fall = 30.0
+
+
 def as_it_is(rest: Rest) -> None:
     return None
 
@@ -57,6 +62,7 @@ def swapped(source: FitSource, rest: Rest) -> FitSource:
         ('jump', jumped, FORCE, 7),
         # Ten minutes are too short to see which one leads.
         ('swapped', as_it_is, FORCE, 7),
+        ('compensated', compensated, FORCE, 12),
     ],
 )
 def test_what_is_allowed_goes_on_to_the_end(rng, name, spoil, options, n):
