@@ -32,7 +32,7 @@ from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
 from .posterior import Regression
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
-from .sensors import learn_detector
+from .sensors import gradients_at_rest, learn_detector
 from .sources import FitSource
 from .start import position_means
 from .verdict import Finding, enforce
@@ -179,7 +179,8 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         sets, columns = prior_sets(known), prior_columns(known)
     else:
         sets = sets_of(options, bags)
-        columns = () if options.model == 'golovach' else bank(sensors)
+        columns = bank(sensors, gradients_at_rest(bags, sensors))
+        columns = () if options.model == 'golovach' else columns
     reference = options.reference_temperature
     model = Model(options.model, sets, columns, sensors, detector, reference)
     windows = thermal_windows(bags, model)

@@ -142,11 +142,19 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
                 f'{one.unit.serial} has other curves than {first.unit.serial}: fit both with the '
                 'same model'
             )
-    keys: dict[Column, list[tuple[float, float]]] = {}
+    keys: dict[Column, list[Column]] = {}
     for one in calibrations:
-        for column, key in zip(prior_columns(one), _unranged(prior_columns(one)), strict=True):
-            keys.setdefault(key, []).append(column.range)
-    like = _like(calibrations, [replace(key, range=union(own)) for key, own in keys.items()])
+        for column, key in zip(prior_columns(one), _alike(prior_columns(one)), strict=True):
+            keys.setdefault(key, []).append(column)
+    columns = [
+        replace(
+            key,
+            range=union(one.range for one in own),
+            rest_k=float(np.mean([one.rest_k for one in own])),
+        )
+        for key, own in keys.items()
+    ]
+    like = _like(calibrations, columns)
     K = np.array([constants_of(one).scale for one in calibrations])
     mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
     told = [_told(one, like, mean_K) for one in calibrations]
@@ -162,9 +170,9 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     return with_parameters(like, mean_K, mean, scatter)
 
 
-def _unranged(columns: Sequence[Column]) -> list[Column]:
-    """Return columns as they are told apart: units differ in what range each has seen."""
-    return [replace(column, range=(0.0, 1.0)) for column in columns]
+def _alike(columns: Sequence[Column]) -> list[Column]:
+    """Return columns as they are told apart: units differ in what they have seen, and in heat."""
+    return [replace(column, range=(0.0, 1.0), rest_k=0.0) for column in columns]
 
 
 def _told(calibration: Calibration, like: Calibration, mean_K: Floats) -> tuple[Floats, Floats]:
@@ -173,8 +181,8 @@ def _told(calibration: Calibration, like: Calibration, mean_K: Floats) -> tuple[
         raise FitError(
             f'{calibration.unit.serial} has no covariance: an import says nothing of its type'
         )
-    everything = _unranged(prior_columns(like))
-    terms = [everything.index(column) for column in _unranged(prior_columns(calibration))]
+    everything = _alike(prior_columns(like))
+    terms = [everything.index(column) for column in _alike(prior_columns(calibration))]
     scale = constants_of(calibration).scale
     values, factor = parameters_of(calibration), np.ones(calibration.posterior.n_parameters)
     layout, into = parameter_layout(calibration), parameter_layout(like)

@@ -25,6 +25,7 @@ from .reduction import NO_READINGS, Readings, ReducedBag
 _SMALLEST_NOISE = 1e-4
 _BIN_S = 10.0
 _BINS_PER_SIDE = 6
+_MINUTE_S = 60.0
 # A ramp is clear when its rate is this far above the noise of rates.
 _CLEAR = 5.0
 _LAG_RANGE_S = (30.0, 3600.0)
@@ -176,6 +177,32 @@ def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
     # A ripple within the noise of the rates is not seen: then the usual one may be there.
     hidden = min(usual, 3.0 * noise * lag_s)
     return float(np.clip(max(clean * lag_s, hidden), *_RIPPLE_RANGE_C))
+
+
+def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dict[str, float]:
+    """Find what T_s - T_board of each sensor is while the board's rate is 0: its own heat's [K]."""
+    result = {}
+    for name in sensors:
+        rate, gradient = [np.zeros(0)], [np.zeros(0)]
+        for bag in bags:
+            board, other = bag.board, bag.temperatures.get(name, NO_READINGS)
+            if min(len(board.value), len(other.value)) < 30:
+                continue
+            first = max(board.stamp_ns[0], other.stamp_ns[0])
+            last = min(board.stamp_ns[-1], other.stamp_ns[-1])
+            grid = np.arange(0.0, (last - first) * 1e-9, _MINUTE_S)
+            at, beside = (
+                np.interp(grid, (one.stamp_ns - first) * 1e-9, one.value) for one in (board, other)
+            )
+            if len(grid) > 2:
+                rate.append(np.gradient(at, _MINUTE_S))
+                gradient.append(beside - at)
+        g, v = np.concatenate(gradient), np.concatenate(rate)
+        moved = v - v.mean() if len(v) else v
+        power = float(moved @ moved)
+        lag = float(moved @ g) / power if power > 0.0 else 0.0
+        result[name] = round(float(np.median(g - lag * v)), 3) if len(g) else 0.0
+    return result
 
 
 def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str, int, float]]:

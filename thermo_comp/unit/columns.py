@@ -14,13 +14,16 @@ rate       dT_board/dt [K/s]           the same, as seen by one thermometer
 board      T_board - L_tau(T_board)    parts that lag the board
 neighbour  L_tau(g_s)                  parts between the thermometers
 square     (T_board - L_tau)^2, or     curves of parts that lag the board; losses of a flow
-           g_s^2 where tau is 0
+           q_s^2 where tau is 0
 cube       (T_board - L_tau)^3         the same, and a flow that grows faster than its cause
-even       tanh((g_s / width)^2)       heat load whichever way the heat flows
-size       abs(g_s)                    the same, as a heat pump's
+even       tanh((q_s / width)^2)       heat load whichever way the heat flows
+size       abs(q_s)                    the same, as a heat pump's
 play       P_r(v) - v, v = t or        rate-independent hysteresis
            v = L_tau(t)
 =========  ==========================  ====================================================
+
+Even is what does not ask for the direction of a change, so ``q_s = g_s - rest``: less what g_s is
+at rest, where the board's own heat makes it warmer than the case.
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u held at the edges of the column's range
 and t at those of the calibrated temperatures. The groups of the bank are its kinds; *product* and
@@ -33,7 +36,7 @@ here, so that another regressor is an entry of `bank` and, if it is of a new kin
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Final, Literal
 
@@ -54,7 +57,7 @@ FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
 #: Widths of the even columns [K], half-widths of the plays [K], and the lag that some follow [s].
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
-PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2)
+PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAU: Final = 900.0
 
 
@@ -68,15 +71,16 @@ class Column:
     ]
     kind: Annotated[
         Literal['now', 'rate', 'board', 'neighbour', 'square', 'cube', 'size', 'even', 'play'],
-        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or g_s^2 without '
-        'lag; (T - lagged T)^3; abs(g_s); tanh((g_s / width)^2); play of t minus t, where '
-        'g_s = T_s - T_board.',
+        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or q_s^2 without '
+        'lag; (T - lagged T)^3; abs(q_s); tanh((q_s / width)^2); play of t minus t, where '
+        'g_s = T_s - T_board and q_s = g_s - rest_k.',
     ]
     sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
     tau_s: Annotated[
         NotNegative, 'Time constant of the lag (board, neighbour, square, cube; play: 0 = none).'
     ] = 0.0
     width_k: Annotated[NotNegative, 'Width of even, half-width of play.'] = 0.0
+    rest_k: Annotated[float, 'What g_s is at rest, for even, size and square without lag.'] = 0.0
     power: Annotated[int, Bounds(at_least=0), 'The value is multiplied by t to this power.'] = 0
     during: Annotated[
         Literal['always', 'static', 'dynamic'],
@@ -119,8 +123,14 @@ class Column:
         return math.inf if self.lag and self.order + self.power > 2 else self.tau_s
 
 
-def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
-    """Return all columns that a response may have, none held to a range yet."""
+def bank(
+    sensors: Sequence[str] = ('case',), at_rest: Mapping[str, float] | None = None
+) -> tuple[Column, ...]:
+    """
+    Return all columns that a response may have, none held to a range yet; `at_rest` is what the
+    gradient of each sensor is there [K].
+    """
+    rest = at_rest or dict.fromkeys(sensors, 0.0)
     now = [Column('now', 'now', sensor, range=UNBOUNDED) for sensor in sensors]
     board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in FINE_TAUS]
     neighbour = [
@@ -138,13 +148,13 @@ def bank(sensors: Sequence[str] = ('case',)) -> tuple[Column, ...]:
     square += [replace(one, power=1) for one in square]
     square += [replace(one, group='square', kind='cube') for one in coarse]
     even = [
-        Column('even', 'even', sensor, width_k=width, power=power, range=(0.0, 1.0))
+        Column('even', 'even', sensor, 0.0, width, rest[sensor], power, range=(0.0, 1.0))
         for sensor in sensors
         for power in (0, 1, 2)
         for width in EVEN_WIDTHS
     ]
     even += [
-        Column('even', kind, sensor, power=power, range=UNBOUNDED)
+        Column('even', kind, sensor, rest_k=rest[sensor], power=power, range=UNBOUNDED)
         for sensor in sensors
         for kind in ('size', 'square')
         for power in (0, 1, 2)
@@ -219,11 +229,10 @@ class ColumnTable:
         of = [_source(one, layout) for one in columns]
         sources = list(dict.fromkeys(of))
         self._source = np.array([sources.index(one) for one in of], np.int64)
-        self._places = np.array([place for place, _, _ in sources], np.int64)
-        self._widths = np.array([width for _, _, width in sources])[:, np.newaxis]
-        rows = {
-            form: [k for k, (_, own, _) in enumerate(sources) if own == form] for form in _FORMS
-        }
+        self._places = np.array([one[0] for one in sources], np.int64)
+        self._widths = np.array([one[2] for one in sources])[:, np.newaxis]
+        self._rests = np.array([one[3] for one in sources])[:, np.newaxis]
+        rows = {form: [k for k, one in enumerate(sources) if one[1] == form] for form in _FORMS}
         # A line is what it is made of.
         self._forms = [
             (rows[form], *both) for form, both in _FORMS.items() if rows[form] and form != 'line'
@@ -233,7 +242,7 @@ class ColumnTable:
 
     def raw(self, states: Floats) -> Floats:
         """Evaluate u of each column, not held."""
-        u = states[self._places] / self._widths
+        u = (states[self._places] - self._rests) / self._widths
         for rows, value, _ in self._forms:
             u[rows] = value(u[rows])
         return np.asarray(u[self._source])
@@ -265,12 +274,14 @@ class ColumnTable:
         """Differentiate u by the number that it is made of, ranges aside."""
         slopes = np.ones((len(self._places), states.shape[1]))
         for rows, _, slope in self._forms:
-            slopes[rows] = slope(states[self._places[rows]] / self._widths[rows])
+            slopes[rows] = slope(
+                (states[self._places[rows]] - self._rests[rows]) / self._widths[rows]
+            )
         return np.asarray((slopes / self._widths)[self._source])
 
 
-def _source(column: Column, layout: Layout) -> tuple[int, str, float]:
-    """Find which number of a state a column is made of, in which form, of which width."""
+def _source(column: Column, layout: Layout) -> tuple[int, str, float, float]:
+    """Find which number of a state a column is made of, in which form, of which width and rest."""
     form = column.kind if column.kind in _FORMS else 'line'
     if column.kind == 'rate':
         place = RATE
@@ -280,4 +291,5 @@ def _source(column: Column, layout: Layout) -> tuple[int, str, float]:
         place = layout.lags[column.lag]
     else:
         place = layout.gradients[column.sensor]
-    return place, form, column.width_k if form == 'even' else 1.0
+    width = column.width_k if form == 'even' else 1.0
+    return place, form, width, column.rest_k if form != 'line' else 0.0
