@@ -180,7 +180,7 @@ def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
 
 
 def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dict[str, float]:
-    """Find what T_s - T_board of each sensor is while the board's rate is 0: its own heat's [K]."""
+    """Find T_s - T_board of each sensor while the board's rate is 0: what its own heat makes."""
     result = {}
     for name in sensors:
         rate, gradient = [np.zeros(0)], [np.zeros(0)]

@@ -55,10 +55,10 @@ UNBOUNDED: Final = (-1e9, 1e9)
 #: so large, and take every other.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
-#: Widths of the even columns [K], half-widths of the plays [K], and the lag that some follow [s].
+#: Widths of the even columns [K], half-widths of the plays [K], and the lags that they follow [s].
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
-PLAY_TAU: Final = 900.0
+PLAY_TAUS: Final = (0.0, 450.0, 900.0, 1800.0)
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def bank(
     ]
     play = [
         Column('play', 'play', tau_s=tau, width_k=width, range=UNBOUNDED)
-        for tau in (0.0, PLAY_TAU)
+        for tau in PLAY_TAUS
         for width in PLAY_WIDTHS
     ]
     return (*now, *board, *neighbour, *product, *mixed, *square, *even, *play)
