@@ -39,6 +39,8 @@ _JITTER = 1e-13
 _START_JITTER = 1e-10
 # A step that promises less than this part of a noise variance per reading may be the last ...
 _FAR = 0.1
+# What is nearer than this in log evidence is reached by one step [1].
+_NEAR = 30.0
 # ... of no more than so many. One that overshoots is tried again, up to so many times, with bias
 # and scale [g], attitudes [rad] and starts [K] held where they are, at first to these sds.
 _MOST_STEPS, _MOST_TRIES, _BENDS, _BENDS_K = 6, 6, 1e-3, 0.1
@@ -312,7 +314,7 @@ class Regression(Design):
     ) -> Posterior:
         """
         Find the mode under a prior, in so many steps or, where it is far, in as many as it takes;
-        one step only looks where a state is, and none goes where that points, unseen.
+        one step only looks where a state is; with none, short ones are taken unseen.
         """
         layout = self.layout(prior.widths > 0.0)
         precision = self.precision(prior, layout)
@@ -342,9 +344,10 @@ class Regression(Design):
             factor = Factor(equations.hessian + information, layout)
             step = factor.solve(gradient)
             promised = 0.5 * float(step @ gradient)
-            is_enough = k == last or (k >= n_steps - 1 and promised < far)
-            if promised < tolerance or is_enough:
-                state = state if n_steps else self._moved(state, step, layout)
+            if is_short := not n_steps and promised < _NEAR:
+                state = self._moved(state, step, layout)
+            is_enough = k == last or (k >= (n_steps or 2) - 1 and promised < far)
+            if promised < tolerance or is_short or is_enough:
                 break
             for _ in range(_MOST_TRIES):
                 if damping:
