@@ -67,7 +67,7 @@ def fit(
     the prior's uncertainty. Local gravity is yours to give.
 
     Groups: curve, set, now, board, neighbour, product, mixed, square, even,
-    play. Those that the evidence does not want leave by themselves.
+    change, play. Those that the evidence does not want leave by themselves.
 
     Example:
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154

@@ -44,7 +44,7 @@ _PATIENCE = 4
 _SETTLED = 0.03
 # Of a unit with one kind of physics beside parts that lag, the columns of the others make a guess
 # among thousands that say the same of these bags and not of the next: one kind is asked for first.
-_KINDS = (('even',), ('product', 'mixed', 'square'), ('play',), (SET,))
+_KINDS = (('even',), ('change',), ('product', 'mixed', 'square'), ('play',), (SET,))
 # Sets that gain so much of what the best kind does may be the best if they closed otherwise.
 _LIKE_SETS = 0.4
 # The memory is as short as it can be [s]: the longest lags of a bank and the curves over
@@ -60,7 +60,7 @@ _EARNED = 3.0
 # No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
 _LEAST_SIGMA = 1e-8
 # Of the noise of a window, what a column may add unseen before it counts.
-_OPEN = 2.0
+_OPEN = 4.0
 # Windows more sds off than this lose weight.
 _FAR_SDS, _FARTHEST_SDS = 3.0, 1e3
 # A fifth of a normal sample lies farther off than so many sds.

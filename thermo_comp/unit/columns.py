@@ -23,7 +23,7 @@ play       P_r(v) - v, v = t or        rate-independent hysteresis
 =========  ==========================  ====================================================
 
 Even is what does not ask for the direction of a change, so ``q_s = g_s - rest``: less what g_s is
-at rest, where the board's own heat makes it warmer than the case.
+at rest, where the board's own heat makes it warmer than the case, in *change*, and g_s in *even*.
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u held at the edges of the column's range
 and t at those of the calibrated temperatures. The groups of the bank are its kinds; *product* and
@@ -66,7 +66,18 @@ class Column:
     """One regressor of the thermal response; its keys are the calibration file's."""
 
     group: Annotated[
-        Literal['now', 'rate', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'play'],
+        Literal[
+            'now',
+            'rate',
+            'board',
+            'neighbour',
+            'product',
+            'mixed',
+            'square',
+            'even',
+            'change',
+            'play',
+        ],
         'What evidence judges together.',
     ]
     kind: Annotated[
@@ -130,7 +141,6 @@ def bank(
     Return all columns that a response may have, none held to a range yet; `at_rest` is what the
     gradient of each sensor is there [K].
     """
-    rest = at_rest or dict.fromkeys(sensors, 0.0)
     now = [Column('now', 'now', sensor, range=UNBOUNDED) for sensor in sensors]
     board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in FINE_TAUS]
     neighbour = [
@@ -148,16 +158,23 @@ def bank(
     square += [replace(one, power=1) for one in square]
     square += [replace(one, group='square', kind='cube') for one in coarse]
     even = [
-        Column('even', 'even', sensor, 0.0, width, rest[sensor], power, range=(0.0, 1.0))
+        Column('even', 'even', sensor, width_k=width, power=power, range=(0.0, 1.0))
         for sensor in sensors
         for power in (0, 1, 2)
         for width in EVEN_WIDTHS
     ]
     even += [
-        Column('even', kind, sensor, rest_k=rest[sensor], power=power, range=UNBOUNDED)
+        Column('even', kind, sensor, power=power, range=UNBOUNDED)
         for sensor in sensors
         for kind in ('size', 'square')
         for power in (0, 1, 2)
+    ]
+    # A heat pump's load is even in the flow of heat, what a change does is even about rest.
+    rest = at_rest or {}
+    even += [
+        replace(one, group='change', rest_k=rest[one.sensor])
+        for one in even
+        if rest.get(one.sensor)
     ]
     play = [
         Column('play', 'play', tau_s=tau, width_k=width, range=UNBOUNDED)
