@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from thermo_comp.thermal.memory import MemorySpec
 from thermo_comp.thermal.settings import DetectorSettings
-from thermo_comp.thermal.state import Layout
+from thermo_comp.thermal.state import GRADIENT, Layout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.columns import (
     BANK_TAUS,
@@ -41,22 +41,38 @@ def test_the_bank():
     assert pytest.approx([60.0 * 2.0 ** (k / 2) for k in range(15)]) == FINE_TAUS
     assert by_group(bank()) == {
         'now': 1, 'board': 15, 'neighbour': 15, 'product': 16, 'mixed': 9, 'square': 24,
-        'even': 21, 'play': 8,
+        'even': 21, 'play': 20,
     }  # fmt: skip
     assert by_group(bank(('case', 'tip'))) == {
         'now': 2, 'board': 15, 'neighbour': 30, 'product': 16, 'mixed': 18, 'square': 24,
-        'even': 42, 'play': 8,
+        'even': 42, 'play': 20,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
+
+
+def test_change_is_even_about_rest():
+    warm = bank(('case', 'tip'), {'case': -0.5, 'tip': 0.0})
+    change = [column for column in warm if column.group == 'change']
+    assert by_group(warm)['change'] == 21
+    assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
+    table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
+    states = np.zeros((Layout(MemorySpec(('case', 'tip'))).width, 3))
+    # At rest, and as far to either side of it.
+    states[GRADIENT] = -0.5, 1.0, -2.0
+    values = table.raw(states)
+    assert np.all(values[:, 0] == 0.0)
+    np.testing.assert_array_equal(values[:, 1], values[:, 2])
+    slopes = table.slopes(states)
+    np.testing.assert_allclose(slopes[:, 1], -slopes[:, 2])
 
 
 def test_what_the_bank_needs_remembered():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
-    # A lag of its own for the plays that follow one.
-    assert spec.taus('board') == (*FINE_TAUS[:8], 900.0, *FINE_TAUS[8:])
+    # Lags of their own for the plays that follow one.
+    assert spec.taus('board') == tuple(sorted((*FINE_TAUS, 450.0, 900.0, 1800.0)))
     assert spec.taus('case') == spec.taus('tip') == FINE_TAUS
-    assert len(spec.plays) == 8
+    assert len(spec.plays) == 20
     assert memory_of(()) == MemorySpec()
     with pytest.raises(ValueError, match="one of \\('case',\\), got tip"):
         memory_of(bank(('tip',)))

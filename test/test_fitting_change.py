@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A board warmer than its case by its own heat: what a change does is even about that."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from builders import ArrayBlock
+from scipy.signal import lfilter
+
+from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.fitting.sensors import gradients_at_rest
+from thermo_comp.simulation.campaign import positions
+
+GRAVITY, MICRO = 9.80665, 9.80665e-6
+STEP_S, OWN_HEAT_K = 2.0, 0.6
+#: Of 30 samples of 4 ug, a minute each.
+NOISE = 4.0 * MICRO
+
+
+def lagged(values, tau: float):
+    """First-order lag that begins in equilibrium."""
+    share = 1.0 - np.exp(-STEP_S / tau)
+    return lfilter([share], [1.0, share - 1.0], values - values[0]) + values[0]
+
+
+def recorded(rng, up, name: str, targets: tuple[float, ...]) -> FitSource:
+    """Record a unit of two thermal nodes whose bias is even in what heats its board."""
+    corners = [(0.0, targets[0]), (900.0, targets[0])]
+    for before, after in pairwise(targets):
+        corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]
+        corners += [(corners[-1][0] + 1500.0, after)]
+    time = np.arange(0.0, corners[-1][0], STEP_S)
+    case = lagged(np.interp(time, *zip(*corners, strict=True)), 120.0)
+    board = lagged(case, 500.0)
+    heated = case - board
+    board = board + OWN_HEAT_K
+    t = board - 20.0
+    change = np.sqrt(heated**2 + 0.4**2) - 0.4
+    bias = np.outer(t, (8.0, -5.0, 11.0)) + np.outer(t**2, (0.05, 0.1, -0.08))
+    bias += np.outer(change, (9.0, -12.0, 6.0)) * (1.0 + 0.01 * t[:, None])
+    force = GRAVITY * up * (1.0 + 6e-5 * t[:, None])
+    stamps = 10**18 + np.rint(time * 1e9).astype(np.int64)
+    thermometers = [np.round(one + 0.003 * rng.standard_normal(len(time)), 4)
+                    for one in (board, case)]  # fmt: skip
+    accel = force + bias * MICRO + NOISE * rng.standard_normal((len(time), 3))
+    block = ArrayBlock(stamps, accel, stamps, thermometers[0], stamps + 1, thermometers[1])
+    return FitSource(name, lambda: [block])
+
+
+def test_what_a_change_does_is_found_about_rest(rng):
+    programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
+    bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(9, 3))]
+    reduced = [reduce_source(bag, full_scale=None) for bag in bags]
+    # To the noise of readings over hours, and what the lag of the case spreads.
+    assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.05
+    groups = ('curve', 'now', 'board', 'even', 'change')
+    found, about_0 = (
+        fit(bags, FitOptions(gravity=GRAVITY, input='m/s^2', groups=names))
+        for names in (groups, groups[:-1])
+    )
+    kept = {column.group for column in found.calibration.response}
+    assert 'change' in kept
+    assert 'even' not in kept
+    # Means of a minute, less what nine positions took of them.
+    assert found.residuals[-1].fitted.rms < 1.2 * NOISE / np.sqrt(30.0)
+    assert found.residuals[-1].left_out.rms < 0.5 * about_0.residuals[-1].left_out.rms
