@@ -70,3 +70,9 @@ def test_what_a_change_does_is_found_about_rest(rng):
     assert found.residuals[-1].left_out.rms < about_0.residuals[-1].left_out.rms
     evidence = [one.learnt.posterior.log_evidence for one in (found, about_0)]
     assert evidence[0] > evidence[1] + 50.0
+
+
+def test_what_is_forced_takes_part_beside_the_groups_that_may(rng):
+    bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(6, 3))]
+    options = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), forced=('now',))
+    assert {column.group for column in fit(bags, options).calibration.response} == {'now'}

@@ -93,7 +93,8 @@ def _wide_prior(
 ) -> Prior:
     """Say what is known of any unit before its data are seen."""
     groups = windows.data.groups
-    allowed = np.array([options.groups is None or group in options.groups for group in groups])
+    asked = {*groups} if options.groups is None else {*options.groups, *options.forced}
+    allowed = np.array([group in asked for group in groups])
     allowed &= windows.has_temperature
     in_scale = windows.data.in_scale & allowed
     # RMS of what the readings do within the positions, on the largest axis.
