@@ -249,7 +249,7 @@ def states_of(windows: ThermalWindows, calibration: Calibration) -> Floats:
     layout = Layout(spec)
     states = np.zeros((len(windows.temperature), layout.width))
     states[:, 0], states[:, 3] = windows.temperature, windows.weight
-    raw = dict(zip(bank(), windows.raw.T, strict=True)) if windows.raw.size else {}
+    raw = dict(zip(windows.model.columns, windows.raw.T, strict=True))
     plain = {(c.kind, c.sensor, c.tau_s, c.width_k): value for c, value in raw.items()}
     for (tau, width), place in layout.plays.items():
         states[:, place] = plain['play', 'case', tau, width]
