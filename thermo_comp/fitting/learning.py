@@ -134,7 +134,7 @@ def learn(
             posterior, prior = settle(state, prior, rounds=_PATIENCE)
             _downweight(regression, posterior)
             posterior, prior = settle(posterior.state, prior, rounds=_ROUNDS)
-        if walks and k == 1:
+        if walks and (k == 1 or (is_more and k > 1)):
             # A walk takes what a missing column leaves: it comes where there are columns enough.
             prior = _walk(regression, posterior, prior)
             posterior, prior = settle(posterior.state, prior, rounds=_ROUNDS)
