@@ -55,8 +55,8 @@ def test_what_a_change_does_is_found_about_rest(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(9, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # To the noise of readings over hours, and what the lag of the case spreads.
-    assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.05
+    # Of two readings of 3 mK a minute, for some twenty hours: 0.1 mK, and rates of minutes.
+    assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'now', 'board', 'even', 'change')
     found, about_0 = (
         fit(bags, FitOptions(gravity=GRAVITY, input='m/s^2', groups=names))
@@ -65,11 +65,11 @@ def test_what_a_change_does_is_found_about_rest(rng):
     kept = {column.group for column in found.calibration.response}
     assert 'change' in kept
     assert 'even' not in kept
-    # Means of a minute, less what nine positions took of them.
-    assert found.residuals[-1].fitted.rms < 1.2 * NOISE / np.sqrt(30.0)
+    # Means of a minute; about 0 a part of what the change does is left, several times as much.
+    floor = NOISE / np.sqrt(30.0)
+    assert found.residuals[-1].fitted.rms < 1.1 * floor
+    assert about_0.residuals[-1].fitted.rms > 2.0 * floor
     assert found.residuals[-1].left_out.rms < about_0.residuals[-1].left_out.rms
-    evidence = [one.learnt.posterior.log_evidence for one in (found, about_0)]
-    assert evidence[0] > evidence[1] + 50.0
 
 
 def test_what_is_forced_takes_part_beside_the_groups_that_may(rng):

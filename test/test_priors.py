@@ -160,8 +160,8 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
         for record in test_of(9, 9, 10)
     ]
     assert left[1] > 10.0 * left[0]
-    # Six rests of ten minutes tell a level to half of the noise of a minute, at the worst.
-    assert left[2] < 1.5 * left[0]
+    # Six rests of ten minutes tell a level to half of the noise of a minute, at the worst: 12 % more.
+    assert left[2] < 1.2 * left[0]
 
 
 def left_by(calibration: Calibration, record: SimulatedRun) -> float:

@@ -179,8 +179,8 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         sets, columns = prior_sets(known), prior_columns(known)
     else:
         sets = sets_of(options, bags)
-        columns = bank(sensors, gradients_at_rest(bags, sensors))
-        columns = () if options.model == 'golovach' else columns
+        is_paper = options.model == 'golovach'
+        columns = () if is_paper else bank(sensors, gradients_at_rest(bags, sensors))
     reference = options.reference_temperature
     model = Model(options.model, sets, columns, sensors, detector, reference)
     windows = thermal_windows(bags, model)

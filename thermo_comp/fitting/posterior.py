@@ -39,11 +39,11 @@ _JITTER = 1e-13
 _START_JITTER = 1e-10
 # A step that promises less than this part of a noise variance per reading may be the last ...
 _FAR = 0.1
-# What is nearer than this in log evidence is reached by one step [1].
-_NEAR = 30.0
 # ... of no more than so many. One that overshoots is tried again, up to so many times, with bias
 # and scale [g], attitudes [rad] and starts [K] held where they are, at first to these sds.
 _MOST_STEPS, _MOST_TRIES, _BENDS, _BENDS_K = 6, 6, 1e-3, 0.1
+# A step that promises less log evidence than this goes where the next look would send it.
+_NEAR = 30.0
 # Parts of their widths in which columns that take no part are tried.
 _PARTS = 10.0 ** np.arange(-4.0, 1.01, 0.25)
 _SKEW_ROWS = ((1, 0), (2, 0), (2, 1))

@@ -6,9 +6,9 @@ Owns still intervals: raw samples -> short cells (count, mean, variance) -> wher
 Two tests are relative to the bag's own quiet level: the variance inside a cell (vibration,
 handling) and the step between neighbouring cells (a turn, a knock): a step starts a new interval,
 because a shift of one microradian is already one micro-g. Temperature moves a unit at rest, too:
-what the cells around do in one direction, slower than the Earth turns, is a drift and no step. Two
-are absolute, because a flight has a
-quietest tenth, too: a sensor at rest scatters by no more than its noise, and does not turn.
+what the cells around do in one direction, slower than the Earth turns, is a drift and no step.
+Two are absolute, because a flight has a quietest tenth, too: a sensor at rest scatters by no more
+than its noise, and does not turn.
 """
 
 from __future__ import annotations

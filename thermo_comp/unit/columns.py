@@ -113,8 +113,8 @@ class Column:
     @property
     def is_of_sensor(self) -> bool:
         """Whether the value is made of `sensor`, now or before."""
-        is_of_sensor = self.kind in ('now', 'neighbour', 'even', 'size')
-        return is_of_sensor or (self.kind == 'square' and not self.tau_s)
+        is_loss = self.kind == 'square' and not self.tau_s
+        return is_loss or self.kind in ('now', 'neighbour', 'even', 'size')
 
     @property
     def lag(self) -> tuple[str, float] | None:
