@@ -160,7 +160,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
         for record in test_of(9, 9, 10)
     ]
     assert left[1] > 10.0 * left[0]
-    # Six rests of ten minutes tell a level to half of the noise of a minute, at the worst: 12 % more.
+    # Six rests of ten minutes tell a level to half of a minute's noise, at the worst: 12 % more.
     assert left[2] < 1.2 * left[0]
 
 
