@@ -111,7 +111,7 @@ class Corrected:
 
 def fitted(records: Sequence[SimulatedRun], **options: Any) -> Calibration:
     """Fit one test."""
-    sources = [FitSource(record.name, lambda record=record: [block(record)]) for record in records]
+    sources = [FitSource('bag', lambda record=record: [block(record)]) for record in records]
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, **options)).calibration
 
 

@@ -111,9 +111,7 @@ def efficiency(n_units: int) -> None:
         claimed: list[Floats] = []
         for seed in range(1, n_units + 1):
             unit, ups = exact_unit(seed), positions(n_positions, seed)
-            stations = [
-                Position(f'position-{i}', parse_cyclogram('demo'), up) for i, up in enumerate(ups)
-            ]
+            stations = [Position(parse_cyclogram('demo'), up) for up in ups]
             ours = fit_and_correct(arrays(unit, stations, seed, rate_hz=4.0), [])
             truth = np.array([unit.bias_at_reference, np.log(unit.scale_factor)])
             ratios.append((ours.constants - truth) / bound(unit, 'demo', ups, WINDOW_S))

@@ -60,7 +60,7 @@ def test_evidence_says_when_the_regime_closes(closes: Closes, options: dict[str,
     # A reading every four seconds: the case changes by 0.1 K meanwhile.
     unit = unit_preset('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
-    plan = [Position(f'bag{k}', PROGRAM, up) for k, up in enumerate(FACES)]
+    plan = [Position(PROGRAM, up) for up in FACES]
     for record in arrays(unit, plan, 11, rate_hz=2.0):
         step = np.outer(weight(record, closes), STEP * unit.scale_factor)
         records.append(replace(record, counts=record.counts + step))

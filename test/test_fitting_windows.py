@@ -34,14 +34,14 @@ SECOND = 1_000_000_000
 
 
 def sources(n: int, seed: int = 1) -> list[FitSource]:
-    plan = [Position(f'bag{k}', PROGRAM, up) for k, up in enumerate(positions(n, seed))]
+    plan = [Position(PROGRAM, up) for up in positions(n, seed)]
     result = []
     unit = unit_preset('own-lags', seed).with_thermometers(rate_hz=0.25)
     for record in arrays(unit, plan, seed):
         counts = record.counts.astype(np.float64)
         board, case = (record.board_stamp_ns, record.board), (record.case_stamp_ns, record.case)
         block = ArrayBlock(record.accel_stamp_ns, counts, *board, *case)
-        result.append(FitSource(record.name, lambda block=block: [block]))
+        result.append(FitSource('bag', lambda block=block: [block]))
     return result
 
 

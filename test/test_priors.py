@@ -38,14 +38,14 @@ def source(record: SimulatedRun) -> FitSource:
         record.case_stamp_ns[::8] + 10**18,
         record.case[::8],
     )
-    return FitSource(record.name, lambda: [block])
+    return FitSource('bag', lambda: [block])
 
 
 @cache
 def test_of(number: int, first: int, last: int) -> tuple[SimulatedRun, ...]:
     """Record some of twelve positions of one sibling."""
     ups = positions(12, number)[first:last]
-    stations = [Position(f'p{k}', PROGRAM, up) for k, up in enumerate(ups)]
+    stations = [Position(PROGRAM, up) for up in ups]
     return tuple(arrays(KIND.sibling(number, 0.15), stations, 100 * number + first))
 
 
@@ -145,7 +145,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
         by = np.rint(moved * np.array([axis.scale_factor for axis in old.axes]))
         return replace(record, counts=record.counts + by.astype(record.counts.dtype))
 
-    rests = [Position(f'r{k}', day, up) for k, up in enumerate(positions(6, 77))]
+    rests = [Position(day, up) for up in positions(6, 77)]
     later = [source(aged(record)) for record in arrays(KIND.sibling(9, 0.15), rests, 999)]
     new = fit(later, replace(OPTIONS, serial='unit-9', prior=old)).calibration
     for now, before in zip(new.regime_sets(), old.regime_sets(), strict=True):

@@ -27,7 +27,7 @@ sys.path.insert(0, str(ROOT / 'benchmarks'))
 from accuracy import corrected_by_truth
 
 PROGRAM = parse_cyclogram('20 10min, 30@1 20min, 24@0.5 10min')
-STATION = Position('one', PROGRAM, np.array([0.48, -0.6, 0.64]))
+STATION = Position(PROGRAM, np.array([0.48, -0.6, 0.64]))
 
 
 def _history(temperature: Floats, step: float = 1.0) -> PartHistory:

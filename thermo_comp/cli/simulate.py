@@ -90,7 +90,7 @@ def simulate(
             profile = profile or 'chamber'
             program = campaign.parse_cyclogram(profile)
             ups = campaign.positions(positions or 1, position_seed)
-            stations = tuple(campaign.Position(profile, program, up) for up in ups)
+            stations = tuple(campaign.Position(program, up) for up in ups)
         elif profile or positions:
             raise options.usage('--plan is a whole test: leave out --profile and --positions')
         else:

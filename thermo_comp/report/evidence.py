@@ -72,7 +72,6 @@ class Evidence:
     findings: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
     history: tuple[Epoch, ...] = ()
-    is_fit: bool = False
 
     @property
     def sources(self) -> tuple[Source, ...]:
@@ -83,7 +82,7 @@ class Evidence:
     def is_seen(self) -> bool:
         """Whether the calibration was fitted on one of these bags."""
         known = {source.sha256 for source in self.sources if source.sha256}
-        return self.is_fit or any(bag.source.sha256 in known for bag in self.bags)
+        return bool(self.steps) or any(bag.source.sha256 in known for bag in self.bags)
 
     @property
     def is_simulated(self) -> bool:
@@ -243,7 +242,6 @@ def evidence_of_fit(result: FitResult) -> Evidence:
         left_out={k: left_out[one] for k, one in enumerate(found) if left_out.get(one, 0.0) > 0.0},
         findings=tuple(dict.fromkeys((*judged.findings, *against))),
         checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
-        is_fit=True,
     )
 
 

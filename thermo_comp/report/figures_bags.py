@@ -143,8 +143,7 @@ def _panels(
 
 def _rows(evidence: Evidence) -> Bools:
     """Tell which windows are of the bag that is shown."""
-    rows: Bools = given(evidence.windows).bag == given(evidence.shown).index
-    return rows
+    return np.asarray(given(evidence.windows).bag == given(evidence.shown).index)
 
 
 def _plot(axes: Axes, evidence: Evidence, value: Floats, unit: float, **line: Any) -> None:

@@ -139,15 +139,13 @@ def positions(n: int, seed: int = 0) -> Floats:
     for row in range(n):
         push = generator(seed, Stream.POSITIONS, row).standard_normal(3)
         up[row] += math.radians(_SPREAD_DEG) * np.cross(push, up[row])
-    result: Floats = up / np.linalg.norm(up, axis=1, keepdims=True)
-    return result
+    return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)
 class Position:
     """One position of a test: the chamber's program, and the direction of the specific force."""
 
-    name: str
     program: Cyclogram
     up: Floats
 
@@ -165,22 +163,21 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     if name == 'held-out':
         # Attitudes that no plan has: any direction, but no axis upright.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
-        return _positions(name, parse_cyclogram('held-out'), ups)
+        return _positions(parse_cyclogram('held-out'), ups)
     if name.startswith('chamber'):
         n, preset = (18, 'long') if name == 'chamber-18' else (9, 'three-hours')
-        return _positions('chamber', parse_cyclogram(preset), positions(n, seed))
+        return _positions(parse_cyclogram(preset), positions(n, seed))
     bench: list[Position] = []
     for up in positions(18, seed):
         room = rng.normal(21.5, 0.7)
         program = Cyclogram((0.0, 1200.0), (room, room + rng.normal(0.0, 0.3)))
-        bench += _positions(f'bench-{len(bench) + 1:02d}', program, up[None])
+        bench += _positions(program, up[None])
     if name == 'tumble':
         return tuple(bench)
     ups = _THREE[: int(name[-1])] + rng.normal(0.0, 0.15, (int(name[-1]), 3))
-    return (*bench, *_positions('chamber', parse_cyclogram('three-hours'), ups))
+    return (*bench, *_positions(parse_cyclogram('three-hours'), ups))
 
 
-def _positions(name: str, program: Cyclogram, ups: Floats) -> tuple[Position, ...]:
+def _positions(program: Cyclogram, ups: Floats) -> tuple[Position, ...]:
     ups = ups / np.linalg.norm(ups, axis=1, keepdims=True)
-    names = [name] if len(ups) == 1 else [f'{name}-{i:02d}' for i in range(1, len(ups) + 1)]
-    return tuple(Position(name, program, up) for name, up in zip(names, ups, strict=True))
+    return tuple(Position(program, up) for up in ups)

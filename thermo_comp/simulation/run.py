@@ -39,7 +39,6 @@ class Truth:
     unit: UnitModel
     response: ThermalResponse
     grid_s: Floats
-    air: Floats
     temperatures: Floats
     thermal_bias: Floats
     scale_grid: Floats
@@ -83,7 +82,6 @@ class SimulatedRun:
     case: Floats
     truth: Truth
     angular_rate: Floats | None = None
-    name: str = ''
 
 
 def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: Any) -> SimulatedRun:
@@ -95,11 +93,10 @@ def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
     """Run a unit through a test in memory; each position has a seed of its own, stamps from 0."""
-    runs = (
+    return [
         simulate(unit, one.program, one.up, rate_hz=rate_hz, seed=1000 * seed + k, start_ns=0)
         for k, one in enumerate(stations)
-    )
-    return [replace(run, name=one.name) for run, one in zip(runs, stations, strict=True)]
+    ]
 
 
 def simulate_blocks(
@@ -203,7 +200,6 @@ def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
         unit,
         response,
         grid,
-        np.interp(grid, knots, air),
         temperatures,
         np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g,
         1.0 + scale,
