@@ -106,7 +106,9 @@ def known_of(
     stated = options.ageing_bias, options.ageing_scale
     tried = [(grown(*stated), more) for more in _MORE_ALONE]
     if not any(stated):
-        tried += [(grown(one * options.gravity, one), 0.0) for one in _AGEINGS]
+        aged = [grown(one * options.gravity, one) for one in _AGEINGS]
+        # The fit begins with the last: noise must not take what a narrow one leaves.
+        tried += [*((one, 0.0) for one in aged), (aged[-1], _MORE_ALONE[-1])]
     layout = regression.layout(regression.windows.parts)
     to_file = file_parameters(regression, layout, state, sets, range(len(calibration.response)))
     mean = regression.vector(state, layout)[: layout.n_unit]
