@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what is done with one bag: ``thermo_comp info`` looks at it (or at a calibration), ``replay``
-corrects it, ``play`` sends it onto the live topics.
-"""
+"""Owns what is done with one bag: ``info`` (or with a calibration), ``replay`` and ``play``."""
 
 from dataclasses import asdict
 from pathlib import Path

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what goes to and fro between other tools and ours: ``thermo_comp convert``, their logs into
-bags; ``export`` and ``import``, a calibration into their files and back.
-"""
+"""Owns ``convert``, others' logs into bags; ``export``, ``import``, a calibration to and fro."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp fit``, ``prior`` and ``fleet fit``: bags of a unit to its calibration,
-calibrations to that of their type, bags of many units to all of these.
-"""
+"""Owns ``fit``, bags to a calibration; ``prior``, calibrations to their type's; ``fleet fit``."""
 
 import time
 from collections.abc import Callable, Iterable

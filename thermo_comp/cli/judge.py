@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp evaluate``, ``report`` and ``view``: what a calibration leaves of |f| on bags:
-in tables, as a certificate and live.
-"""
+"""Owns ``evaluate``, ``report``, ``view``: what a calibration leaves of |f|, as table and page."""
 
 import sys
 import webbrowser

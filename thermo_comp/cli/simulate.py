@@ -1,12 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns ``thermo_comp simulate``, bags of a thermal test with known truth, and ``demo``, the main job
-on the sample bags.
-
-The demo fits on nine bags; the tenth is played onto live topics, compensated by the node in a
-process of its own, and recorded. What comes out is held against the offline run and gravity.
-"""
+"""Owns ``simulate``, bags of a test with known truth; ``demo``, the main job on sample bags."""
 
 import json
 import os

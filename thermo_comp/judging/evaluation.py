@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the way from recordings to a judgement, each read once, in bounded memory; and the history of
-a unit: what has drifted between its calibrations, with their covariance.
-"""
+"""Owns the way from recordings, each read once, to a judgement; the history of a unit."""
 
 from __future__ import annotations
 
@@ -54,9 +51,8 @@ def open_bags(
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
     """
-    Read bags for windows of `window_s`, as the first calibration says, else as usual.
-
-    Raises RecordingError if one cannot be read, or has no board temperature where it needs one.
+    Read bags for windows of `window_s`, as the first calibration says, else as usual;
+    RecordingError if one cannot be read, or has no board temperature where it needs one.
     """
     require: tuple[Role, ...] = ('board',)
     known: dict[str, Any] = {}

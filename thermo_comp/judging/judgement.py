@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the judgement of a calibration on recordings: one verdict, with its numbers and exit code;
-what it takes to make ``|f| = g`` in all positions is what the axes have moved by.
-"""
+"""Owns the judgement of a calibration on recordings: a verdict with its numbers and exit code."""
 
 from __future__ import annotations
 
@@ -208,7 +205,7 @@ def distinct_positions(windows: Windows) -> int:
 
 
 def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[AxisShift, ...]:
-    """Fit nine constants to the positions' means; none with fewer than six distinct ones."""
+    """Fit the nine shifts that make ``|f| = g``; none with fewer than six distinct positions."""
     if distinct_positions(windows) < POSITIONS_NEEDED:
         return ()
     gravity = windows.gravity

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the words of a judgement, verdicts, sections and where the limits lie; a gyroscope's verdict.
-"""
+"""Owns the words of a judgement, its sections and limits, and the verdict on a gyroscope."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the windows that a judgement rests on: means at rest of exactly the stated length, corrected
-as the node would correct a sample there; a row each is all that is kept of a bag.
-"""
+"""Owns the windows that a judgement rests on: means at rest, corrected as the node would."""
 
 from __future__ import annotations
 
@@ -41,9 +38,9 @@ _LEAST_FILLED = 0.9
 @dataclass(frozen=True)
 class Windows:
     """
-    Windows at rest, of all bags, in order; arrays of n rows.
+    Windows at rest, of all bags, in order; arrays of n rows, which are all that is kept of a bag.
 
-    Each is `window_s` long, and begins at `start_ns`; `time` is its middle since the bag's first
+    Each is exactly `window_s` long, from `start_ns` on; `time` is its middle since the bag's first
     sample [s], `count` and `mean` are of its raw samples. A position is a still interval, counted
     through all bags. The rate is the board's [K/s]. Dynamic are those in which the dynamic set
     prevails, inside those that lie inside the calibrated ranges as a whole, swapped those in which

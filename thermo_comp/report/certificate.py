@@ -142,10 +142,7 @@ class Result(NamedTuple):
 
 
 def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...]:
-    """
-    Split the uncertainty of ``|f|`` at rest into what it comes from; empty without a judgement.
-    Repeatability is what the residual exceeds white noise, attitude and model together by.
-    """
+    """Split the uncertainty of ``|f|`` at rest into what it comes from; empty unjudged."""
     judgement, calibration = evidence.judgement, evidence.calibration
     if judgement is None or calibration is None or not judgement.sections['all'].n:
         return ()

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what a test is: the chamber's program, ready-made or typed in, and the attitudes of the unit.
-"""
+"""Owns what a test is: the chamber's program, ready-made or typed in, and the attitudes."""
 
 from __future__ import annotations
 

@@ -187,9 +187,7 @@ def _mems(draw: _Specimen) -> UnitModel:
 
 
 def _triad(draw: _Specimen) -> UnitModel:
-    """
-    Draw a triad of bare heads on a board: tempcos that lag with the heads, and its kind's physics.
-    """
+    """Draw a triad of bare heads on a board: tempcos that lag with them, its kind's physics."""
     kind = draw.name
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
     board_tau, taus = draw.between(400.0, 900.0), [draw.between(500.0, 1500.0) for _ in heads]
