@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -19,11 +20,17 @@ from thermo_comp.simulation.presets import UNIT_NAMES, unit_preset
 ROUNDING = 1e-9
 
 
+def response_of(
+    network: ThermalNetwork, time: Sequence[float], air: Sequence[float]
+) -> ThermalResponse:
+    return ThermalResponse(network, np.array(time), np.array(air))
+
+
 def test_one_part_follows_a_ramp_as_the_textbook_says() -> None:
     """A first-order lag in a ramp: ``T = r (t - tau (1 - exp(-t / tau)))``."""
     tau, rate = 900.0, 0.5 / 60.0
     network = ThermalNetwork({'case': 900.0}, (Link(AIR, 'case', 1.0),))
-    response = ThermalResponse(network, [0.0, 3600.0], [20.0, 20.0 + rate * 3600.0])
+    response = response_of(network, [0.0, 3600.0], [20.0, 20.0 + rate * 3600.0])
     time = np.linspace(0.0, 3600.0, 61)
     expected = 20.0 + rate * (time - tau * (1.0 - np.exp(-time / tau)))
     np.testing.assert_allclose(response.temperatures(time)[:, 0], expected, atol=ROUNDING)
@@ -49,7 +56,7 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
     decaying = np.exp(np.outer(time, modes)) * amplitude
     expected = rate * (time[:, None] - lag + decaying @ shapes.T)
 
-    response = ThermalResponse(network, [0.0, 5400.0], [0.0, rate * 5400.0])
+    response = response_of(network, [0.0, 5400.0], [0.0, rate * 5400.0])
     np.testing.assert_allclose(response.temperatures(time), expected, atol=ROUNDING)
 
 
@@ -57,7 +64,7 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
 def test_presets_agree_with_a_numerical_integrator(name: str) -> None:
     unit = unit_preset(name, 3)
     program = parse_cyclogram('demo')
-    response = ThermalResponse(unit.network, program.time_s, program.temperature_c)
+    response = response_of(unit.network, program.time_s, program.temperature_c)
     network = unit.network
     A, b, p = network.system()
     time = np.linspace(0.0, program.duration_s, 200)
@@ -98,9 +105,11 @@ def test_still_state_obeys_the_heat_balance() -> None:
     to_air = next(link for link in unit.network.links if AIR in (link.a, link.b))
     case = warm[unit.network.nodes.index('case')]
     assert to_air.conductance * (case - 12.0) == pytest.approx(sum(unit.network.power.values()))
-    response = ThermalResponse(unit.network, [0.0, 3600.0], [12.0, 12.0])
+    response = response_of(unit.network, [0.0, 3600.0], [12.0, 12.0])
     np.testing.assert_allclose(
-        response.temperatures([0.0, 1800.0, 3600.0]), np.tile(warm, (3, 1)), atol=ROUNDING
+        response.temperatures(np.array([0.0, 1800.0, 3600.0])),
+        np.tile(warm, (3, 1)),
+        atol=ROUNDING,
     )
     board = unit.network.nodes.index('board')
     assert unit.network.equilibrium(unit.network.air_for('board', 20.0))[board] == pytest.approx(
@@ -125,7 +134,7 @@ def test_thermostat_holds_its_part_and_spends_what_leaks() -> None:
         )
         assert network.settled(air)[len(network.nodes)] == pytest.approx(leak)
     program = parse_cyclogram('fast')
-    response = ThermalResponse(network, program.time_s, program.temperature_c)
+    response = response_of(network, program.time_s, program.temperature_c)
     grid = np.arange(0.0, program.duration_s, 30.0)
     # 30 K outside, 3 K/min: an oven of this class keeps the head to better than 0.2 K.
     assert np.ptp(response.temperatures(grid)[:, head]) < 0.2
@@ -134,4 +143,4 @@ def test_thermostat_holds_its_part_and_spends_what_leaks() -> None:
 def test_an_oven_refuses_air_that_it_cannot_hold_off() -> None:
     network = unit_preset('thermostatted', 0).network
     with pytest.raises(ValueError, match=r'air of 5\.\.90 degC needs -.* W of a thermostat'):
-        ThermalResponse(network, [0.0, 60.0], [5.0, 90.0])
+        response_of(network, [0.0, 60.0], [5.0, 90.0])

@@ -130,7 +130,7 @@ def write_log(
     log: ForeignLog,
     output: str | Path,
     force: bool = False,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> ConversionReport:
     """Check a log and write it as a bag: a bare file ``*.mcap``, else a rosbag2 directory."""
     if log.serial:
@@ -217,11 +217,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 
 
 def _write(
-    log: ForeignLog,
-    output: Path,
-    force: bool,
-    newest: Ints,
-    progress: Callable[[float], None] | None,
+    log: ForeignLog, output: Path, force: bool, newest: Ints, progress: Callable[[float], None]
 ) -> None:
     """Write the messages; a stamp that goes back keeps its place through its log time."""
     topics, n = Topics(), len(log.stamp_ns)
@@ -258,8 +254,7 @@ def _write(
                     topics.imu, stamp_ns, values, np.zeros(9), log.frame_id, imu, newest[rows]
                 )
             writer.flush()
-            if progress is not None:
-                progress(rows.stop / n)
+            progress(rows.stop / n)
 
 
 def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:

@@ -57,7 +57,7 @@ class LiveReport:
         self._version = self._notice = ''
         # While nothing good was seen yet: a page with the reason, which goes on asking.
         self._evidence = Evidence(serial=calibration.name)
-        self._figures: list[tuple[ReportFigure, str]] = []
+        self._drawn: list[tuple[ReportFigure, str]] = []
 
     def version(self) -> str:
         """Tell the state of the files: another text whenever one of them has changed."""
@@ -71,16 +71,13 @@ class LiveReport:
                 self._version, self._notice = version, ''
                 try:
                     evidence = self.evidence()
-                    self._figures = drawn_figures(figures_of(evidence))
+                    self._drawn = drawn_figures(figures_of(evidence))
                     self._evidence = evidence
                 except (ThermoCompError, OSError, ValueError) as error:
-                    older = '\nThe page below is older.' if self._figures else ''
+                    older = '\nThe page below is older.' if self._drawn else ''
                     self._notice = f'{error}{older}'
             return render_report(
-                self._evidence,
-                figures=self._figures,
-                script=_SCRIPT % version,
-                notice=self._notice,
+                self._evidence, figures=self._drawn, script=_SCRIPT % version, notice=self._notice
             )
 
     def evidence(self) -> Evidence:

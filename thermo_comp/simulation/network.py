@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.optimize import root
 
 from ..typing import Floats
@@ -140,21 +139,15 @@ class ThermalResponse:
     """
     Temperatures of a network over a program, at any instant.
 
-    `knot_air` are the air temperatures at the `knot_time` [s], shape (m,); `power` is what the
-    parts dissipate between the knots beside the constant powers, W, shape (m - 1, n_parts). At the
-    start all is on and in equilibrium.
+    `air` are the chamber's at the knots `time` [s], shape (m,); `power` is what the parts
+    dissipate between the knots beside the constant powers, W, shape (m - 1, n_parts). At the start
+    all is on and in equilibrium.
     """
 
     def __init__(
-        self,
-        network: ThermalNetwork,
-        knot_time: ArrayLike,
-        knot_air: ArrayLike,
-        power: ArrayLike | None = None,
+        self, network: ThermalNetwork, time: Floats, air: Floats, power: Floats | None = None
     ) -> None:
-        self.network = network
-        self._time = np.asarray(knot_time, dtype=float)
-        air = np.asarray(knot_air, dtype=float)
+        self.network, self._time = network, time
         heat = network.thermostat
         if heat is not None:
             # The state behind the parts' temperatures.
@@ -168,7 +161,7 @@ class ThermalResponse:
         A, b, p = network.system()
         drive = np.tile(p, (len(self._time) - 1, 1))
         if power is not None:
-            drive[:, : len(network.nodes)] += np.asarray(power) / list(network.capacity.values())
+            drive[:, : len(network.nodes)] += power / list(network.capacity.values())
         if network.is_convective:
             steps = np.arange(self._time[0], self._time[-1], _STEP_S)
             fine = np.union1d(self._time, steps)
@@ -194,15 +187,14 @@ class ThermalResponse:
             decayed = modes @ (np.exp(rate * lasts) * self._amplitude[k])
             state, before = self._alpha[k] + self._beta[k] * lasts + decayed.real, now
 
-    def states(self, time: ArrayLike) -> Floats:
+    def states(self, time: Floats) -> Floats:
         """Return the parts' temperatures and the thermostat's integral [W], shape (m, k)."""
-        time = np.atleast_1d(np.asarray(time, dtype=float))
         k = np.clip(np.searchsorted(self._time, time, side='right') - 1, 0, len(self._time) - 2)
         since = (time - self._time[k])[:, None]
         decaying = np.exp(since * self._rate) * self._amplitude[k]
         states: Floats = self._alpha[k] + self._beta[k] * since + (decaying @ self._modes.T).real
         return states
 
-    def temperatures(self, time: ArrayLike) -> Floats:
+    def temperatures(self, time: Floats) -> Floats:
         """Return the temperatures [degC] in the order of ``network.nodes``, shape (m, n_parts)."""
         return self.states(time)[:, : len(self.network.nodes)]

@@ -188,7 +188,7 @@ def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
         knots, is_on = _switched(unit.load, knots, seed)
         air = np.interp(knots, cyclogram.time_s, air)
         heated = [part == unit.load.part for part in unit.network.nodes]
-        power = unit.load.power * np.outer(is_on, heated)
+        power = np.where(np.outer(is_on, heated), unit.load.power, 0.0)
     response = ThermalResponse(unit.network, knots, air, power)
     grid = np.arange(math.ceil(cyclogram.duration_s / _GRID_S) + 1, dtype=float) * _GRID_S
     temperatures = response.temperatures(grid)
