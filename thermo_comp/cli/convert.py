@@ -90,7 +90,7 @@ def convert(
     out.line(
         f'{found.path}: {report.rows} rows, {report.duration_s:.1f} s at {report.rate_hz:.4g} Hz'
     )
-    out.line(f'{report.output}:')
+    out.line(f'{output}:')
     for name, count in report.messages.items():
         out.line(f'  {count:8} {accel if name == "accel" else f"temperature/{name}"}')
     out.line(f'unit: {found.unit}; {report.believed}')
@@ -114,7 +114,8 @@ def convert(
             out.line(f'  {begin:9.1f} .. {end:.1f} s')
     out.told([(found.path, found.chosen, found.missing)])
     out.end(
-        **picked(report, 'output rows rate_hz duration_s believed stillness'),
+        output=output,
+        **picked(report, 'rows rate_hz duration_s believed stillness'),
         **picked(found, 'input unit missing chosen hint'),
         source=found.path,
         start_ns=start_ns,

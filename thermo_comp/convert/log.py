@@ -100,7 +100,6 @@ class ConversionReport:
     """What came in, what went out, and what was seen on the way."""
 
     log: ForeignLog  # what was written of it
-    output: str
     rows: int
     messages: Mapping[str, int]  # by the name of the input
     rate_hz: float
@@ -173,7 +172,6 @@ def write_log(
     counts = {name: len(one.stamp_ns) for name, one in log.temperatures.items()}
     return ConversionReport(
         log,
-        str(output),
         rows=len(usable) + log.n_short,
         messages={'accel': len(stamp_ns), 'board': 0, 'case': 0, **counts},
         rate_hz=1e9 / float(np.median(steps[steps > 0])) if steps.any() else float('nan'),

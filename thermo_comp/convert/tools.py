@@ -160,17 +160,12 @@ def _read_ardupilot(text: str, number: int | None) -> Content | None:
         powers = (held - _ARDUPILOT_REFERENCE_C) ** np.arange(1, 4)
         return np.column_stack((-slopes @ powers, slopes))
 
+    bias, range_c = cubics('ACC'), (values[f'{prefix}TMIN'], values[f'{prefix}TMAX'])
     # An autopilot that has learnt nothing of its gyroscope lists zeros.
-    has_rate = values.has(f'{prefix}GYR')
-    return Content(
-        np.eye(3),
-        cubics('ACC'),
-        _ARDUPILOT_REFERENCE_C,
-        (values[f'{prefix}TMIN'], values[f'{prefix}TMAX']),
-        [_THERMAL_NOTE],
-        f'ArduPilot {prefix}*',
-        rate_bias=cubics('GYR') if has_rate else None,
-    )
+    rate_bias = cubics('GYR') if values.has(f'{prefix}GYR') else None
+    source, notes = f'ArduPilot {prefix}*', [_THERMAL_NOTE]
+    reference = _ARDUPILOT_REFERENCE_C
+    return Content(np.eye(3), bias, reference, range_c, notes, source, rate_bias=rate_bias)
 
 
 class _Parameters(dict[str, float]):

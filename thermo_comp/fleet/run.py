@@ -69,7 +69,7 @@ def fit_fleet(
     n_workers: int | None = None,
     client: Any = None,
     earlier: Sequence[Row] = (),
-    tell: Callable[[int, int, Row], None] | None = None,
+    tell: Callable[[int, int, Row], None] = lambda *_: None,
 ) -> FleetResult:
     """Fit all units whose results are not there yet; ThermoCompError, OutputError if it cannot."""
     for name in ('distributed', 'fsspec', 'pyarrow'):
@@ -93,8 +93,7 @@ def fit_fleet(
             n_done += len(missing)
             for unit, outcome in run(client, storage.address, missing, how) if missing else ():
                 rows[unit.name] = results.store(unit, how, outcome)
-                if tell is not None:
-                    tell(len(rows), len(some), rows[unit.name])
+                tell(len(rows), len(some), rows[unit.name])
             return rows
 
         rows = fitted(units, options)

@@ -24,7 +24,7 @@ from .drift import (
     triple,
 )
 from .network import AIR, Link, ThermalNetwork, Thermostat
-from .unit import GyroModel, Stream, SwitchedLoad, ThermometerModel, UnitModel, generator, rounded
+from .unit import GyroModel, Stream, SwitchedLoad, UnitModel, generator, rounded
 
 
 class _Specimen:
@@ -172,8 +172,6 @@ def _mems(draw: _Specimen) -> UnitModel:
         bias_ug=20000.0,
         spread=0.02,
         misalignment_sd=1e-2,
-        board=ThermometerModel('board', noise_sd=0.02, phase=0.5),
-        case=ThermometerModel('case', noise_sd=0.02),
         noise_density=(120.0, 120.0, 150.0),
         converter=rounded,
     )
@@ -183,7 +181,7 @@ def _mems(draw: _Specimen) -> UnitModel:
         CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(0.1)),
     )
     gyro = GyroModel(rate, draw.normal(500.0), (5.0, 5.0, 5.0), turn_on=2.0)
-    return replace(unit, gyro=gyro)
+    return replace(unit.with_thermometers(noise_sd=0.02), gyro=gyro)
 
 
 def _triad(draw: _Specimen) -> UnitModel:

@@ -195,19 +195,11 @@ def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
     origin = unit.origin
     history = PartHistory(unit.network.nodes, temperatures - origin, origin, _GRID_S)
     bias_ug, scale = drift_of(unit.drift, history)
+    bias = np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g
     none = np.empty(0)
-    return Truth(
-        unit,
-        response,
-        grid,
-        temperatures,
-        np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g,
-        1.0 + scale,
-        none if unit.gyro is None else unit.gyro.bias(history),
-        bias_grid=none,
-        specific_force=none,
-        cycle_s=none,
-    )
+    rate = none if unit.gyro is None else unit.gyro.bias(history)
+    # What one run adds is still to come.
+    return Truth(unit, response, grid, temperatures, bias, 1.0 + scale, rate, none, none, none)
 
 
 def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Bools]:
