@@ -63,10 +63,10 @@ def _content(
     calibration: Calibration, tool: Tool, up: tuple[float, float, float] | None
 ) -> Content:
     """Take from a calibration what a tool's file can hold, and note the rest."""
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     sets = calibration.static.axes()
-    K = np.array([axis.scale_factor for axis in axes])
-    level = np.array([axis.bias + one.delta for axis, one in zip(axes, sets, strict=True)])
+    K = np.array([axis.scale_factor for axis in calibration.axes])
+    levels = zip(calibration.axes, sets, strict=True)
+    level = np.array([axis.bias + one.delta for axis, one in levels])
     range_c = calibration.static.temperature_range_c
     temperature = np.linspace(*range_c, _GRID)
     own_reference_c = calibration.reference_temperature_c

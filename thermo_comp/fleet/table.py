@@ -158,7 +158,6 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
     start = datetime.fromtimestamp(min(bag.start_ns for bag in bags) // 10**9, timezone.utc)
     sets = calibration.regime_sets()
     static = sets[0].axes()
-    axes = [getattr(calibration.axes, axis) for axis in AXES]
     bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
     up = np.array([one.up for one in result.positions])
     lacking = {one.name for one in result.findings if one.level != 'good'}
@@ -171,7 +170,7 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
         'bias_sd_{0}_ug': bias_sd / MICRO_G,
         'bias_slope_{0}_ug_k': [
             float(one.bias_function.slope(0.0)) / (axis.scale_factor * MICRO_G)
-            for one, axis in zip(static, axes, strict=True)
+            for one, axis in zip(static, calibration.axes, strict=True)
         ],
         'm_{0}_urad': [calibration.misalignment[i][j] * 1e6 for i, j in _BELOW],
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,

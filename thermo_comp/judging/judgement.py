@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..fitting.coverage import distinct_directions, norm_columns
+from ..fitting.start import within_positions
 from ..fitting.verdict import POSITIONS_NEEDED
 from ..online.compensator import SWAPPED
 from ..text import counted
@@ -247,8 +248,7 @@ def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
 
 def rms_by_axis(windows: Windows) -> Floats:
     """Give the RMS of each axis about its mean in a position, static and dynamic, shape (2, 3)."""
-    _, place = np.unique(windows.position, return_inverse=True)
-    about = windows.force - means_by(windows.position, windows.force)[place]
+    about = within_positions(windows.force, windows.position)
     return np.array(
         [
             np.sqrt(np.mean(about[rows] ** 2, axis=0)) if rows.any() else np.full(3, np.nan)

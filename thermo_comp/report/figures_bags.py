@@ -15,6 +15,7 @@ from ..thermal.regime import Regime
 from ..typing import Bools, Floats
 from ..unit.calibration import AXES
 from ..unit.gravity import MICRO_G, spoken
+from ..unit.metrics import statistics_by_regime
 from . import style
 from .evidence import LEFT_OUT, RAW, Evidence, Position, given
 from .html import number
@@ -87,11 +88,9 @@ def draw_residuals(evidence: Evidence) -> Figure:
         axes.locator_params(axis='y', nbins=5)
         if rung != RAW:
             _symmetric(axes, residual[rows])
-        parts = [
-            f'{name} {number(float(np.sqrt(np.mean(residual[rows][part] ** 2))) / MICRO_G)}'
-            for name, part in (('static', ~dynamic), ('dynamic', dynamic))
-            if part.any()
-        ]
+        found = statistics_by_regime(residual[rows], dynamic)
+        del found['all']
+        parts = [f'{name} {number(one.rms / MICRO_G)}' for name, one in found.items() if one.n]
         title = f'{rung}: RMS {", ".join(parts)} µg'
         if axes is panels[0]:
             style.legend_above(axes, title)
@@ -164,8 +163,8 @@ def _drift(evidence: Evidence) -> tuple[Floats, str]:
         begin = windows.time[rows] <= windows.time[rows][0] + _ZERO_S
         drift[rows] -= windows.mean[rows][begin].mean(axis=0)
     if evidence.calibration is not None:
-        axes = evidence.calibration.axes
-        return drift / [one.scale_factor for one in (axes.x, axes.y, axes.z)] / MICRO_G, 'µg'
+        K = [one.scale_factor for one in evidence.calibration.axes]
+        return drift / K / MICRO_G, 'µg'
     return (drift / MICRO_G, 'µg') if evidence.is_imu else (drift, 'counts')
 
 

@@ -18,7 +18,7 @@ from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
 from ..unit.gyroscope import MILLIDEGREE
-from ..unit.prediction import bias_and_scale, ramp_states, sd_of_states, step_states
+from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states, sd_of_states, step_states
 from ..unit.rate_triad import rate_triad
 from . import style
 from .evidence import CHOSEN, Evidence, given
@@ -151,8 +151,7 @@ def curves(calibration: Calibration) -> list[Curve]:
         cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
         ramps = (('heating', dynamic, heating), ('cooling', dynamic, cooling))
         ways += [one for one in ramps if one[2]]
-    reference = np.array([calibration.reference_temperature_c])
-    bias_0, scale_0 = bias_and_scale(calibration, ramp_states(calibration, reference))
+    bias_0, _, scale_0, _ = in_a_soak(calibration)
     found = []
     for way, part, rate_k_min in ways:
         rate = rate_k_min / 60.0
