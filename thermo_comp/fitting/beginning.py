@@ -47,8 +47,8 @@ def regress(
     prior, knowns = _wide_prior(windows, start, up, options), []
     if known is not None:
         state = as_known(known, regression, state)
-        knowns = known_of(known, regression, state, windows.model.sets, options)
-        prior = replace(prior, widths=windows.data.parts.astype(np.float64), known=knowns[-1])
+        *knowns, widest = known_of(known, regression, state, windows.model.sets, options)
+        prior = replace(prior, widths=windows.data.parts.astype(np.float64), known=widest)
     forced = [
         options.model == 'golovach' or group == CURVE or group in options.forced
         for group in windows.data.groups

@@ -85,7 +85,10 @@ def as_known(calibration: Calibration, regression: Regression, state: State) -> 
 def known_of(
     calibration: Calibration, regression: Regression, state: State, sets: Sets, options: FitOptions
 ) -> list[Known]:
-    """Turn a calibration into priors on its columns, for the evidence, FitError without claim."""
+    """
+    Turn a calibration into priors on its columns, for the evidence, the last to begin with;
+    FitError without claim.
+    """
     if calibration.posterior is None:
         raise FitError('the prior has no covariance: an import makes no claim to build on')
     K = constants_of(calibration).scale
@@ -106,9 +109,9 @@ def known_of(
     stated = options.ageing_bias, options.ageing_scale
     tried = [(grown(*stated), more) for more in _MORE_ALONE]
     if not any(stated):
-        aged = [grown(one * options.gravity, one) for one in _AGEINGS]
-        # The fit begins with the last: noise must not take what a narrow one leaves.
-        tried += [*((one, 0.0) for one in aged), (aged[-1], _MORE_ALONE[-1])]
+        tried += [(grown(one * options.gravity, one), 0.0) for one in _AGEINGS]
+    # The fit only begins with the last: noise must not take what a narrow one leaves.
+    tried.append((tried[-1][0], _MORE_ALONE[-1]))
     layout = regression.layout(regression.windows.parts)
     to_file = file_parameters(regression, layout, state, sets, range(len(calibration.response)))
     mean = regression.vector(state, layout)[: layout.n_unit]
