@@ -75,6 +75,19 @@ def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path: Path, separ
     assert table.n_short == 1
 
 
+def test_a_column_may_begin_late(tmp_path: Path) -> None:
+    # WHY: a thermometer reports its first reading after the accelerometer, and stands last.
+    rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
+    table = read_text(
+        write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows])),
+        ['t', 'celsius'],
+        ROWS_ALONE,
+    )
+    np.testing.assert_array_equal(table.values['t'], np.arange(60.0))
+    assert np.isnan(table.values['celsius'][:20]).all()
+    assert table.values['celsius'][20] == 40.0
+
+
 def test_line_numbers_are_those_of_an_editor(tmp_path: Path) -> None:
     path = write(tmp_path / 'log.csv', '# made by hand\na,b\n\n1,2\nx,3\n4\n5,6\n')
     table = read_text(path, ['a', 'b'], ROWS_ALONE)

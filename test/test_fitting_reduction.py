@@ -122,6 +122,21 @@ def test_vibration_is_cut_out(rng: np.random.Generator) -> None:
     assert second.time[0] > 23.0
 
 
+def test_a_chamber_whose_compressor_cycles_has_one_position(rng: np.random.Generator) -> None:
+    # WHY: half of what was recorded was left out, and each pause of the compressor was a position
+    # of its own: 18 bags had 1135, and their fit took ten minutes.
+    # WHAT: twelve shakes of three times the noise belong to the rest, and a turn of 300 urad
+    # between two of them is still one.
+    accel = still(rng, 720.0, (0.0, 0.0, 3000.0))
+    for start in range(3000, 72000, 6000):
+        accel[start : start + 3000] += 0.9 * rng.standard_normal((3000, 3))
+    (only,) = reduced([block(accel)]).intervals
+    assert (only.end_ns - only.start_ns) * 1e-9 > 680.0
+    accel[34500:] += (1.0, 0.0, 0.0)
+    first, second = reduced([block(accel)]).intervals
+    assert first.time[-1] < 345.0 < second.time[0]
+
+
 def test_a_knock_starts_a_new_position(rng: np.random.Generator) -> None:
     # The attitude shifts by 1 count of 3000 without any vibration: 300 urad, a step of 20 sd of
     # a cell mean.

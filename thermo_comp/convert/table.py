@@ -152,7 +152,7 @@ def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str],
     before it, begins the table: then the first of these has the headings.
     """
     first = list(islice(rows, _PREAMBLE_ROWS))
-    is_row = [_n_cells(row) == width for _, row in first]
+    is_row = [_n_cells(row) <= width <= len(row) for _, row in first]
     n_numbers = [sum(_number(cell) is not None for cell in row) for _, row in first]
     is_first = [one and 2 * n > width for one, n in zip(is_row, n_numbers, strict=True)]
     if not any(is_first):

@@ -181,6 +181,9 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         sets = sets_of(options, bags)
         is_paper = options.model == 'golovach'
         columns = () if is_paper else bank(sensors, gradients_at_rest(bags, sensors))
+        if not any(len(bag.case.value) for bag in bags):
+            # A gradient that is guessed from the board's rate tells nothing that its lags do not.
+            columns = tuple(one for one in columns if not one.is_of_sensor)
     reference = options.reference_temperature
     model = Model(options.model, sets, columns, sensors, detector, reference)
     windows = thermal_windows(bags, model)

@@ -41,6 +41,9 @@ _MIN_RESTS_S = (3.0, 2.0, 1.0)
 # Of samples so slow that a cell lasts this long [s], shorter ones may find more rests: of so many
 # samples, for so many attitudes.
 _SLOW_CELL_S, _FEW_SAMPLES, _ENOUGH = 3.0, 5, 6
+# Cells on either side of a shake, what a parabola through all may leave, mean square [sd], and how
+# many shakes are a habit.
+_AROUND, _ONE_LINE, _CYCLES = 4, 4.0, 6
 _RATIOS = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
 
 
@@ -242,7 +245,33 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
         np.array([weighted[a:b].sum(axis=0) / cells.count[a:b].sum() for a, b in ranges])
         for ranges in found
     ]
-    return found[best_rests([one.reshape(-1, 3) for one in means])]
+    return _joined(cells, found[best_rests([one.reshape(-1, 3) for one in means])], still_sd)
+
+
+def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> list[tuple[int, int]]:
+    """
+    Join rests between which the unit was shaken, but not moved, where that happens all the time:
+    a compressor that cycles.
+    """
+    is_calm = stillness.is_under(cells, still_sd)
+    result = ranges[:1]
+    for start, stop in ranges[1:]:
+        first, last = result[-1]
+        around = slice(max(first, last - _AROUND), min(stop, start + _AROUND))
+        time, mean = cells.time[around], cells.mean[around]
+        variance = np.maximum(cells.variance[around], cells.quantum**2 / 12.0)
+        root = np.sqrt(np.maximum(cells.count[around, None], 1) / np.maximum(variance, 1e-300))
+        is_one = is_calm[last:start].all() and np.all(np.diff(cells.index[around]) == 1)
+        for axis in range(3) if is_one else ():
+            line = np.vander((time - time[0]) / np.ptp(time), 3) * root[:, [axis]]
+            value = mean[:, axis] * root[:, axis]
+            left = value - line @ np.linalg.lstsq(line, value, rcond=None)[0]
+            is_one = is_one and np.mean(left**2) < _ONE_LINE
+        if is_one:
+            result[-1] = first, stop
+        else:
+            result.append((start, stop))
+    return result if len(ranges) - len(result) >= _CYCLES else ranges
 
 
 def _windows(

@@ -222,7 +222,7 @@ def still_intervals(
     `still_sd` is the largest scatter at rest [parts of g], `ratio` of a variance to the quiet one.
     """
     full = _is_full(cells)
-    believable = full & _is_under(cells, still_sd) & ~_is_turning(cells)
+    believable = full & is_under(cells, still_sd) & ~_is_turning(cells)
     if not believable.any():
         return []
     # A sensor that reads the same number for long is no measure of its noise: toggling between two
@@ -252,7 +252,7 @@ def still_intervals(
 
 def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     """Say what speaks against rests in a bag that has none."""
-    full, under = _is_full(cells), _is_under(cells, still_sd)
+    full, under = _is_full(cells), is_under(cells, still_sd)
     if full.any() and not (full & under).any():
         least = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
         return (
@@ -276,7 +276,7 @@ def _one_g(cells: Cells) -> float:
     return float(np.median(norms)) if len(norms) else 0.0
 
 
-def _is_under(cells: Cells, still_sd: float) -> Bools:
+def is_under(cells: Cells, still_sd: float) -> Bools:
     """Whether a cell scatters by no more than a sensor at rest, or its own rounding."""
     ceiling = np.maximum((still_sd * _one_g(cells)) ** 2, cells.quantum**2)
     return np.asarray((cells.variance <= ceiling).all(axis=1))

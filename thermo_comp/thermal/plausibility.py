@@ -46,6 +46,8 @@ LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
 _SIGMAS: Final = 6.0
+#: Rates begin at 0: what is switched on and heats itself is not calm until so long after [ns].
+_CALM_NS: Final = 120 * 10**9
 
 
 class Fault(Enum):
@@ -222,6 +224,7 @@ class LeadCheck:
         self.is_reversed = False
         self.doubt = 0.0
         self._calm: tuple[float, float] | None = None
+        self._calm_ns: int | None = None
         self._n_alike = 0
         self._is_against = False
 
@@ -230,10 +233,14 @@ class LeadCheck:
         case, board = self._case, self._board
         calm = self._calm_rate
         if is_static or (-calm < case.rate < calm and -calm < board.rate < calm):
-            self._calm = (case.temperature, board.temperature)
             self._n_alike = 0
             self.doubt = 0.0
+            stamp_ns = case.stamp_ns or 0
+            self._calm_ns = stamp_ns if self._calm_ns is None else self._calm_ns
+            if is_static or stamp_ns - self._calm_ns >= _CALM_NS:
+                self._calm = (case.temperature, board.temperature)
             return
+        self._calm_ns = None
         if self._calm is None or not (case.is_ready and board.is_ready):
             return
         by_case, by_board = case.temperature - self._calm[0], board.temperature - self._calm[1]
