@@ -316,7 +316,7 @@ def judge_result(
         why = ': no temperature drift above the noise; already compensated?'
         yield _advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and has_temperature:
-        why = 'it takes more positions, or temperature does not explain the drift'
+        why = 'no position tells what another does: take more of them'
         yield _advice('left out', f'{text}: positions left out are worse than raw: {why}')
     else:
         yield Finding('residual', 'good', text)
