@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thermo_comp.fitting.posterior import Regression
-from thermo_comp.fitting.unknowns import Prior, State, Windows, initial_state
+from thermo_comp.fitting.unknowns import Prior, State, Windows, initial_state, tangent_basis
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.typing import Floats
 
@@ -42,6 +42,8 @@ class Truth:
     #: Random walk of the bias, m/s^2 per root second.
     walk: float = 0.0
     offset_sd: float = 0.0
+    #: What supports lean by, rad per RMS of what they lean with.
+    lean_sd: float = 0.0
 
     @property
     def weights(self) -> Floats:
@@ -68,13 +70,20 @@ def table_of(
     A = np.eye(3)
     A[1, 0], A[2, 0], A[2, 1] = truth.skew
     means = []
-    for columns, direction in zip(shapes, up, strict=True):
+    lean = np.concatenate(shapes)[:, [0, 2]]
+    lean /= np.sqrt(np.mean(lean**2, axis=0))
+    leaning = truth.lean_sd * rng.standard_normal((n_positions, 2, 2)) if truth.lean_sd else None
+    for p, (columns, direction) in enumerate(zip(shapes, up, strict=True)):
         moved = columns.copy()
         moved[:, 2:4] += share[:, 2:4] * (truth.start_sd * rng.standard_normal(2))
         force = GRAVITY * A @ direction
         clean = truth.kappa * force * (1.0 + moved @ truth.on_scale.T)
         clean = clean + truth.bias + moved @ truth.on_bias.T
         clean += truth.offset_sd * rng.standard_normal(3)
+        if leaning is not None:
+            across = tangent_basis(up)[p] @ leaning[p].T
+            own = lean[p * n_windows : (p + 1) * n_windows]
+            clean += truth.kappa * GRAVITY * (own @ (A @ across).T)
         steps = rng.standard_normal((n_windows, 3)) * truth.walk * np.sqrt(step_s)
         steps[0] = 0.0
         white = rng.standard_normal((n_windows, 3)) * truth.sigma
@@ -93,6 +102,7 @@ def table_of(
         start=np.tile(share, (n_positions, 1)),
         start_covariance=START,
         in_scale=np.ones(len(GROUPS), dtype=bool),
+        lean=lean,
     )
     return windows, up
 
@@ -129,6 +139,7 @@ def prior_of(
         'skew_sd': 1e-2,
         'widths': widths(names, 1e-2, 1e-3),
         'offset_sd': max(truth.offset_sd, 1e-9),
+        'lean_sd': max(truth.lean_sd, 1e-9),
         'sigma': truth.sigma,
         'rho': (truth.walk / truth.sigma) ** 2,
     }

@@ -58,6 +58,7 @@ class Dense:
             at.skew + x[layout.skew],
             up / np.linalg.norm(up, axis=1, keepdims=True),
             at.offset + x[layout.offset],
+            at.lean + x[layout.lean],
             at.start + x[layout.start],
         )
 
@@ -69,8 +70,11 @@ class Dense:
         for k in np.flatnonzero(w.lag >= 0):
             moved[:, k] += w.start[:, k] * state.start[w.bag, w.lag[k]]
         moved /= rms
-        force = GRAVITY * state.up[w.position] @ inverse_misalignment(state.skew).T
+        A = inverse_misalignment(state.skew)
+        force = GRAVITY * state.up[w.position] @ A.T
         predicted = state.kappa * force * (1.0 + moved @ state.weights[1].T)
+        across = np.einsum('pij,pkj->pki', tangent_basis(state.up), state.lean)[w.position]
+        predicted += state.kappa * GRAVITY * np.einsum('nk,nki->ni', w.lean, across) @ A.T
         predicted += state.bias + moved @ state.weights[0].T + state.offset[w.position]
         left = w.mean / NOMINAL - predicted
         parts = [self.roots[axis] @ left[:, axis] for axis in range(3)]
@@ -79,6 +83,7 @@ class Dense:
             (state.bias - prior.bias_mean) / prior.bias_sd,
             state.skew / prior.skew_sd,
             state.offset.ravel() / prior.offset_sd,
+            state.lean.ravel() / prior.lean_sd,
             np.linalg.solve(np.linalg.cholesky(w.start_covariance), state.start.T).ravel(),
         ]
         for weights, sd in zip(state.weights, prior.widths, strict=True):
@@ -99,7 +104,7 @@ class Dense:
 @pytest.fixture(scope='module')
 def solved() -> tuple[Regression, Prior, Posterior]:
     rng = np.random.default_rng(5)
-    truth = Truth(start_sd=0.5, walk=0.3 * MICRO, offset_sd=2.0 * MICRO)
+    truth = Truth(start_sd=0.5, walk=0.3 * MICRO, offset_sd=2.0 * MICRO, lean_sd=5e-6)
     windows, up = table_of(truth, 10, rng, n_windows=12, step_s=400.0)
     windows = replace(windows, weight=rng.uniform(0.3, 1.0, len(windows.time)))
     regression, state = begin(windows, up)

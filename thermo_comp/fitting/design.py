@@ -27,7 +27,7 @@ from ..typing import Bools, Floats, Ints
 from .unknowns import Layout, Prior, State, Windows
 
 # Unknowns that a step is added to; the last ones may take no part.
-_ADDED = ('kappa', 'bias', 'weights', 'skew', 'offset', 'start')
+_ADDED = ('kappa', 'bias', 'weights', 'skew', 'offset', 'lean', 'start')
 
 
 class Whitener:
@@ -97,7 +97,8 @@ class _Whitened:
 
 class Design:
     """
-    The data of a fit as combinations of base columns: one, the columns, and their start states.
+    The data of a fit as combinations of base columns: one, the columns, their start states, and
+    what a support leans with.
 
     windows: the data
     gravity: local gravity; 0 for an angular rate
@@ -119,7 +120,12 @@ class Design:
         self._start = np.where(np.abs(windows.start) < 1e-9, 0.0, windows.start) / self.rms
         self.moved = np.flatnonzero(windows.lag >= 0)
         self._base = np.hstack(
-            (np.ones((len(windows.time), 1)), self._columns, self._start[:, self.moved])
+            (
+                np.ones((len(windows.time), 1)),
+                self._columns,
+                self._start[:, self.moved],
+                windows.lean,
+            )
         )
         edges = np.searchsorted(windows.position, np.arange(windows.n_positions + 1))
         self._rows = [slice(a, b) for a, b in pairwise(edges.tolist())]
@@ -164,16 +170,18 @@ class Design:
         n_lags = len(self.windows.start_covariance) if moved.any() else 0
         up = np.empty((n_positions, 2), dtype=np.int64)
         offset = np.empty((n_positions, 3), dtype=np.int64)
+        lean = np.empty((n_positions, self.windows.lean.shape[1], 2), dtype=np.int64)
         start = np.empty((self.n_bags, n_lags), dtype=np.int64)
         blocks = []
         for bag in range(self.n_bags):
             first = n
             for p in np.flatnonzero(self._bags == bag):
-                up[p], offset[p] = take(2), take(3)
+                up[p], offset[p], lean[p] = take(2), take(3), take(*lean.shape[1:])
             start[bag] = take(n_lags)
             blocks.append(slice(first, n))
-        base = np.flatnonzero(np.concatenate(([True], taken, moved)))
-        return Layout(axis, weights, skew, up, offset, start, n_unit, tuple(blocks), n, base)
+        leans = np.ones(lean.shape[1], dtype=bool)
+        base = np.flatnonzero(np.concatenate(([True], taken, moved, leans)))
+        return Layout(axis, weights, skew, up, offset, lean, start, n_unit, tuple(blocks), n, base)
 
     def precision(self, prior: Prior, layout: Layout) -> Floats:
         """Inverse variances of the prior, shape (n,); where there is a matrix instead, 0."""
@@ -185,6 +193,7 @@ class Design:
         if prior.known is not None:
             result[: layout.n_unit] = 0.0
         result[layout.offset] = prior.offset_sd**-2
+        result[layout.lean] = prior.lean_sd**-2
         if not self.gravity:
             # Attitudes are nothing to an angular rate: they stay as they are.
             result[layout.up] = 1.0
@@ -238,9 +247,12 @@ class Design:
         result[0] = state.kappa[axis] * force + state.bias[axis] + state.offset[p, axis]
         result[1 : n_columns + 1] = weight
         moved = self.moved
-        result[n_columns + 1 :] = (
+        end = n_columns + 1 + len(moved)
+        result[n_columns + 1 : end] = (
             weight[moved] * state.start[self._bags[p]][self.windows.lag[moved]]
         )
+        turned = state.kappa[axis] * self.gravity * (state.inverse[axis] @ state.tangents[p])
+        result[end:] = state.lean[p] @ turned
         return result
 
     def residual(self, state: State) -> Floats:

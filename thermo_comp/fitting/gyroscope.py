@@ -66,6 +66,8 @@ def add_gyroscope(
         windows.data,
         mean=windows.angular_rate,
         in_scale=np.zeros(len(windows.data.groups), dtype=bool),
+        # Nor does an angular rate feel how it leans.
+        lean=np.zeros((len(windows.temperature), 0)),
     )
     one = np.ones(3)
     regression = Regression(data, 0.0, one)

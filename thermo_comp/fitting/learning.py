@@ -300,6 +300,11 @@ def _settle(
             offset_sd = max(np.sqrt(np.sum(state.offset**2) / told_offset), least)
             if told_offset > 1.0:
                 change = max(change, float(np.abs(np.log(offset_sd / prior.offset_sd))))
+        lean_sd = prior.lean_sd
+        if (told_lean := float(posterior.told[layout.lean].sum())) > 0.3 and regression.gravity:
+            lean_sd = max(np.sqrt(np.sum(state.lean**2) / told_lean), 1e-9)
+            if told_lean > 1.0:
+                change = max(change, float(np.abs(np.log(lean_sd / prior.lean_sd))))
         if (told_skew := float(posterior.told[layout.skew].sum())) > 1.0:
             skew_sd = max(np.sqrt(np.sum(state.skew**2) / told_skew), 1e-6)
         start_share = _start_share(regression, posterior)
@@ -311,6 +316,7 @@ def _settle(
             widths=np.where(gone, 0.0, new),
             offset_sd=float(offset_sd),
             skew_sd=float(skew_sd),
+            lean_sd=float(lean_sd),
             sigma=sigma,
             start_share=start_share,
         )
@@ -341,8 +347,8 @@ def _sigma(posterior: Posterior, prior: Prior) -> Floats:
     square = np.sum(posterior.whitened**2, axis=0)
     told, layout = posterior.told, posterior.layout
     own = told[layout.axis].sum(axis=1) + told[layout.offset].sum(axis=0)
-    # Attitudes, misalignment and start states are told by all three.
-    shared = told[layout.skew].sum() + told[layout.up].sum() + told[layout.start].sum()
+    # Attitudes, what they lean by, misalignment and start states are told by all three.
+    shared = sum(told[at].sum() for at in (layout.skew, layout.up, layout.lean, layout.start))
     spent = own + shared / 3.0
     sigma = prior.sigma * np.sqrt(square / np.maximum(n - spent, 0.05 * n))
     return np.asarray(np.maximum(sigma, _LEAST_SIGMA))

@@ -5,7 +5,8 @@ Owns the one regression: bias, scale, misalignment, attitudes, start states, giv
 
 Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
 
-    N / K0 = kappa a (1 + S s) + b + B beta + o_p + walk + white,   a = (A u_p)_i g,  A = M^-1
+    N / K0 = kappa a (1 + S s) + b + B beta + o_p + kappa (A l_p)_i g + walk + white,
+    a = (A u_p)_i g,  A = M^-1,  l_p across u_p: what the support leans by
 
 With g = 0 this is the regression of an angular rate: what is left is b, B beta and o_p.
 
@@ -202,10 +203,12 @@ class Regression(Design):
         width, first = layout.axis.shape[1], layout.axis[axis, 0]
         moved, lag = self.moved, self.windows.lag[self.moved]
         m0 = state.start[self._bags[p], lag]
-        behind = len(self._base[0]) - len(moved) + np.arange(len(moved))
+        behind = 1 + len(self.windows.groups) + np.arange(len(moved))
+        n_leans = layout.lean.shape[1]
         # How each unknown acts on the base: T; a weight takes its column along with what the
         # start states add to it.
-        T = np.zeros((len(self._base[0]), width + 6 + layout.start.shape[1]))
+        starts = width + 6 + 2 * n_leans
+        T = np.zeros((len(self._base[0]), starts + layout.start.shape[1]))
         T[0, 1] = 1.0
         for places, factor in zip(layout.weights[:, axis], (1.0, kappa * a), strict=True):
             used = np.flatnonzero(places >= 0)
@@ -214,9 +217,13 @@ class Regression(Design):
             T[behind[used], places[moved[used]] - first] = factor * m0[used]
         on_bias, on_scale = state.weights[:, axis]
         if layout.start.size:
-            T[behind, width + 6 + lag] = (on_bias + kappa * a * on_scale)[moved]
+            T[behind, starts + lag] = (on_bias + kappa * a * on_scale)[moved]
+        across = kappa * self.gravity * (A[axis] @ state.tangents[p])
+        for k in range(n_leans):
+            T[k - n_leans, starts + 2 * (k - n_leans) : starts + 2 * (k - n_leans) + 2] = across
         T = T[layout.base]
-        scaled = np.concatenate(([1.0], on_scale, on_scale[moved] * m0))[layout.base]
+        scaled = np.concatenate(([1.0], on_scale, on_scale[moved] * m0, np.zeros(n_leans)))
+        scaled = scaled[layout.base]
         T[:, 0] = a * scaled
         turned = kappa * self.gravity * scaled
         for k, (row, source) in enumerate(_SKEW_ROWS):
@@ -232,6 +239,7 @@ class Regression(Design):
                 layout.skew,
                 layout.up[p],
                 layout.offset[p, axis : axis + 1],
+                layout.lean[p].ravel(),
                 layout.start[self._bags[p]],
             )
         )
@@ -273,8 +281,8 @@ class Regression(Design):
         """
         layout, n = posterior.layout, posterior.layout.n_unit
         filtered = posterior.whitened * prior.sigma
-        own = [layout.up[p], layout.offset[p], layout.start[self._bags[p]]]
-        local = np.concatenate(own)
+        starts = layout.start[self._bags[p]]
+        local = np.concatenate((layout.up[p], layout.offset[p], layout.lean[p].ravel(), starts))
         place = np.full(layout.n, -1)
         place[:n] = np.arange(n)
         place[local] = n + np.arange(len(local))
@@ -287,8 +295,8 @@ class Regression(Design):
             gradient[where] += g
         away = self.vector(posterior.state, layout)
         known = np.diag(self.precision(prior, layout)[local])
-        if len(own[2]):
-            known[-len(own[2]) :, -len(own[2]) :] += self.start_information / prior.start_share
+        if n_starts := len(starts):
+            known[-n_starts:, -n_starts:] += self.start_information / prior.start_share
         gradient[n:] -= known @ away[local]
         inner = np.linalg.solve(
             hessian[n:, n:] + known, np.column_stack((hessian[n:, :n], gradient[n:]))

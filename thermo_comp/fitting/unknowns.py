@@ -32,6 +32,7 @@ class Windows:
     start: derivative of each column by that state, shape (n, m)
     start_covariance: prior of the start states [K^2], shape (n_lags, n_lags)
     in_scale: which columns the scale may have as well as the bias, shape (m,)
+    lean: what a support may lean with, in units of their RMS, shape (n, k)
     """
 
     position: Ints
@@ -46,6 +47,7 @@ class Windows:
     start: Floats
     start_covariance: Floats
     in_scale: Bools
+    lean: Floats
 
     @property
     def n_positions(self) -> int:
@@ -85,6 +87,7 @@ class Prior:
     sigma: white noise of a typical window [m/s^2], shape (3,)
     rho: variance per second of the walk over that of the white noise, shape (3,)
     least_offset_sd: what offset_sd is at least, whatever the data say [m/s^2]
+    lean_sd: what the supports lean by [rad per RMS of what they lean with]
     start_share: of the run-time prior's variance of the start states, what these bags have
     known: takes the place of all widths of the unit's own parameters; these say only which columns
         take part
@@ -99,6 +102,7 @@ class Prior:
     sigma: Floats
     rho: Floats
     least_offset_sd: float = 0.0
+    lean_sd: float = 1e-7
     start_share: float = 1.0
     known: Known | None = None
 
@@ -106,7 +110,8 @@ class Prior:
 @dataclass(frozen=True)
 class State:
     """
-    The unknowns; weights are of columns in units of their RMS, in bias and scale, shape (2, 3, m).
+    The unknowns; weights are of columns in units of their RMS, in bias and scale, shape (2, 3, m);
+    lean is of each position, along its tangents, shape (n_positions, k, 2).
     """
 
     kappa: Floats
@@ -115,6 +120,7 @@ class State:
     skew: Floats
     up: Floats
     offset: Floats
+    lean: Floats
     start: Floats
 
     @cached_property
@@ -144,6 +150,7 @@ class Layout:
     skew: Ints
     up: Ints
     offset: Ints
+    lean: Ints
     start: Ints
     n_unit: int
     blocks: tuple[slice, ...]
@@ -188,5 +195,6 @@ def initial_state(
         skew=skew,
         up=up,
         offset=np.zeros((len(up), 3)),
+        lean=np.zeros((len(up), windows.lean.shape[1], 2)),
         start=np.zeros((n_bags, len(windows.start_covariance))),
     )

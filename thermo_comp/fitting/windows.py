@@ -169,6 +169,9 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     k, m = len(columns), len(groups) + len(columns)
     moved_at, end = 4 + k + m, 4 + k + m + len(columns)
     lag = [spec.lags.index(one.lag) if one.lag and one.kind != 'play' else -1 for one in columns]
+    # A support follows the chamber: some of it the board's temperature, some the case's.
+    lean = np.column_stack((rows[:, 0] - reference, rows[:, 3]))
+    size = np.sqrt(np.mean(lean**2, axis=0))
     data = Windows(
         position=position,
         bag=bag_of,
@@ -187,6 +190,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
             [not (group == SET and is_level) for group, is_level in sets.levels()]
             + [column.kind != 'play' for column in columns]
         ),
+        lean=lean[:, size > 0.0] / size[size > 0.0],
     )
     return ThermalWindows(
         model,
