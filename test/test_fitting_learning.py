@@ -12,7 +12,7 @@ from fitting_truth import GROUPS, MICRO, Truth, begin, prior_of, table_of, width
 
 from thermo_comp.fitting.learning import Learnt, _downweight, _without, group_worth, learn
 from thermo_comp.fitting.posterior import Regression
-from thermo_comp.fitting.unknowns import Known, Prior
+from thermo_comp.fitting.unknowns import Known, Prior, Windows
 from thermo_comp.fitting.windows import SET
 from thermo_comp.typing import Bools, Floats
 
@@ -292,3 +292,27 @@ def test_what_is_known_beforehand_is_believed_as_far_as_the_data_do(
     # The same data say it: the two differ by less than each is uncertain.
     sd = np.sqrt(told.posterior.variance[layout.weights[0, :, 0]])
     assert np.abs(curve - true).max() < 2.0 * sd.max()
+
+
+def test_what_supports_lean_by_comes_out_and_leaves_the_unit_alone() -> None:
+    truth = Truth(lean_sd=5e-6)
+    windows, up = table_of(truth, 12, np.random.default_rng(0), n_windows=60)
+    stiff = replace(windows, lean=windows.lean[:, :0])
+
+    def drift_left(table: Windows) -> tuple[Learnt, float]:
+        regression, state = begin(table, up)
+        found = learn(regression, state, wide(truth))
+        missed = found.posterior.state.weights[0] / regression.rms - truth.on_bias
+        return found, float(np.sqrt(np.mean((table.columns @ missed.T) ** 2)))
+
+    found, left = drift_left(windows)
+    # 12 positions x 2 angles x 2 columns: a sd of 10 %.
+    assert 0.7 < found.prior.lean_sd / truth.lean_sd < 1.3
+    # 5 urad lean 5 ug of any axis; the noise of 720 windows hides 0.1 ug of each weight.
+    assert left < 0.5 * MICRO
+    assert drift_left(stiff)[1] > 1.0 * MICRO
+
+
+def test_a_stiff_support_is_not_seen_leaning(calm: tuple[Regression, Learnt, Truth]) -> None:
+    regression, found, _ = calm
+    assert np.abs(regression.gravity * found.posterior.state.lean).max() < 0.01 * MICRO

@@ -39,19 +39,26 @@ def regress(
     tell: Callable[[float], None],
 ) -> tuple[Regression, Learnt]:
     """Learn from the windows what is known of the unit, with or without a prior."""
-    known = options.prior
-    regression = Regression(windows.data, options.gravity, start.scale)
+    known, data = options.prior, windows.data
+    # What the sets alone leave is a response, and no noise.
+    walks = windows.raw.shape[1] > 0
+    walks &= options.groups is None or not {CURVE, SET} >= {*options.groups}
+    has_one_direction = len(distinct_directions(up)) == 1
+    if not walks or has_one_direction:
+        # Nor is it a lean of the supports; in one attitude a lean may be any drift of the bias.
+        data = replace(data, lean=data.lean[:, :0])
+    regression = Regression(data, options.gravity, start.scale)
     inverse = np.asarray(np.linalg.inv(start.misalignment), dtype=np.float64)
     bias, skew = start.bias / start.scale, inverse[[1, 2, 2], [0, 0, 1]]
-    state = initial_state(windows.data, regression.n_bags, bias, np.ones(3), skew, up)
+    state = initial_state(data, regression.n_bags, bias, np.ones(3), skew, up)
     prior, knowns = _wide_prior(windows, start, up, options), []
     if known is not None:
         state = as_known(known, regression, state)
         *knowns, widest = known_of(known, regression, state, windows.model.sets, options)
-        prior = replace(prior, widths=windows.data.parts.astype(np.float64), known=widest)
+        prior = replace(prior, widths=data.parts.astype(np.float64), known=widest)
     forced = [
         options.model == 'golovach' or group == CURVE or group in options.forced
-        for group in windows.data.groups
+        for group in data.groups
     ]
     learnt = learn(
         regression,
@@ -59,10 +66,8 @@ def regress(
         prior,
         np.array(forced),
         lambda part: tell(0.7 + 0.25 * part),
-        held=(prior.widths[1] > 0.0) & (len(distinct_directions(up)) == 1),
-        # What the sets alone leave is a response, and no noise.
-        walks=windows.raw.shape[1] > 0
-        and (options.groups is None or not {CURVE, SET} >= {*options.groups}),
+        held=(prior.widths[1] > 0.0) & has_one_direction,
+        walks=walks,
         knowns=knowns,
     )
     return regression, learnt

@@ -65,9 +65,9 @@ def add_gyroscope(
     data = replace(
         windows.data,
         mean=windows.angular_rate,
+        # An angular rate has no scale to tell here, nor does it feel how a support leans.
         in_scale=np.zeros(len(windows.data.groups), dtype=bool),
-        # Nor does an angular rate feel how it leans.
-        lean=np.zeros((len(windows.temperature), 0)),
+        lean=windows.data.lean[:, :0],
     )
     one = np.ones(3)
     regression = Regression(data, 0.0, one)

@@ -109,9 +109,7 @@ def learn(
         kept = np.ones(prior.widths.shape, dtype=bool)
         silent = prior.widths > 0.0
     silent[1] |= held
-    # What a model without a response leaves is no lean of the supports.
-    leans = walks and regression.gravity > 0.0
-    settle = partial(_settle, regression, silent=silent, kept=kept, leans=leans)
+    settle = partial(_settle, regression, silent=silent, kept=kept)
     groups, reach = regression.windows.groups, regression.windows.reach
     alone = [np.isin(groups, names) & (reach <= _REACHES_S[0]) for names in _KINDS]
     # A curve of the dynamic set beside that of the static one comes last of all: where no soak
@@ -278,7 +276,6 @@ def _settle(
     *,
     silent: Bools,
     kept: Bools,
-    leans: bool,
     rounds: int = 40,
 ) -> tuple[Posterior, Prior]:
     """Repeat the fixed point; silent columns keep their width, kept ones may not leave, (2, m)."""
@@ -304,7 +301,7 @@ def _settle(
             if told_offset > 1.0:
                 change = max(change, float(np.abs(np.log(offset_sd / prior.offset_sd))))
         lean_sd = prior.lean_sd
-        if leans and (told_lean := float(posterior.told[layout.lean].sum())) > 0.3:
+        if (told_lean := float(posterior.told[layout.lean].sum())) > 0.3:
             lean_sd = max(np.sqrt(np.sum(state.lean**2) / told_lean), 1e-9)
         if (told_skew := float(posterior.told[layout.skew].sum())) > 1.0:
             skew_sd = max(np.sqrt(np.sum(state.skew**2) / told_skew), 1e-6)

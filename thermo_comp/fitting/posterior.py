@@ -219,8 +219,7 @@ class Regression(Design):
         if layout.start.size:
             T[behind, starts + lag] = (on_bias + kappa * a * on_scale)[moved]
         across = kappa * self.gravity * (A[axis] @ state.tangents[p])
-        for k in range(n_leans):
-            T[k - n_leans, starts + 2 * (k - n_leans) : starts + 2 * (k - n_leans) + 2] = across
+        T[len(T) - n_leans :, width + 6 : starts] = np.kron(np.eye(n_leans), across)
         T = T[layout.base]
         scaled = np.concatenate(([1.0], on_scale, on_scale[moved] * m0, np.zeros(n_leans)))
         scaled = scaled[layout.base]

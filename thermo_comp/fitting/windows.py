@@ -169,7 +169,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     k, m = len(columns), len(groups) + len(columns)
     moved_at, end = 4 + k + m, 4 + k + m + len(columns)
     lag = [spec.lags.index(one.lag) if one.lag and one.kind != 'play' else -1 for one in columns]
-    # A support follows the chamber: some of it the board's temperature, some the case's.
+    # A support follows the chamber: some of it the board, some what is around it.
     lean = np.column_stack((rows[:, 0] - reference, rows[:, 3]))
     size = np.sqrt(np.mean(lean**2, axis=0))
     data = Windows(
