@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from fitting_truth import GROUPS, MICRO, Truth, begin, prior_of, table_of, widths
 
-from thermo_comp.fitting.learning import Learnt, _downweight, _without, group_worth, learn
+from thermo_comp.fitting.learning import Learnt, _downweight, _without, learn
 from thermo_comp.fitting.posterior import Regression
 from thermo_comp.fitting.unknowns import Known, Prior, Windows
 from thermo_comp.fitting.windows import SET
+from thermo_comp.fitting.worth import group_worth
 from thermo_comp.typing import Bools, Floats
 
 ALL = ('curve', 'board', 'idle')
@@ -316,3 +317,19 @@ def test_what_supports_lean_by_comes_out_and_leaves_the_unit_alone() -> None:
 def test_a_stiff_support_is_not_seen_leaning(calm: tuple[Regression, Learnt, Truth]) -> None:
     regression, found, _ = calm
     assert np.abs(regression.gravity * found.posterior.state.lean).max() < 0.01 * MICRO
+
+
+@pytest.mark.parametrize('seed', [3, 4, 5])
+def test_no_better_choice_is_near_the_truth(seed: int) -> None:
+    # Bags that began far from rest: each start is a product with the weights that are to be found.
+    truth = Truth(start_sd=1.0)
+    regression, found = learnt_of(truth, 12, seed)
+    needed = np.array(GROUPS) != 'idle'
+    prior = replace(wide(truth), widths=np.where(needed, wide(truth).widths, 0.0))
+    state = replace(
+        found.posterior.state,
+        weights=truth.weights * regression.rms,
+        start=np.zeros_like(found.posterior.state.start),
+    )
+    told = learn(regression, state, prior, forced=True)
+    assert found.posterior.log_evidence > told.posterior.log_evidence - 1.0

@@ -198,7 +198,8 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     if asks and learnt.has_sets:
         # Only the sets feel when the regime closes: with the case, or with the board too.
         others = thermal_windows(bags, replace(model, detector=replace(detector, closes='case')))
-        again = Regression(others.data, options.gravity, start.scale)
+        data = replace(others.data, lean=regression.windows.lean)
+        again = Regression(data, options.gravity, start.scale)
         again.reweight(regression.weight)
         with_sets = learnt.prior.widths.copy()
         with_sets[0, np.array(others.data.groups) == SET] += COLUMN_BIAS_SD

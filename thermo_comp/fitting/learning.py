@@ -6,15 +6,13 @@ Owns what the data teach the prior: a width for each column, both noises, what e
 Each column has a width of its own, shared by the axes, bias and scale apart. Widths and white
 noise follow MacKay's fixed point (``alpha = gamma / sum w^2``); a column that the data do not need
 gets an ever smaller width and leaves. The walk's share is found by a search along the log evidence
-of each axis. At the end a column or group stays if the log evidence would fall without it
-(Savage-Dickey ratio).
+of each axis. At the end a column stays if the log evidence would fall without it; then all that
+was asked for is asked once more from there, and the better of the two is kept.
 
 References
 ----------
 .. [1] D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992), eqs 4.8 to 4.10.
 .. [2] M. E. Tipping, Sparse Bayesian learning and the relevance vector machine, JMLR 1 (2001).
-.. [3] J. M. Dickey, The weighted likelihood ratio, linear hypotheses on normal location
-   parameters, Annals of Mathematical Statistics 42 (1971).
 
 """
 
@@ -23,16 +21,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ..typing import Bools, Floats, Ints
+from ..typing import Bools, Floats
 from ..unit.calibration import GroupEvidence
 from .posterior import Posterior, Regression
 from .unknowns import Known, Prior, State
 from .windows import SET
+from .worth import earned, group_worth, told_of
 
 # Of the three weights of a column, what the data must tell under a wide prior to be asked.
 _SILENT = 0.05
@@ -102,7 +100,7 @@ def learn(
     allowed = prior
     asks = prior.known is None and not kept.all()
     if asks:
-        silent = told_of(regression.solve(state, prior)) < _SILENT
+        silent = told_of(regression.solve(state, prior, n_steps=2)) < _SILENT
         silent &= prior.widths > 0.0
     else:
         # Nothing is asked of columns whose weights are known beforehand, nor where all must stay.
@@ -110,6 +108,13 @@ def learn(
         silent = prior.widths > 0.0
     silent[1] |= held
     settle = partial(_settle, regression, silent=silent, kept=kept)
+
+    def finish(posterior: Posterior, prior: Prior) -> tuple[Posterior, Prior]:
+        while (idle := _idle(regression, posterior, prior, kept)).any():
+            prior = _without(prior, idle)
+            posterior, prior = settle(posterior.state, prior, rounds=6)
+        return posterior, prior
+
     groups, reach = regression.windows.groups, regression.windows.reach
     alone = [np.isin(groups, names) & (reach <= _REACHES_S[0]) for names in _KINDS]
     # A curve of the dynamic set beside that of the static one comes last of all: where no soak
@@ -151,9 +156,12 @@ def learn(
         best = int(np.argmax([one.log_evidence for one in tried]))
         prior = replace(prior, known=knowns[best])
         posterior, prior = settle(tried[best].state, prior)
-    while (idle := _idle(regression, posterior, prior, kept)).any():
-        prior = _without(prior, idle)
-        posterior, prior = settle(posterior.state, prior, rounds=6)
+    posterior, prior = finish(posterior, prior)
+    if asks:
+        # Widths settle near where they began, with starts and attitudes of few columns: once more.
+        wide = _without(replace(prior, widths=allowed.widths), ~asked & ~kept)
+        again = finish(*settle(posterior.state, wide))
+        posterior, prior = max((posterior, prior), again, key=lambda one: one[0].log_evidence)
     tell(0.9)
     if walks:
         prior = _walk(regression, posterior, prior)
@@ -166,56 +174,6 @@ def learn(
     worth = group_worth(regression, posterior, prior)
     has_sets |= any(one.group == SET for one in worth)
     return Learnt(posterior, prior, worth, claim, has_sets)
-
-
-def told_of(posterior: Posterior) -> Floats:
-    """Effective parameters of each column in bias and scale, of all axes, shape (2, m)."""
-    return np.asarray(np.append(posterior.told, 0.0)[posterior.layout.weights].sum(axis=1))
-
-
-def earned(mode: Floats, covariance: Floats, places: Ints, sd: float | Floats) -> float:
-    """How much the log evidence falls when some weights are held at 0 (Savage-Dickey)."""
-    mode, covariance = mode[places], covariance[np.ix_(places, places)]
-    root = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
-    values = np.maximum(values, 1e-12)
-    along = vectors.T @ (mode / root)
-    determinant = float(np.log(values).sum() + 2.0 * np.log(root).sum())
-    known = float(np.sum(np.log(np.broadcast_to(sd, mode.shape))))
-    return 0.5 * float(np.sum(along**2 / values)) + 0.5 * determinant - known
-
-
-def group_worth(
-    regression: Regression, posterior: Posterior, prior: Prior
-) -> tuple[GroupEvidence, ...]:
-    """Say what each group explains, spends and earns."""
-    names = np.array(regression.windows.groups)
-    columns = regression.windows.columns / regression.rms
-    mode = regression.vector(posterior.state, posterior.layout)[: len(posterior.covariance)]
-    force = regression.gravity * posterior.state.up[regression.windows.position]
-    told = told_of(posterior)
-    parts: tuple[Literal['bias', 'scale'], ...] = ('bias', 'scale')
-    result = []
-    for k, part in enumerate(parts):
-        for group in dict.fromkeys(regression.windows.groups):
-            used = (names == group) & (prior.widths[k] > 0.0)
-            if not used.any():
-                continue
-            added = columns[:, used] @ posterior.state.weights[k][:, used].T
-            if part == 'scale':
-                added = added * force
-            places, sd = posterior.layout.weights[k][:, used], prior.widths[k][used]
-            result.append(
-                GroupEvidence(
-                    group,
-                    part,
-                    float(np.sqrt(np.mean(added**2))),
-                    max(float(told[k][used].sum()), 0.0),
-                    earned(mode, posterior.covariance, places.ravel(), np.tile(sd, 3)),
-                    tuple(sd.tolist()),
-                )
-            )
-    return tuple(result)
 
 
 def _without(prior: Prior, gone: Bools) -> Prior:

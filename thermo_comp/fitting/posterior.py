@@ -40,14 +40,17 @@ _JITTER = 1e-13
 _START_JITTER = 1e-10
 # A step that promises less than this part of a noise variance per reading may be the last ...
 _FAR = 0.1
-# ... of no more than so many. One that overshoots is tried again, up to so many times, with bias
-# and scale [g], attitudes [rad] and starts [K] held where they are, at first to these sds.
-_MOST_STEPS, _MOST_TRIES, _BENDS, _BENDS_K = 6, 6, 1e-3, 0.1
+# ... of no more than so many. Of one that goes uphill such shares are tried, down to this one,
+# the Hessian of what bends the way so much stiffer while the rest follows.
+_MOST_STEPS, _FALL, _LEAST_SHARE, _HELD = 6, 0.25, 1e-3, 1e9
 # A step that promises less log evidence than this goes where the next look would send it.
 _NEAR = 30.0
 # Parts of their widths in which columns that take no part are tried.
 _PARTS = 10.0 ** np.arange(-4.0, 1.01, 0.25)
 _SKEW_ROWS = ((1, 0), (2, 0), (2, 1))
+
+# A state, its residuals filtered and whitened, the prior's pull, minus twice its log density.
+_Look = tuple[State, Floats, Floats, Floats, float]
 
 
 class Factor:
@@ -135,25 +138,22 @@ class Absent:
 
     def gain(self, widths: Floats, columns: Bools) -> float:
         """
-        Return what columns, shape (m,), would add to the log evidence in one part of their widths:
+        Return what columns, shape (m,), would add to the log evidence, all together or the best of
+        them alone (one guess of so many), in one part of their widths:
         ``(q (1 + S)^-1 q - log det(1 + S)) / 2`` with S and q in units of these.
         """
         wanted = (self.places >= 0) & columns
+        singles = [self._gain(widths, wanted & one) for one in np.diag(columns)[columns]]
+        if not singles:
+            return 0.0
+        return max(self._gain(widths, wanted), max(singles) - float(np.log(len(singles))))
+
+    def _gain(self, widths: Floats, wanted: Bools) -> float:
         at, width = self.places[wanted], np.broadcast_to(widths[:, None], wanted.shape)[wanted]
         S, along = np.linalg.eigh(self.information[np.ix_(at, at)] * np.outer(width, width))
         square = _PARTS[:, None] ** 2
         S, q2 = square * np.maximum(S, 0.0), square * (along.T @ (width * self.pull[at])) ** 2
         return 0.5 * float((q2 / (1.0 + S) - np.log1p(S)).sum(axis=1).max(initial=0.0))
-
-
-@dataclass(frozen=True)
-class _Equations:
-    """Of one linearisation: Hessian, gradient, whitened residuals, minus twice log likelihood."""
-
-    hessian: Floats
-    gradient: Floats
-    white: Floats
-    size: float
 
 
 class Regression(Design):
@@ -171,9 +171,10 @@ class Regression(Design):
         white = filtered / prior.sigma
         return filtered, white, size + float(np.sum(white * white))
 
-    def _equations(self, state: State, prior: Prior, layout: Layout) -> _Equations:
-        """Hessian and gradient of minus the log likelihood, and the residuals."""
-        filtered, white, size = self.whiten(state, prior)
+    def _equations(
+        self, state: State, prior: Prior, layout: Layout, filtered: Floats
+    ) -> tuple[Floats, Floats]:
+        """Hessian and gradient of minus the log likelihood, of what `whiten` gave."""
         hessian = np.zeros((layout.n, layout.n))
         gradient = np.zeros(layout.n)
         width = layout.axis.shape[1]
@@ -190,7 +191,7 @@ class Regression(Design):
             hessian[np.ix_(layout.skew, np.arange(own.start, own.stop))] = hessian[
                 own, layout.skew
             ].T
-        return _Equations(hessian, gradient, white, size)
+        return hessian, gradient
 
     def _block(
         self, state: State, prior: Prior, layout: Layout, p: int, axis: int, filtered: Floats
@@ -248,13 +249,14 @@ class Regression(Design):
         """Ask the data for columns that take no part; `state` is the mode under `prior`."""
         everything = replace(prior, widths=np.maximum(prior.widths, allowed.widths))
         layout = self.layout(everything.widths > 0.0)
-        equations = self._equations(state, everything, layout)
-        hessian, precision = equations.hessian, self.precision(everything, layout)
+        filtered, *_ = self.whiten(state, everything)
+        hessian, pull = self._equations(state, everything, layout, filtered)
+        precision = self.precision(everything, layout)
         places = np.where(prior.widths[:, None] == 0.0, layout.weights, -1)
         is_absent = np.isin(np.arange(layout.n), places)
         absent, present = np.flatnonzero(is_absent), np.flatnonzero(~is_absent)
         away = self.vector(state, layout) - self.prior_mean(everything, layout)
-        gradient = equations.gradient - precision * away
+        gradient = pull - precision * away
         information = hessian[np.ix_(absent, absent)]
         hessian[np.diag_indices(layout.n)] += precision
         for where, matrix in self._inform(prior, layout):
@@ -331,24 +333,28 @@ class Regression(Design):
         for where, matrix in matrices:
             information[where, where] += matrix
 
-        def look(state: State) -> tuple[State, _Equations, Floats, float]:
-            equations = self._equations(state, prior, layout)
+        def look(state: State) -> _Look:
+            filtered, white, size = self.whiten(state, prior)
             away = self.vector(state, layout) - mean
             pull = information @ away
-            return state, equations, equations.gradient - pull, equations.size + float(away @ pull)
+            return state, filtered, white, pull, size + float(away @ pull)
 
-        # Where bags hardly tell bias, scale and attitude apart, these bend the way down.
-        stiff, damping = np.zeros(layout.n), 0.0
-        for places in (layout.kappa, layout.skew, layout.up):
-            stiff[places] = _BENDS**-2
-        stiff[layout.start] = _BENDS_K**-2
-        stiff[layout.bias] = (_BENDS * (self.gravity or 1.0)) ** -2
+        def equations(at: _Look) -> tuple[Floats, Floats]:
+            hessian, gradient = self._equations(at[0], prior, layout, at[1])
+            return hessian + information, gradient - at[3]
+
+        # All but these is linear: wherever these go, the rest follows at once.
+        bends = np.zeros(layout.n, dtype=bool)
+        for places in (layout.kappa, layout.skew, layout.up, layout.start):
+            bends[places] = True
         # What takes no part any more is 0.
-        state, equations, gradient, size = look(self._moved(state, np.zeros(layout.n), layout))
+        found = look(self._moved(state, np.zeros(layout.n), layout))
         far = _FAR * self.windows.mean.size
         last = max(n_steps, _MOST_STEPS) - 1 if n_steps != 1 else 0
         for k in range(last + 1):
-            factor = Factor(equations.hessian + information, layout)
+            state, _, white, _, size = found
+            hessian, gradient = equations(found)
+            factor = Factor(hessian, layout)
             step = factor.solve(gradient)
             promised = 0.5 * float(step @ gradient)
             if is_short := not n_steps and promised < _NEAR:
@@ -356,18 +362,15 @@ class Regression(Design):
             is_enough = k == last or (k >= (n_steps or 2) - 1 and promised < far)
             if promised < tolerance or is_short or is_enough:
                 break
-            for _ in range(_MOST_TRIES):
-                if damping:
-                    damped = information + np.diag(damping * stiff)
-                    step = Factor(equations.hessian + damped, layout).solve(gradient)
-                found = look(self._moved(state, step, layout))
-                if found[-1] < size or promised < far:
-                    break
-                damping = max(10.0 * damping, 1.0)
-            else:
+            found, share = look(self._moved(state, step, layout)), 1.0
+            while found[-1] >= size and share > _LEAST_SHARE:
+                found = look(self._moved(state, np.where(bends, share * step, 0.0), layout))
+                held, pull = equations(found)
+                held[np.diag_indices(layout.n)] *= np.where(bends, _HELD, 1.0)
+                follow = Factor(held, layout).solve(pull)
+                found, share = look(self._moved(found[0], follow, layout)), _FALL * share
+            if found[-1] >= size:
                 break
-            damping = 0.01 * damping if damping > 0.1 else 0.0
-            state, equations, gradient, size = found
         determinant = float(np.log(precision[precision > 0.0]).sum())
         determinant += sum(float(np.linalg.slogdet(matrix)[1]) for _, matrix in matrices)
         evidence = -0.5 * (size - 2.0 * promised + factor.log_determinant - determinant)
@@ -380,4 +383,4 @@ class Regression(Design):
             at = slice(-len(matrix), None)
             own = (covariance, *blocks)[ends.index(where.stop)][at, at]
             told[where] = 1.0 - np.einsum('ij,ji->i', matrix, own)
-        return Posterior(state, layout, told, covariance, variance, equations.white, evidence)
+        return Posterior(state, layout, told, covariance, variance, white, evidence)
