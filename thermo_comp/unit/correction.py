@@ -145,6 +145,10 @@ class Correction:
         self._W = weights.reshape(-1, 6).T[:, :, np.newaxis]
         self._is_present = (self._W[:3] != 0.0) | (self._W[3:] != 0.0)
         self._find_felt()
+        slopes = self.curves.slopes(np.linspace(*self._span, _GAP_TEMPERATURES))
+        of_bias = np.arange(6)[:, np.newaxis] < 3
+        bends = slopes.std(axis=2, keepdims=True)
+        self._bends = np.concatenate((bends * of_bias, bends * ~of_bias))
         rounding = ROUNDING_VARIANCE if calibration.unit.input == 'counts' else 0.0
         self.noise = tuple(
             density * density / calibration.unit.cycle_time_s + rounding / (k * k)
@@ -171,7 +175,10 @@ class Correction:
         self._felt, self._felt_starts = np.unique(pair[self._felt_columns], return_index=True)
         # ``T - L`` rises with T, ``g = T_s - T`` falls; the lag of a gradient does neither.
         signs = [-1.0 for _ in self.memory.sensors]
-        signs += [float(name == BOARD_INPUT) for name, _ in self.memory.lags]
+        is_of_board = [name == BOARD_INPUT for name, _ in self.memory.lags]
+        signs += map(float, is_of_board)
+        first = GRADIENT + 2 * len(self.memory.sensors)
+        self._lagged = first + 2 * np.flatnonzero(is_of_board)
         self._signs = np.array(signs)[:, np.newaxis, np.newaxis]
 
     def bias_scale(self, states: Floats) -> Floats:
@@ -287,18 +294,27 @@ class Correction:
         excess, _, relative = self.curves.excess(states)
         outside = rest * relative[0] + weight * relative[1]
         shares = np.array([rest + unknown * weight, weight + unknown * rest])
-        variances = (shares * (states[VAR_BOARD] + excess * excess), states[self._felt_variances])
+        variances = (shares * states[VAR_BOARD], states[self._felt_variances])
         felt = self.felt(states, factors[0])
         # The response hangs on the board's temperature through the powers of t and what is felt.
         on_board = self._weigh(raw * factors[1], in_order(self._signs * felt, 0))
-        slopes = self.curves.slopes(board) + on_board
-        v = self._spread(np.concatenate(variances), np.concatenate((slopes, felt)))
+        slopes = self.curves.slopes(board)
+        v = self._spread(np.concatenate(variances), np.concatenate((slopes + on_board, felt)))
         v[:, 0] += (shares[:, np.newaxis] * self.curves.residuals).sum(axis=0)
         v += slow
         is_beyond = bool(over.any())
-        if is_beyond or outside.any():
+        # A part that lags the board may be outside when the board is back.
+        parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
+        parts_out = np.abs(parts - hold(parts, *self._span)).max(axis=0)
+        if is_beyond or outside.any() or parts_out.any():
             # Far outside, the residual of the fit says nothing any more: it grows with the excess.
             own = np.where(self._is_present, self.table.excess(raw), 0.0).max(axis=1, initial=0.0)
+            # The lags were there, too, or will be: what is cut off follows the curves alone. Of
+            # parts outside, and where bias and scale cancel in the slope, its changes remain.
+            v += self._spread(shares * excess * excess, slopes)
+            bent = shares * np.maximum(excess * excess, parts_out * parts_out)
+            bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
+            v += self._spread(np.concatenate((bent, bent)), bends)
             v *= (1.0 + (outside + own) ** 2)[:, np.newaxis]
         doubt = unknown + weight * rest + outside * outside
         if not (is_beyond or doubt.any()):
@@ -308,8 +324,8 @@ class Correction:
                 self.table.factors(board, np.full_like(weight, of))[0] for of in (0.0, 1.0)
             )
             gap = self._weigh(held * (of_dynamic - of_static), gap)
-        cut_off = self._weigh(over * factors[0], np.zeros_like(gap))
-        more = self._spread(np.array([doubt, np.ones_like(doubt)]), np.array([gap, cut_off]))
+        held_back = self._weigh(over * factors[0], np.zeros_like(gap))
+        more = self._spread(np.array([doubt, np.ones_like(doubt)]), np.array([gap, held_back]))
         return np.asarray(v + more)
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
