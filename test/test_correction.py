@@ -27,6 +27,7 @@ from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.memory import start_covariance
+from thermo_comp.thermal.state import BOARD, Layout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.calibration import Axes, AxisReference, ResponseTerm, parameter_layout
 from thermo_comp.unit.columns import bank
@@ -327,3 +328,53 @@ def test_the_state_at_the_edge_of_a_column_is_held_and_what_is_cut_off_is_paid_f
     excess = correction.excess(outside, is_dynamic=False)
     assert excess.relative == pytest.approx(2.0)
     assert excess[:3] == (0.0, 0.0, 2.0)
+
+
+def sd_at(unit, board, behind=0.0, force=0.0):
+    """Give the claimed sd of the x axis in a soak, without the noise of a message [m/s^2]."""
+    correction = Correction(unit)
+    layout = Layout(correction.memory)
+    state = [0.0] * layout.width
+    state[BOARD] = board
+    for place in layout.lags.values():
+        state[place] = behind
+    line = correction.line(tuple(state), tuple(state), np.zeros(9), 0.0)
+    a, b, c = line[12:15]
+    return math.sqrt(a - correction.noise[0] + b * force + c * force**2)
+
+
+def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
+    # b = 0.5 L: the curve's slope and that of its lag cancel for an error of the thermometer, not
+    # for 6 K that the parts have, too.
+    bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
+    unit = calibration(
+        static=regime_set(bias), dynamic=regime_set(bias),
+        response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
+    )  # fmt: skip
+    assert sd_at(unit, 35.0) == pytest.approx(1e-6, rel=1e-6)
+    # Times what is added far outside, 6 K of half a range of 15 K.
+    far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
+    assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
+
+
+def test_beyond_the_range_slopes_that_cancel_are_no_knowledge():
+    # 0.5 + 0.02 t counts/K: at the upper edge 0.8, which a force of 10 m/s^2 takes away.
+    bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
+    unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
+    # Over 30 K the slope changes by 0.02 * 30 / sqrt(12), at few temperatures a little more.
+    bends = 0.6 / math.sqrt(12.0)
+    far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
+    assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
+    assert sd_at(unit, 41.0) == pytest.approx(math.hypot(bends, 0.8) * 6.0 / 300.0 * far, rel=0.05)
+
+
+def test_a_part_that_is_still_outside_is_paid_for():
+    bent = axis_set((0.0, 0.5, 0.01), residual_sd_m_s2=1e-6)
+    unit = calibration(
+        static=regime_set(bent), dynamic=regime_set(bent),
+        response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
+    )  # fmt: skip
+    # The board is back at 33 degC, the part is at 34, then still at 41.
+    assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
+    bends = 0.6 / math.sqrt(12.0)
+    assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)

@@ -218,7 +218,7 @@ def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[Floats, Fl
     shortest = min(
         (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1), default=1.0
     )
-    step_s = max(shortest / 2.0, 0.1)
+    step_s = max(shortest / 5.0, 0.1)
     start_s, states, is_known = thermal_states(bag, tracker, step_s)
     grid = np.asarray(start_s + step_s * np.arange(len(states)), dtype=np.float64)
     # The memory is the tracker's, on the grid at once: reading by reading it takes longer than all

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..thermal.memory import BOARD_INPUT, MemorySpec
-from ..thermal.state import BOARD, GRADIENT, RATE, UNKNOWN, VAR_BOARD, VAR_GRADIENT, WEIGHT
+from ..thermal.state import BOARD, GRADIENT, RATE, UNKNOWN, VAR_BOARD, VAR_GRADIENT, WEIGHT, Layout
 from ..typing import Floats
 from .calibration import Calibration
 from .columns import ColumnTable, memory_of
@@ -175,10 +175,9 @@ class Correction:
         self._felt, self._felt_starts = np.unique(pair[self._felt_columns], return_index=True)
         # ``T - L`` rises with T, ``g = T_s - T`` falls; the lag of a gradient does neither.
         signs = [-1.0 for _ in self.memory.sensors]
-        is_of_board = [name == BOARD_INPUT for name, _ in self.memory.lags]
-        signs += map(float, is_of_board)
-        first = GRADIENT + 2 * len(self.memory.sensors)
-        self._lagged = first + 2 * np.flatnonzero(is_of_board)
+        signs += [float(name == BOARD_INPUT) for name, _ in self.memory.lags]
+        lags = Layout(self.memory).lags
+        self._lagged = [at for (name, _), at in lags.items() if name == BOARD_INPUT]
         self._signs = np.array(signs)[:, np.newaxis, np.newaxis]
 
     def bias_scale(self, states: Floats) -> Floats:
