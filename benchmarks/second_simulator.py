@@ -60,6 +60,15 @@ PLANS: dict[str, tuple[str, Program, float, str, list[Program]]] = {
         ],
     ),
 }  # fmt: skip
+# What was fitted from 5 to 35 degC goes beyond by 5 to 20 K, and comes back.
+PLANS['beyond'] = (
+    *PLANS['mild'][:3],
+    'HB',
+    [
+        (20, 30, [(high, 0.5, 60), (low, 0.5, 60), (20, 0.5, 30)])
+        for low, high in ((0, 40), (-5, 45), (-15, 55))
+    ],
+)
 KINDS = ('own', 'products', 'hyst', 'hystm', 'even', 'convection', 'slow', 'plain')
 
 
@@ -279,7 +288,7 @@ def main() -> int:
     )
     names = {'type': lambda text: text.split(',')}
     parser.add_argument('--kinds', **names, default=KINDS, help='some kinds only')
-    parser.add_argument('--plans', **names, default=tuple(PLANS), help='wide, mild')
+    parser.add_argument('--plans', **names, default=('wide', 'mild'), help='beyond, too')
     parser.add_argument('--seeds', type=int, default=1, help='units per kind')
     parser.add_argument('--model', default='response', help='or golovach')
     options = parser.parse_args()

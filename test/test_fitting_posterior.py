@@ -14,7 +14,7 @@ from fitting_truth import GRAVITY, GROUPS, MICRO, NOMINAL, START, Truth, begin, 
 from scipy.optimize import least_squares
 
 from thermo_comp.errors import FitError
-from thermo_comp.fitting.posterior import Absent, Posterior, Regression
+from thermo_comp.fitting.posterior import Posterior, Regression
 from thermo_comp.fitting.start import constant_calibration, position_means
 from thermo_comp.fitting.unknowns import Prior, State, Windows, inverse_misalignment, tangent_basis
 from thermo_comp.typing import Floats
@@ -281,23 +281,6 @@ def test_no_step_goes_uphill(seed: int) -> None:
         sizes.append(0.5 * float(np.sum(dense.residual(np.zeros(dense.n)) ** 2)))
     # But for what a step brings that promises less than the tolerance.
     assert np.diff(sizes).max() < 1e-3
-
-
-def test_one_column_alone_may_earn_what_many_spend(rng: np.random.Generator) -> None:
-    # Forty columns of unit information, one of which the data pull by five sds.
-    q = rng.standard_normal(3 * 40) * 0.1
-    q[:3] = 5.0
-    # Of the scale none is asked.
-    places = np.stack((np.arange(3 * 40).reshape(40, 3).T, np.full((3, 40), -1)))
-    absent = Absent(100.0 * np.eye(3 * 40), 10.0 * q, places)
-    widths = np.ones((2, 40))
-    # In closed form, at the width where it is most.
-    square = 100.0 * 10.0 ** np.arange(-8.0, 2.01, 0.5)
-    each = 1.5 * float((25.0 * square / (1.0 + square) - np.log1p(square)).max())
-    assert absent.gain(widths, np.arange(40) == 0) == pytest.approx(each)
-    # The best of forty is one guess of forty.
-    many = absent.gain(widths, np.ones(40, dtype=bool))
-    assert many == pytest.approx(each - np.log(40.0))
 
 
 def test_what_takes_no_part_any_more_is_gone(solved: tuple[Regression, Prior, Posterior]) -> None:

@@ -138,17 +138,10 @@ class Absent:
 
     def gain(self, widths: Floats, columns: Bools) -> float:
         """
-        Return what columns, shape (m,), would add to the log evidence, all together or the best of
-        them alone (one guess of so many), in one part of their widths:
+        Return what columns, shape (m,), would add to the log evidence in one part of their widths:
         ``(q (1 + S)^-1 q - log det(1 + S)) / 2`` with S and q in units of these.
         """
         wanted = (self.places >= 0) & columns
-        singles = [self._gain(widths, wanted & one) for one in np.diag(columns)[columns]]
-        if not singles:
-            return 0.0
-        return max(self._gain(widths, wanted), max(singles) - float(np.log(len(singles))))
-
-    def _gain(self, widths: Floats, wanted: Bools) -> float:
         at, width = self.places[wanted], np.broadcast_to(widths[:, None], wanted.shape)[wanted]
         S, along = np.linalg.eigh(self.information[np.ix_(at, at)] * np.outer(width, width))
         square = _PARTS[:, None] ** 2
