@@ -124,6 +124,7 @@ def learn(
     prior = _without(allowed, ~asked & ~kept)
     posterior = regression.solve(state, prior)
     prior = replace(prior, sigma=_sigma(posterior, prior))
+    has_grown = False
     for k, more in enumerate((alone, *([one] for one in rest)) if asks else (alone, alone)):
         gains = [0.0]
         if asks:
@@ -133,6 +134,7 @@ def learn(
             has_sets = gains[-1] > max(_MORE_EARNED, _LIKE_SETS * max(gains))
         if is_more := max(gains) > _MORE_EARNED:
             asked = asked | more[int(np.argmax(gains))]
+            has_grown = k > 0
         if is_more or k == 0:
             prior = _without(allowed, ~asked & ~kept)
             # Before knocks have lost their weight nothing may leave: beside them nothing is seen.
@@ -157,7 +159,7 @@ def learn(
         prior = replace(prior, known=knowns[best])
         posterior, prior = settle(tried[best].state, prior)
     posterior, prior = finish(posterior, prior)
-    if asks:
+    if has_grown:
         # Widths settle near where they began, with starts and attitudes of few columns: once more.
         wide = _without(replace(prior, widths=allowed.widths), ~asked & ~kept)
         again = finish(*settle(posterior.state, wide))
