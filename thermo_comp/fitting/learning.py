@@ -100,7 +100,8 @@ def learn(
     allowed = prior
     asks = prior.known is None and not kept.all()
     if asks:
-        silent = told_of(regression.solve(state, prior, n_steps=2)) < _SILENT
+        # Looked at from where it begins: told by what the fit begins to believe, it is chance.
+        silent = told_of(regression.solve(state, prior, n_steps=1)) < _SILENT
         silent &= prior.widths > 0.0
     else:
         # Nothing is asked of columns whose weights are known beforehand, nor where all must stay.
