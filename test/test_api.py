@@ -15,6 +15,7 @@ from readme_helpers import FENCES
 from test_layers import loaded_after
 
 import thermo_comp as tc
+from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.replay import replay
@@ -242,6 +243,8 @@ def test_a_bag_that_is_given_twice_is_refused(root: Path, tmp_path: Path) -> Non
     copy = shutil.copy(bag, tmp_path / 'copy.mcap')
     with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: is .*01\.mcap once more'):
         tc.fit([bag, copy], gravity=9.80665)
+    with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: is .*01\.mcap once more'):
+        open_bags([bag, copy])
 
 
 def test_arrays_that_cannot_be_fitted_are_refused() -> None:

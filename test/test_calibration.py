@@ -136,8 +136,10 @@ TEXT = dump_calibration(RICH)
             'x: {scale_factor: 300.0',
             'x: {scale_factor: 0.0',
             'axes.x.scale_factor',
-            'must not be 0',
+            r'must be 1e-09 to 1e\+09',
         ),
+        ('{scale_factor: 300.0', '{scale_factor: 1.0e-300', 'axes.x.scale_factor', 'got 1e-300'),
+        ('0, bias: 5.0}', '0, bias: 1.0e+12}', 'axes.x.bias', 'within twice .*, 65534'),
         (
             'coefficients: [0.0, 0.3]',
             'coefficients: [0.1, 0.3]',

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from builders import rich_calibration
 from conftest import Cli, parsed
 
@@ -326,3 +327,11 @@ class TestCells:
         lines = list(output.aligned(('n', 'name'), [(1, 'a'), (10, 'bc')]))
         assert lines == [' n  name', ' 1  a', '10  bc']
         assert list(output.aligned(('n',), [], 'title')) == ['title', 'n']
+
+
+def test_what_sets_the_exit_code_is_said_to_the_quiet(capsys) -> None:
+    out = output.Output(quiet=True)
+    out.told([('01.mcap', 'the only topic', 'cut off after 3 s')])
+    with pytest.raises(typer.Exit):
+        out.end()
+    assert capsys.readouterr() == ('', 'thermo_comp: 01.mcap: cut off after 3 s\n')

@@ -214,6 +214,24 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic: Calibration) -> None:
     assert numbers(plain.text, '\t')['TC_A0_X1_0'] == numbers(level.text, '\t')['TC_A0_X1_0']
 
 
+def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic: Calibration) -> None:
+    # WHY: PX4 subtracts from m/s^2 as they are read; 0.5 % of the scale are 5 mg at rest.
+    axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
+    calibration = replace(cubic, axes=axes)
+    plain = export_calibration(calibration, 'px4')
+    for name, value in numbers(export_calibration(cubic, 'px4').text, '\t').items():
+        assert numbers(plain.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
+    assert any('constant scale is lost' in n and '5000 ppm' in n for n in plain.notes)
+    up = (0.6, 0.0, 0.8)
+    level = numbers(export_calibration(calibration, 'px4', up=up).text, '\t')
+    for axis in range(3):
+        # At the attitude and the reference nothing but gravity is left of a reading.
+        d = 20.0 - level['TC_A0_TREF']
+        reading = 0.995 * 9.81 * up[axis] + (0.1, -0.2, 0.3)[axis]
+        offset = sum(level[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))
+        assert reading - offset == pytest.approx(9.81 * up[axis], abs=1e-7)
+
+
 def test_what_is_lost_is_said(cubic: Calibration) -> None:
     spline = CubicSpline((-15.0, 0.0, 10.0, 25.0), (0.01, 0.0, 0.02, -0.01))
     static = replace(cubic.static, x=AxisSet(spline, ONE))

@@ -222,7 +222,21 @@ def test_prior_without_claim_is_refused():
     prior = replace(fitted(1).calibration, posterior=None)
     few = [source(record) for record in test_of(9, 0, 6)]
     with pytest.raises(FitError, match='no covariance'):
-        fit(few, replace(OPTIONS, serial='unit-9', prior=prior))
+        fit(few, replace(OPTIONS, serial='unit-1', prior=prior))
+
+
+def test_another_units_calibration_is_no_prior():
+    # WHY: a sibling's nine constants are sure of themselves, and were taken for this unit's.
+    all_twelve = [source(record) for record in test_of(9, 0, 12)]
+    options = replace(OPTIONS, serial='unit-9', prior=fitted(1).calibration)
+    with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit-9'):
+        fit(all_twelve, options)
+    allowed = fit(all_twelve, replace(options, allow=('prior',)))
+    said = [one.message for one in allowed.findings if one.name == 'prior']
+    assert any('allowed: ' in one for one in said)
+    assert any('bags contradict the prior' in one for one in said)
+    # What is blind to the regime cannot be told in the two curves of a prior.
+    assert not allowed.residuals[-1].one_set.n
 
 
 def test_prior_of_the_other_input_is_refused():

@@ -288,6 +288,14 @@ def test_split_files_follow_each_other(tmp_path: Path) -> None:
         )
 
 
+def test_a_folder_of_bags_is_no_bag(tmp_path: Path) -> None:
+    # WHY: bags of different positions were once read as the pieces of one that was cut off.
+    for name in ('01.mcap', '02.mcap'):
+        (tmp_path / name).write_bytes(b'')
+    with pytest.raises(RecordingError, match=r'folder of 2 bags, .* give \*\.mcap'):
+        read(tmp_path)
+
+
 def test_a_bare_database_and_one_without_metadata(tmp_path: Path) -> None:
     messages = regular_messages()
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')

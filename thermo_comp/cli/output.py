@@ -51,7 +51,8 @@ class Output:
             if chosen:
                 alike.setdefault(chosen, []).append(bag)
             if missing:
-                self.note(f'{bag}: {missing}')
+                # What sets the exit code is said even to those who want errors alone.
+                _print(f'thermo_comp: {bag}: {missing}', sys.stderr)
                 self._is_torn = True
         for said, names in alike.items():
             more = f' and {len(names) - 1} more' if len(names) > 1 else ''

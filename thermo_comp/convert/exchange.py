@@ -71,23 +71,36 @@ def _content(
     temperature = np.linspace(*range_c, _GRID)
     own_reference_c = calibration.reference_temperature_c
     t = temperature - own_reference_c
+    # Counts have been divided by K before a correction, readings in m/s^2 have not.
+    gain = K if calibration.unit.input == 'm/s^2' else np.ones(3)
     bias = np.array([one.bias_function.value(t) for one in sets]) / K[:, None]
     scale = np.array([one.scale_function.value(t) for one in sets]) - 1.0
     scale_drift = float(np.max(np.abs(scale)))
     reference_c = own_reference_c if tool.reference_c is None else tool.reference_c
     matrix, cubics = np.array(calibration.misalignment), np.zeros((3, 4))
     notes: list[str] = []
+    if calibration.provenance.model == unit.POPULATION:
+        notes.append('it is the mean of a type of unit: what one differs by is not in it')
     rate_notes, rate_bias = [], None
     if tool.is_thermal:
         d = temperature - reference_c
         loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
         offset = (level / K)[:, None] + bias + loads[:, None] * scale
+        offset = gain[:, None] * offset + ((gain - 1.0) * loads)[:, None]
         cubics, misfit = _cubics(d, offset)
         if misfit > 0.01 * MICRO_G:
             notes.append(f'bias functions replaced by cubics, off by {misfit / MICRO_G:.2g} ug')
         if scale_drift > 1e-8:
             rest = 'folded into the offset at one attitude' if up else 'lost'
             notes.append(f'scale over temperature is {rest}: up to {1e6 * scale_drift:.2g} ppm')
+        constant = float(np.max(np.abs(gain - 1.0)))
+        if constant > 1e-8:
+            rest = (
+                'folded into the offset at one attitude'
+                if up
+                else 'lost, calibrate the six faces in the autopilot afterwards'
+            )
+            notes.append(f'the constant scale is {rest}: up to {1e6 * constant:.4g} ppm')
         worst = float(np.max(np.abs(matrix - np.eye(3))))
         if worst:
             notes.append(f'misalignment is lost: up to {1e6 * worst:.3g} urad')
@@ -138,8 +151,11 @@ def _losses(calibration: Calibration) -> list[str]:
     notes = []
     lost = sorted({term.group for term in calibration.response if any(term.bias + term.scale)})
     if lost:
+        worth = [one.explains_m_s2 for one in calibration.evidence if one.group in lost]
+        cost = f', up to {spoken(float(np.linalg.norm(worth)))} RMS' if worth else ''
         notes.append(
-            f'the thermal response is lost ({", ".join(lost)}): heating and cooling read the same'
+            f'the thermal response is lost ({", ".join(lost)}){cost}: heating and cooling read '
+            'the same'
         )
     static, dynamic = (
         [(one.delta, one.bias_function, one.scale_function) for one in regime.axes()]

@@ -49,7 +49,8 @@ class ResidualRow:
 
     section: ``static``, ``dynamic`` or ``all``
     raw: with the constants at the reference temperature
-    one_set, two_sets: with one curve, blind to the regime; with a curve for each regime
+    one_set, two_sets: with one curve, blind to the regime, nothing where each regime has its own
+        from the start; with a curve for each regime
     fitted: with the calibration, on the data that it was fitted to
     left_out: each position with what the others say of the unit: what a new attitude will see
     """
@@ -63,9 +64,13 @@ class ResidualRow:
 
 
 def residual_rows(
-    windows: ThermalWindows, regression: Regression, learnt: Learnt
+    windows: ThermalWindows, regression: Regression, learnt: Learnt, *, is_shared: bool
 ) -> tuple[tuple[ResidualRow, ...], Floats]:
-    """Compare the steps of the model; give ``|f| - g`` by the other positions, too [m/s^2]."""
+    """
+    Compare the steps of the model; give ``|f| - g`` by the other positions, too [m/s^2].
+
+    `is_shared`: whether the curve columns are those of both sets, see `windows.Sets`.
+    """
     state = learnt.posterior.state
     steps = [regression.force(replace(state, weights=np.zeros_like(state.weights)))]
     rungs = (_with_only(regression, learnt, groups) for groups in ((CURVE,), (CURVE, SET)))
@@ -75,6 +80,8 @@ def residual_rows(
     is_dynamic = windows.weight > 0.5
     known = np.isfinite(left_out)
     tables = [statistics_by_regime(r, is_dynamic) for r in residuals]
+    if not is_shared:
+        tables[1] = statistics_by_regime(np.empty(0), np.empty(0, bool))
     tables.append(statistics_by_regime(left_out[known], is_dynamic[known]))
     rows = tuple(
         ResidualRow(section, *(table[section] for table in tables))

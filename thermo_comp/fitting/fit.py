@@ -170,7 +170,9 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     if any(seen) and not all(seen):
         name = bags[seen.index(False)].source.name
         raise FitError(f'{name}: no board temperature, which the other bags have')
-    findings = enforce(verdict.judge_bags(bags, options), options)
+    serial = check_serial([bag.source for bag in bags], options)
+    findings = enforce(verdict.judge_prior(serial, options.prior), options)
+    findings += enforce(verdict.judge_bags(bags, options), options)
     known = options.prior
     detector = options.detector or (known.detector if known else learn_detector(bags))
     tell(0.55)
@@ -209,7 +211,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
             again, found = regress(others, start, up, options, tell)
             if found.posterior.log_evidence > learnt.posterior.log_evidence + _CLOSING_EARNED:
                 windows, regression, learnt = others, again, found
-    residuals, left_out = residual_rows(windows, regression, learnt)
+    residuals, left_out = residual_rows(windows, regression, learnt, is_shared=sets.is_shared)
     state = learnt.posterior.state
     K = state.kappa * start.scale
     constants, raw = (K, state.bias, state.skew), residuals[-1].raw.rms

@@ -54,7 +54,7 @@ _NEAR = 0.3
 # Semiconductors double their leakage in some 10 K: an e-fold of 15 K, and of twice that.
 _E_FOLDS_K = (15.0, 30.0)
 #: What is refused, and may be allowed by its name.
-REFUSALS = ('saturation', 'units', 'stuck', 'jump', 'swapped', 'compensated')
+REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compensated')
 _WORDS: dict[str, tuple[str, ...]] = {
     'input': ('counts', 'm/s^2'),
     'model': ('response', 'golovach'),

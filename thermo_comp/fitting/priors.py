@@ -19,7 +19,14 @@ import numpy as np
 from .. import __version__
 from ..errors import FitError
 from ..typing import Floats
-from ..unit.calibration import Calibration, Provenance, RegimeSet, Source, parameter_layout
+from ..unit.calibration import (
+    POPULATION,
+    Calibration,
+    Provenance,
+    RegimeSet,
+    Source,
+    parameter_layout,
+)
 from ..unit.columns import Column
 from .assembly import blank_terms, file_parameters, parameters_of, union, with_parameters
 from .options import FitOptions
@@ -229,13 +236,13 @@ def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Cal
         regimes.append(RegimeSet(temperatures, rates, x, y, z))
     return replace(
         first,
-        unit=replace(first.unit, serial='population'),
+        unit=replace(first.unit, serial=POPULATION),
         static=regimes[0],
         dynamic=regimes[1],
         response=blank_terms(columns),
         provenance=Provenance(
             tool_version=__version__,
-            model='population',
+            model=POPULATION,
             sources=tuple(Source(one.unit.serial) for one in calibrations),
         ),
         evidence=(),

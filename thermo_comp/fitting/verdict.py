@@ -20,6 +20,7 @@ from ..recording.overview import KELVINS
 from ..text import counted
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..typing import Floats
+from ..unit.calibration import POPULATION, Calibration
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
 from .coverage import LeastKnown, distinct_directions, geometry, spoken_direction
 from .jumps import Jump, find_jumps
@@ -42,6 +43,8 @@ _DEAD_SAMPLES = 1000
 # No triad is built with nine constants as small as the first, in parts of one, and moves |f| by
 # less than the second over so many kelvins: what reads like this has been compensated.
 _COMPENSATED, _COMPENSATED_DRIFT, _COMPENSATED_K = 1e-4, 2e-5, 20.0
+# What has a prior leaves no more than this many times what curves without one do.
+_CONTRADICTED = 1.5
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,19 @@ def enforce(findings: Iterable[Finding], options: FitOptions) -> list[Finding]:
         else:
             raise FitError(f'{finding.message} (override with --allow {finding.name})')
     return result
+
+
+def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
+    """Refuse another unit's calibration: what it is sure of is not so of this one."""
+    if prior is None or prior.provenance.model == POPULATION:
+        return
+    if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:
+        yield Finding(
+            'prior',
+            'refusal',
+            f'the prior is the calibration of unit {prior.unit.serial}, the bags are of {serial}: '
+            'make a prior of their type from three units or more with thermo_comp prior',
+        )
 
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
@@ -320,6 +336,13 @@ def judge_result(
         yield _advice('left out', f'{text}: positions left out are worse than raw: {why}')
     else:
         yield Finding('residual', 'good', text)
+    alone = overall.two_sets.rms
+    if options.prior is not None and overall.fitted.rms > _CONTRADICTED * alone:
+        yield _advice(
+            'prior',
+            f'the bags contradict the prior: two sets by themselves leave {spoken(alone)}, with '
+            f'the prior it is {spoken(overall.fitted.rms)}: is it of this unit, or of its type?',
+        )
     if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:
         yield _advice(
             'units',

@@ -71,6 +71,9 @@ def open_bags(
         source, info = recording_source(path, topics, require=require, progress=told)
         usual = {'full_scale': None if info.input == 'imu' else COUNTS_FULL_SCALE}
         source = replace(source, sha256=digest(Path(path)))
+        for other, twin in zip(found, paths, strict=False):
+            if other.source.sha256 == source.sha256:
+                raise RecordingError(f'is {twin} once more, and nothing may count twice', path)
         bag = reduce_source(source, window_s=sum_length(window_s), **(usual | known))
         if 'board' in require and not len(bag.board.value):
             raise RecordingError('no board temperature in it', path=str(path))

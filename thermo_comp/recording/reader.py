@@ -228,6 +228,11 @@ def _described(path: Path) -> _Description:
         for suffix in ('.mcap', '.db3'):
             files = [one for one in path.iterdir() if one.suffix == suffix and one.is_file()]
             if files:
+                if len({re.sub(r'_[0-9]+$', '', one.stem) for one in files}) > 1:
+                    raise RecordingError(
+                        f'a folder of {len(files)} bags, and no bag itself: give *{suffix} in it',
+                        path,
+                    )
                 note = 'metadata.yaml is missing, the recording was not finished'
                 return _Description(suffix[1:], tuple(sorted(files, key=_place_of)), note=note)
         raise RecordingError('not a bag: the directory has no metadata.yaml', path)

@@ -46,6 +46,10 @@ AXES = ('x', 'y', 'z')
 SMALLEST_RELATIVE_SCALE = 0.1
 #: At so many temperatures of its range a function is looked at.
 _GRID = 513
+#: The model of a calibration that stands for a type of unit: a prior.
+POPULATION = 'population'
+# No converter has fewer input units per m/s^2, nor more than one over it.
+_SMALLEST_K = 1e-9
 
 Celsius = Annotated[float, Bounds(at_least=-273.15, below=1000.0)]
 Serial = Annotated[str, Bounds(shortest=1, longest=LONGEST_SERIAL)]
@@ -73,8 +77,11 @@ class AxisReference:
     bias: Annotated[float, 'dNs(0): zero offset at the reference, in input units.']
 
     def __post_init__(self) -> None:
-        if not self.scale_factor:
-            raise ValueError('`scale_factor` must not be 0, got 0.0')
+        if not _SMALLEST_K <= abs(self.scale_factor) <= 1.0 / _SMALLEST_K:
+            raise ValueError(
+                f'`scale_factor` must be {_SMALLEST_K:g} to {1.0 / _SMALLEST_K:g} in magnitude, '
+                f'got {self.scale_factor:g}'
+            )
 
 
 @dataclass(frozen=True)
@@ -229,12 +236,23 @@ class Calibration:
     def __post_init__(self) -> None:
         if (version := self.format_version) != FORMAT_VERSION:
             raise ValueError(f'`format_version` must be {FORMAT_VERSION}, got {version}')
+        self._check_axes()
         self._check_misalignment()
         self._check_sensors()
         for regime in ('static', 'dynamic'):
             self._check_curves(regime)
         if self.posterior is not None:
             self.posterior.check_size(parameter_layout(self).n_parameters)
+
+    def _check_axes(self) -> None:
+        # Words with an offset have it in the bias, at half their range.
+        farthest = 2.0 * self.unit.full_scale
+        for name, axis in zip(AXES, self.axes, strict=True):
+            if abs(axis.bias) > farthest:
+                raise ValueError(
+                    f'`axes.{name}.bias` must be within twice unit.full_scale, {farthest:g}, '
+                    f'got {axis.bias:g}'
+                )
 
     def _check_misalignment(self) -> None:
         for (row, column), value in np.ndenumerate(np.array(self.misalignment)):
