@@ -81,7 +81,7 @@ def test_what_is_allowed_goes_on_to_the_end(rng, name, spoil, options, n):
 
 
 def test_what_cannot_be_allowed_is_said():
-    with pytest.raises(ValueError, match=r'`allow` must be of saturation, .* got .span.'):
+    with pytest.raises(ValueError, match=r'`allow` must be of prior, saturation, .* got .span.'):
         FitOptions(gravity=GRAVITY, allow=('span',))
 
 

@@ -142,7 +142,9 @@ def test_the_paper_s_model_on_its_own_physics(golovach: FitResult) -> None:
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        assert row.two_sets.rms < row.one_set.rms < row.raw.rms, row.section
+        # Each regime has its own curve: there is no single one to show.
+        assert not row.one_set.n
+        assert row.two_sets.rms < row.raw.rms, row.section
     # A linear static set and a quadratic dynamic one.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
