@@ -28,14 +28,17 @@ from ..unit.calibration import (
     Unit,
     parameter_layout,
 )
-from ..unit.columns import Column
+from ..unit.columns import USUAL_BOARD_LAG_S, Column
 from ..unit.functions import TemperatureFunction
 from ..unit.posterior import posterior_of
+from .bayes_factors import group_evidence
 from .evidence import ResidualRow
-from .learning import Learnt
-from .posterior import Regression
+from .claim import Claim
+from .equations import as_vector
 from .reduction import ReducedBag
-from .unknowns import Layout, State
+from .regression import Regression
+from .selection import Selected
+from .unknowns import Layout, Prior, State
 from .verdict import Finding
 from .windows import Sets, ThermalWindows
 
@@ -49,15 +52,14 @@ _LINEAR_REACH = 2.0
 _MARGIN_C, _RATE_MARGIN = 0.5, 0.01
 # Without any thermometer the curve is flat, and what it leaves open grows from the reference on.
 _UNSEEN_MARGIN_C, _UNSEEN_RATE = 50.0, 3.0
-# Stands in where the bags do not tell how far the board lags behind the case.
-_USUAL_BOARD_LAG_S = 900.0
 _NIL = (0.0, 0.0, 0.0)
 
 
 def build_calibration(
     windows: ThermalWindows,
     regression: Regression,
-    learnt: Learnt,
+    selected: Selected,
+    claim: Claim,
     bags: Sequence[ReducedBag],
     unit: Unit,
     residuals: Sequence[ResidualRow] = (),
@@ -65,18 +67,18 @@ def build_calibration(
     known: Calibration | None = None,
 ) -> Calibration:
     """Write a posterior as a calibration; it holds where a prior did, too, `known`."""
-    model, prior, state = windows.model, learnt.prior, learnt.posterior.state
-    layout = learnt.claim.layout
+    model, prior, state = windows.model, selected.prior, selected.posterior.state
+    layout = claim.layout
     taken = (layout.weights[:, 0, len(model.sets.levels()) :] >= 0).any(axis=0)
     used = np.flatnonzero(taken).tolist()
     to_file = file_parameters(regression, layout, state, model.sets, used)
-    values = to_file @ regression.vector(state, layout)[: layout.n_unit]
+    values = to_file @ as_vector(state, layout)[: layout.n_unit]
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
     is_seen = windows.was_measured
     temperatures = _range(windows.temperature, _MARGIN_C if is_seen else _UNSEEN_MARGIN_C)
     rate_margin = _RATE_MARGIN if is_seen else _UNSEEN_RATE
     rates = _widened(windows.rate * 60.0, _LINEAR_REACH, rate_margin)
-    slow = _slow_error(windows, learnt).tolist()
+    slow = _slow_error(prior, claim).tolist()
     earlier = (None, None) if known is None else known.regime_sets()
     static, dynamic = (
         RegimeSet(
@@ -103,7 +105,7 @@ def build_calibration(
         static=static,
         dynamic=dynamic,
         noise_density_m_s2_sqrt_hz=_triple(np.maximum(prior.sigma * np.sqrt(window_s), 1e-9)),
-        slow_noise_m_s2_sqrt_h=_triple(prior.sigma * np.sqrt(prior.rho * 3600.0)),
+        slow_noise_m_s2_sqrt_h=_triple(prior.sigma * prior.noise.rate * np.sqrt(3600.0)),
         sensors=tuple(
             name
             for k, name in enumerate(model.sensors)
@@ -137,9 +139,9 @@ def build_calibration(
                 if finding.level != 'good'
             ),
         ),
-        evidence=learnt.worth if is_seen else (),
+        evidence=group_evidence(regression, selected.posterior, prior) if is_seen else (),
     )
-    covariance = to_file @ learnt.claim.covariance @ to_file.T
+    covariance = to_file @ claim.covariance @ to_file.T
     return with_parameters(blank, state.kappa * regression.nominal_scale, values, covariance)
 
 
@@ -234,9 +236,9 @@ def file_parameters(
                 both[:m] += dynamic
                 dynamic = both
             rows += [level, *static, level + delta, *dynamic, *response[used]]
-    a, _, c = state.skew
-    # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the skew (a, b, c) of its inverse.
-    of_a, of_b, of_c = unknown[layout.skew]
+    a, _, c = state.misalignment
+    # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the elements (a, b, c) of its inverse.
+    of_a, of_b, of_c = unknown[layout.misalignment]
     return np.array([*rows, -of_a, c * of_a - of_b + a * of_c, -of_c])
 
 
@@ -245,17 +247,12 @@ def _board_lag(windows: ThermalWindows) -> float:
     rate = windows.rate - np.mean(windows.rate)
     power = float(rate @ rate)
     lag = float(rate @ windows.gradient) / power if power > 0.0 else np.nan
-    return lag if 1.0 <= lag <= 1e5 else _USUAL_BOARD_LAG_S
+    return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 
 
-def _slow_error(windows: ThermalWindows, learnt: Learnt) -> Floats:
-    """Say what the bias does of itself: another one in each mounting, and a walk [m/s^2]."""
-    prior = learnt.prior
-    data = windows.data
-    length = [float(np.ptp(data.time[data.bag == bag])) for bag in np.unique(data.bag)]
-    # Its mean square over a run as long as the bags is half of what it has at the end.
-    walked = prior.sigma**2 * prior.rho * float(np.median(length)) / 2.0
-    return np.sqrt(prior.offset_sd**2 + walked)
+def _slow_error(prior: Prior, claim: Claim) -> Floats:
+    """Sd of what the bias does of itself: anew in each mounting, and slow noise [m/s^2], (3,)."""
+    return np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.ratio)
 
 
 def _numbers(values: Floats) -> tuple[float, ...]:

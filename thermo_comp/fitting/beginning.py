@@ -14,21 +14,27 @@ import numpy as np
 from ..errors import FitError
 from ..typing import Floats
 from .coverage import distinct_directions
-from .learning import Learnt, learn
 from .options import FitOptions
-from .posterior import Regression
-from .priors import as_known, known_of
+from .priors import informative_priors, with_calibration
+from .regression import Regression
+from .selection import Candidates, Selected, fit_all, select
 from .start import ConstantCalibration, constant_calibration, position_means, within_positions
-from .unknowns import BIAS_SD, SCALE_SD, SKEW_SD, Prior, initial_state
+from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior
 from .verdict import POSITIONS_NEEDED
-from .windows import CURVE, SET, ThermalWindows
+from .windows import CURVE, ThermalWindows
 
-# Widths that columns begin with and silent ones keep: what a cheap sensor does over a chamber.
-COLUMN_BIAS_SD, _COLUMN_SCALE_SD = 1e-3, 1e-4
-# What temperature does to a unit that no thermometer has seen, per K: a cheap sensor's data sheet.
-_UNSEEN_SLOPES = 5e-3, 2e-4
-# A mounting begins with this much of a bias of its own, and the noise with this [m/s^2].
-_OFFSET_SD, _SIGMA = 1e-6, 1e-5
+#: Nothing is steeper than a cheap sensor's data sheet: bias [m/s^2 per K] (500 ug/K), relative
+#: scale factor [1/K] (200 ppm/K), as of consumer MEMS triads.
+STEEPEST = np.array([5e-3, 2e-4])
+# The flattest typical slope of the bias [m/s^2 per K]: 0.1 ug/K, better than navigation grade.
+_FLATTEST = 1e-6
+# Widths of the paper's sets, which stay whatever they gain, over the steepest: as good as free.
+_FREE = 10.0
+# The noise begins with this [m/s^2].
+_SIGMA = 1e-5
+# Mounting and turn-on repeat to some times the noise in 1 Hz: 20 .. 50 ug for a navigation sensor,
+# some tenths of a mg of MEMS.
+_MOUNTING_OVER_NOISE = 3.0
 
 
 def regress(
@@ -36,41 +42,100 @@ def regress(
     start: ConstantCalibration,
     up: Floats,
     options: FitOptions,
-    tell: Callable[[float], None],
-) -> tuple[Regression, Learnt]:
-    """Learn from the windows what is known of the unit, with or without a prior."""
-    known, data = options.prior, windows.data
-    # What the sets alone leave is a response, and no noise.
-    walks = windows.raw.shape[1] > 0
-    walks &= options.groups is None or not {CURVE, SET} >= {*options.groups}
+    progress: Callable[[float], None],
+) -> tuple[Regression, Selected, Floats | None]:
+    """
+    Fit the windows, with or without a prior calibration: the regression, the chosen model, and
+    the typical widths of all columns that could have taken part, (2, m), None where all did.
+    """
+    data = windows.data
     has_one_direction = len(distinct_directions(up)) == 1
-    if not walks or has_one_direction:
-        # Nor is it a lean of the supports; in one attitude a lean may be any drift of the bias.
-        data = replace(data, lean=data.lean[:, :0])
+    if options.model == 'golovach' or has_one_direction:
+        # What the sets alone leave is no tilt of the supports; in one attitude a tilt may be any
+        # drift of the bias.
+        data = replace(data, tilt=data.tilt[:, :0])
     regression = Regression(data, options.gravity, start.scale)
     inverse = np.asarray(np.linalg.inv(start.misalignment), dtype=np.float64)
-    bias, skew = start.bias / start.scale, inverse[[1, 2, 2], [0, 0, 1]]
-    state = initial_state(data, regression.n_bags, bias, np.ones(3), skew, up)
-    prior, knowns = _wide_prior(windows, start, up, options), []
-    if known is not None:
-        state = as_known(known, regression, state)
-        *knowns, widest = known_of(known, regression, state, windows.model.sets, options)
-        prior = replace(prior, widths=data.parts.astype(np.float64), known=widest)
-    forced = [
-        options.model == 'golovach' or group == CURVE or group in options.forced
-        for group in data.groups
-    ]
-    learnt = learn(
-        regression,
-        state,
-        prior,
-        np.array(forced),
-        lambda part: tell(0.7 + 0.25 * part),
-        held=(prior.widths[1] > 0.0) & has_one_direction,
-        walks=walks,
-        knowns=knowns,
+    misalignment = inverse[[1, 2, 2], [0, 0, 1]]
+    state = regression.initial_state(start.bias / start.scale, misalignment, up)
+    candidates = _candidates(windows, start, options, has_one_direction=has_one_direction)
+    prior = Prior(
+        bias_mean=start.bias / start.scale,
+        bias_sd=np.full(3, BIAS_SD),
+        scale_sd=SCALE_SD,
+        misalignment_sd=MISALIGNMENT_SD,
+        column_sd=np.zeros_like(candidates.typical),
+        offset_sd=_SIGMA,
+        sigma=np.full(3, _SIGMA),
+        offset_scale=_mounting_scale(windows, start),
     )
-    return regression, learnt
+    if options.mounting_sd is not None:
+        prior = replace(prior, offset_sd=options.mounting_sd, offset_scale=0.0)
+
+    def tell(part: float) -> None:
+        progress(0.7 + 0.25 * part)
+
+    if options.prior is not None:
+        known = options.prior
+        state = with_calibration(known, regression, state)
+        *others, widest = informative_priors(known, regression, state, windows.model.sets, options)
+        prior = replace(prior, column_sd=data.parts.astype(np.float64), informative=widest)
+        fixed = replace(candidates, fixed=np.ones_like(candidates.fixed))
+        return regression, fit_all(regression, state, prior, fixed, others), None
+    if options.model == 'golovach':
+        prior = replace(prior, column_sd=candidates.typical)
+        return regression, fit_all(regression, state, prior, candidates), None
+    selected = select(regression, state, prior, candidates, tell)
+    return regression, selected, candidates.typical
+
+
+def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> float:
+    """Say how well mountings of such a sensor repeat [m/s^2], from its white noise."""
+    # Second differences of neighbouring windows are free of drift.
+    data = windows.data
+    same = (data.position[2:] == data.position[:-2]).nonzero()[0]
+    if not len(same):
+        return _FLATTEST
+    bend = np.diff(data.mean / start.scale, n=2, axis=0)[same]
+    sigma = float(np.median(np.abs(bend))) / (0.6745 * np.sqrt(6.0))
+    density = sigma * np.sqrt(float(np.median(np.diff(data.time)[same])))
+    return max(_MOUNTING_OVER_NOISE * density, _FLATTEST)
+
+
+def _candidates(
+    windows: ThermalWindows,
+    start: ConstantCalibration,
+    options: FitOptions,
+    *,
+    has_one_direction: bool,
+) -> Candidates:
+    """Say which columns may take part, and how large their weights may be."""
+    data = windows.data
+    groups = np.array(data.groups)
+    asked = {*data.groups} if options.groups is None else {*options.groups, *options.forced}
+    may = np.isin(groups, list(asked)) & (data.kelvins > 0.0)
+    may &= windows.has_temperature
+    parts = np.stack((may, may & data.in_scale))
+    within = within_positions(data.mean / start.scale, data.position)
+    drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
+    moved = float(np.std(windows.temperature)) or 1.0
+    slope = float(np.clip(drift / moved, _FLATTEST, STEEPEST[0] / 3.0))
+    slopes = np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])
+    fixed = np.zeros(parts.shape, dtype=bool)
+    if has_one_direction:
+        # One attitude does not tell the scale from the bias: its curve stays at its prior.
+        parts[1] &= groups == CURVE
+        fixed[1] = parts[1]
+    forced = np.isin(groups, options.forced)
+    if options.model == 'golovach':
+        # The paper's sets stay whatever they gain: their prior says nothing.
+        slopes, forced, fixed = _FREE * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
+    typical, largest = (np.outer(one, data.kelvins) * parts for one in (slopes, STEEPEST))
+    if not windows.was_measured:
+        # No thermometer was there: the slope over temperature is claimed, whatever it may be.
+        typical[:, 0] = largest[:, 0] = STEEPEST
+        forced[0] = fixed[:, 0] = True
+    return Candidates(typical, largest, forced, fixed)
 
 
 def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
@@ -91,44 +156,3 @@ def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibra
             )
         scale = 1.0
     return ConstantCalibration(np.zeros(3), np.full(3, scale), np.eye(3))
-
-
-def _wide_prior(
-    windows: ThermalWindows, start: ConstantCalibration, up: Floats, options: FitOptions
-) -> Prior:
-    """Say what is known of any unit before its data are seen."""
-    groups = windows.data.groups
-    asked = {*groups} if options.groups is None else {*options.groups, *options.forced}
-    allowed = np.array([group in asked for group in groups])
-    allowed &= windows.has_temperature
-    in_scale = windows.data.in_scale & allowed
-    # RMS of what the readings do within the positions, on the largest axis.
-    within = within_positions(windows.data.mean / start.scale, windows.data.position)
-    drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
-    # What a sensor does, its curve does first: the others begin as those of a good one.
-    is_curve = np.array([group == CURVE for group in groups])
-    wide = np.where(is_curve, max(1.0, drift / COLUMN_BIAS_SD), 1.0)
-    scale_wide = wide
-    if len(distinct_directions(up)) == 1:
-        # One attitude does not tell it from the bias: its curve stays at its prior.
-        in_scale &= is_curve
-        scale_wide = np.ones(len(groups))
-        if options.groups is None:
-            # Nor a lag from a tilt or a curve: the curve is what others can use.
-            allowed &= is_curve
-    if options.model == 'golovach':
-        # The paper's sets stay whatever they earn: their prior says nothing.
-        wide, scale_wide = 50.0 * wide, 50.0 * scale_wide
-    widths = np.stack((allowed * wide * COLUMN_BIAS_SD, in_scale * scale_wide * _COLUMN_SCALE_SD))
-    if not windows.was_measured:
-        widths[:, 0] = _UNSEEN_SLOPES
-    return Prior(
-        bias_mean=start.bias / start.scale,
-        bias_sd=np.full(3, BIAS_SD),
-        scale_sd=SCALE_SD,
-        skew_sd=SKEW_SD,
-        widths=widths,
-        offset_sd=_OFFSET_SD,
-        sigma=np.full(3, _SIGMA),
-        rho=np.zeros(3),
-    )

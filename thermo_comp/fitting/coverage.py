@@ -20,9 +20,9 @@ from ..typing import Floats
 from ..unit.calibration import Calibration, parameter_layout
 from ..unit.gravity import STANDARD_GRAVITY
 from .start import constant_calibration
-from .unknowns import BIAS_SD, SCALE_SD, SKEW_SD
+from .unknowns import BIAS_SD, SCALE_SD, MISALIGNMENT_SD
 
-PRIOR_SD = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, SKEW_SD], 3)
+PRIOR_SD = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, MISALIGNMENT_SD], 3)
 # What is easily held is proposed if it is worth this part of the best there is ...
 _NEARLY = 0.5
 # ... and what is nearer than 20 degrees to a position never.

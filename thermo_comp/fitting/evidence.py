@@ -15,9 +15,10 @@ import numpy as np
 
 from ..typing import Floats
 from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
-from .learning import Learnt
-from .posterior import Regression
-from .unknowns import State
+from .left_out import Score
+from .regression import Regression
+from .selection import Selected
+from .unknowns import Noise, State
 from .windows import CURVE, SET, ThermalWindows
 
 
@@ -31,7 +32,7 @@ class PositionReport:
     duration_s: length [s]
     up: estimated direction of the specific force, in the output frame
     residual_rms: RMS of ``|f| - g`` over its windows [m/s^2]
-    left_out_rms: the same, with what the other positions alone say of the unit [m/s^2]
+    left_out_rms: RMS of its left-out error, see `left_out_error` [m/s^2]
     """
 
     source: str
@@ -52,7 +53,7 @@ class ResidualRow:
     one_set, two_sets: with one curve, blind to the regime, nothing where each regime has its own
         from the start; with a curve for each regime
     fitted: with the calibration, on the data that it was fitted to
-    left_out: each position with what the others say of the unit: what a new attitude will see
+    left_out: on data that took no part in the fit, see `left_out_error`
     """
 
     section: str
@@ -64,19 +65,19 @@ class ResidualRow:
 
 
 def residual_rows(
-    windows: ThermalWindows, regression: Regression, learnt: Learnt, *, is_shared: bool
+    windows: ThermalWindows, regression: Regression, selected: Selected, *, is_shared: bool
 ) -> tuple[tuple[ResidualRow, ...], Floats]:
     """
-    Compare the steps of the model; give ``|f| - g`` by the other positions, too [m/s^2].
+    Compare the steps of the model; give the left-out error of each window, too [m/s^2].
 
     `is_shared`: whether the curve columns are those of both sets, see `windows.Sets`.
     """
-    state = learnt.posterior.state
+    state = selected.posterior.state
     steps = [regression.force(replace(state, weights=np.zeros_like(state.weights)))]
-    rungs = (_with_only(regression, learnt, groups) for groups in ((CURVE,), (CURVE, SET)))
+    rungs = (_with_only(regression, selected, groups) for groups in ((CURVE,), (CURVE, SET)))
     steps += [regression.force(step) for step in (*rungs, state)]
     residuals = [norm_residual(force, regression.gravity) for force in steps]
-    left_out = norm_residual(left_out_force(regression, learnt), regression.gravity)
+    left_out = left_out_error(selected.score, regression.gravity)
     is_dynamic = windows.weight > 0.5
     known = np.isfinite(left_out)
     tables = [statistics_by_regime(r, is_dynamic) for r in residuals]
@@ -90,36 +91,36 @@ def residual_rows(
     return rows, left_out
 
 
-def _with_only(regression: Regression, learnt: Learnt, groups: tuple[str, ...]) -> State:
+def left_out_error(score: Score, gravity: float) -> Floats:
+    """
+    Say how far off each left-out window is [m/s^2], shape (n,): ``|f| - g`` where the other
+    positions determine the norm, else the drift, RMS of the axes.
+    """
+    norm = norm_residual(score.force, gravity)
+    drift = np.sqrt(np.mean(score.drift**2, axis=1))
+    return np.asarray(np.where(np.isfinite(norm), norm, drift))
+
+
+def _with_only(regression: Regression, selected: Selected, groups: tuple[str, ...]) -> State:
     """Fit again with some groups only, as wide as they like to be."""
-    only = np.array([group in groups for group in regression.windows.groups])
+    only = np.isin(regression.windows.groups, groups)
     # What such a model leaves is no noise of the windows; it counts for all of them alike.
     prior = replace(
-        learnt.prior,
-        widths=only * regression.windows.parts * [[0.05], [0.005]],
+        selected.prior,
+        column_sd=only * regression.windows.parts * [[0.05], [0.005]],
         offset_sd=1e-7,
-        rho=np.zeros(3),
-        known=None,
+        offset_scale=0.0,
+        noise=Noise(),
+        informative=None,
     )
-    return regression.solve(learnt.posterior.state, prior).state
-
-
-def left_out_force(regression: Regression, learnt: Learnt) -> Floats:
-    """Correct each position by the others, shape (n, 3); NaN where it tells what no other does."""
-    position = regression.windows.position
-    result = np.full((len(position), 3), np.nan)
-    for p in range(regression.windows.n_positions):
-        state = regression.without(learnt.posterior, learnt.prior, p)
-        if state is not None:
-            result[position == p] = regression.force(state)[position == p]
-    return result
+    return regression.solve(selected.posterior.state, prior).state
 
 
 def position_reports(
-    windows: ThermalWindows, regression: Regression, learnt: Learnt, left_out: Floats
+    windows: ThermalWindows, regression: Regression, selected: Selected, left_out: Floats
 ) -> tuple[PositionReport, ...]:
     """List the positions with what the fit, and what the others (`left_out`), left on each."""
-    state = learnt.posterior.state
+    state = selected.posterior.state
     residual = norm_residual(regression.force(state), regression.gravity)
     result = []
     for number, (bag, interval) in enumerate(windows.rests):

@@ -23,15 +23,15 @@ from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
 from . import verdict
 from .assembly import build_calibration
-from .beginning import COLUMN_BIAS_SD, first_guess, regress
+from .beginning import first_guess, regress
 from .coverage import LeastKnown, least_known, rough_centre
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
-from .learning import Learnt
+from .claim import claim_of
 from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
-from .posterior import Regression
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
+from .selection import Selected, is_better
 from .sensors import gradients_at_rest, learn_detector
 from .sources import FitSource
 from .start import position_means
@@ -42,8 +42,6 @@ Progress = Callable[[float], None]
 
 # Usual full scales of units that report m/s^2.
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-# The board has its say in when the regime closes, unless the log evidence gains this without.
-_CLOSING_EARNED = 10.0
 # A bias beyond this part of 1 g is a word of no force.
 _LARGEST_BIAS = 0.5
 
@@ -53,7 +51,7 @@ class FitResult:
     """A fit and its evidence; `rates` are the gyroscope's residuals, where one was fitted."""
 
     calibration: Calibration
-    learnt: Learnt
+    selected: Selected
     residuals: tuple[ResidualRow, ...]
     positions: tuple[PositionReport, ...]
     findings: tuple[Finding, ...]
@@ -195,47 +193,48 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(verdict.judge_windows(windows, up, has_case), options)
     tell(0.7)
-    regression, learnt = regress(windows, start, up, options, tell)
+    regression, selected, typical = regress(windows, start, up, options, tell)
     asks = has_case and known is None and options.detector is None
-    if asks and learnt.has_sets:
+    if asks and any(SET in trial.groups and trial.is_chosen for trial in selected.trials):
         # Only the sets feel when the regime closes: with the case, or with the board too.
         others = thermal_windows(bags, replace(model, detector=replace(detector, closes='case')))
-        data = replace(others.data, lean=regression.windows.lean)
-        again = Regression(data, options.gravity, start.scale)
-        again.reweight(regression.weight)
-        with_sets = learnt.prior.widths.copy()
-        with_sets[0, np.array(others.data.groups) == SET] += COLUMN_BIAS_SD
-        prior, state = replace(learnt.prior, widths=with_sets), learnt.posterior.state
-        now, then = (one.solve(state, prior).log_evidence for one in (regression, again))
-        if then > now + _CLOSING_EARNED:
-            again, found = regress(others, start, up, options, tell)
-            if found.posterior.log_evidence > learnt.posterior.log_evidence + _CLOSING_EARNED:
-                windows, regression, learnt = others, again, found
-    residuals, left_out = residual_rows(windows, regression, learnt, is_shared=sets.is_shared)
-    state = learnt.posterior.state
+        again = regress(others, start, up, options, tell)
+        if is_better(selected.score, again[1].score):
+            windows, (regression, selected, typical) = others, again
+    claim = claim_of(regression, selected, typical, options.gravity_sd)
+    residuals, left_out = residual_rows(windows, regression, selected, is_shared=sets.is_shared)
+    state = selected.posterior.state
     K = state.kappa * start.scale
-    constants, raw = (K, state.bias, state.skew), residuals[-1].raw.rms
+    constants, raw = (K, state.bias, state.misalignment), residuals[-1].raw.rms
     found_none = verdict.judge_constants(windows, up, constants, raw, options)
     findings += enforce(found_none, options)
     findings += verdict.judge_result(
-        K, residuals, learnt.prior.offset_sd, options, windows.has_temperature
+        K, residuals, claim.offset_sd, options, windows.has_temperature
     )
     try:
         calibration = build_calibration(
-            windows, regression, learnt, bags, _unit(bags, options), residuals, findings, known
+            windows,
+            regression,
+            selected,
+            claim,
+            bags,
+            _unit(bags, options),
+            residuals,
+            findings,
+            known,
         )
         calibration, rates = add_gyroscope(calibration, windows, bags, options)
     except ValueError as error:
         raise FitError(f'these data give no calibration that can be used: {error}') from error
-    least = least_known(calibration, learnt.posterior.state.up)
+    least = least_known(calibration, selected.posterior.state.up)
     unseen = list(verdict.judge_coverage(least))
     findings += unseen
     calibration = with_notes(calibration, [f'{one.name}: {one.message}' for one in unseen])
     return FitResult(
         calibration=calibration,
-        learnt=learnt,
+        selected=selected,
         residuals=residuals,
-        positions=position_reports(windows, regression, learnt, left_out),
+        positions=position_reports(windows, regression, selected, left_out),
         findings=tuple(findings),
         least_known=least,
         windows=windows,

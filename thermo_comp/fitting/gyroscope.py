@@ -22,19 +22,21 @@ from ..unit.gravity import EARTH_RATE
 from ..unit.metrics import ResidualStatistics, statistics_by_regime
 from ..unit.rate_triad import gyroscope_of
 from .assembly import build_calibration
-from .evidence import left_out_force
-from .learning import Learnt, learn
+from .claim import claim_of
 from .options import FitOptions
-from .posterior import Regression
 from .reduction import ReducedBag
+from .regression import Regression
+from .selection import Candidates, Selected, select
 from .start import position_means, within_positions
-from .unknowns import Prior, initial_state
-from .windows import CURVE, ThermalWindows
+from .unknowns import Prior
+from .windows import ThermalWindows
 
 # What it is on one axis, of an attitude that nobody knows.
 _EARTH_SD = EARTH_RATE / math.sqrt(3.0)
-# Built-in prior, wide for any gyroscope: bias [rad/s] and what temperature does to it.
-_BIAS_SD, _COLUMN_SD = 1.0, 1e-4
+# Built-in prior, wide for any gyroscope: bias [rad/s].
+_BIAS_SD = 1.0
+# Typical and steepest slope of the bias [rad/s per K]: consumer MEMS, 0.03 and 0.3 deg/s/K.
+_SLOPE, _STEEPEST = 1e-5, 5e-3
 # The noise begins with this [rad/s].
 _SIGMA = 1e-5
 
@@ -65,50 +67,54 @@ def add_gyroscope(
     data = replace(
         windows.data,
         mean=windows.angular_rate,
-        # An angular rate has no scale to tell here, nor does it feel how a support leans.
+        # An angular rate has no scale to tell here, nor does it feel the tilt of a support.
         in_scale=np.zeros(len(windows.data.groups), dtype=bool),
-        lean=windows.data.lean[:, :0],
+        tilt=windows.data.tilt[:, :0],
     )
-    one = np.ones(3)
-    regression = Regression(data, 0.0, one)
+    regression = Regression(data, 0.0, np.ones(3))
     level = position_means(data)
     up = np.tile((0.0, 0.0, 1.0), (data.n_positions, 1))
-    state = initial_state(data, regression.n_bags, level.mean(axis=0), one, np.zeros(3), up)
-    is_curve = np.array([group == CURVE for group in data.groups])
-    drift = float(np.sqrt(np.mean((data.mean - level[data.position]) ** 2, axis=0)).max())
-    allowed = options.groups
-    takes_part = np.array([allowed is None or group in allowed for group in data.groups])
+    state = regression.initial_state(level.mean(axis=0), np.zeros(3), up)
+    asked = {*data.groups} if options.groups is None else {*options.groups}
+    may = np.isin(data.groups, list(asked)) & (data.kelvins > 0.0)
+    widths = np.outer((1.0, 0.0), may * data.kelvins)
+    never = np.zeros(len(data.groups), dtype=bool)
+    candidates = Candidates(
+        _SLOPE * widths, _STEEPEST * widths, never, np.zeros(widths.shape, dtype=bool)
+    )
     prior = Prior(
         bias_mean=np.zeros(3),
         bias_sd=np.full(3, _BIAS_SD),
         scale_sd=1.0,
-        skew_sd=1.0,
-        widths=np.outer((1.0, 0.0), np.where(is_curve, max(_COLUMN_SD, drift), _COLUMN_SD))
-        * takes_part,
+        misalignment_sd=1.0,
+        column_sd=np.zeros_like(widths),
         offset_sd=_EARTH_SD,
         sigma=np.full(3, _SIGMA),
-        rho=np.zeros(3),
-        least_offset_sd=_EARTH_SD,
+        offset_scale=_EARTH_SD,
     )
-    learnt = learn(regression, state, prior, is_curve, walks=bool(windows.model.columns))
-    residuals = _rows(windows, regression, learnt)
+    selected = select(regression, state, prior, candidates)
+    claim = claim_of(regression, selected)
     # Of the offsets the Earth's rate is no error of the gyroscope.
-    turn_on = math.sqrt(max(learnt.prior.offset_sd**2 - _EARTH_SD**2, 0.0))
-    told = replace(learnt, prior=replace(learnt.prior, offset_sd=turn_on))
-    triad = build_calibration(windows, regression, told, bags, calibration.unit)
+    turn_on = math.sqrt(max(claim.offset_sd**2 - _EARTH_SD**2, 0.0))
+    triad = build_calibration(
+        windows, regression, selected, replace(claim, offset_sd=turn_on), bags, calibration.unit
+    )
     needed = {*calibration.sensors, *triad.sensors}
     sensors = tuple(name for name in windows.model.sensors if name in needed)
-    return replace(calibration, gyroscope=gyroscope_of(triad), sensors=sensors), residuals
+    told = replace(calibration, gyroscope=gyroscope_of(triad), sensors=sensors)
+    return told, _rows(windows, regression, selected)
 
 
-def _rows(windows: ThermalWindows, regression: Regression, learnt: Learnt) -> tuple[RateRow, ...]:
-    position, fitted = windows.data.position, regression.force(learnt.posterior.state)
-    left_out = left_out_force(regression, learnt)
+def _rows(
+    windows: ThermalWindows, regression: Regression, selected: Selected
+) -> tuple[RateRow, ...]:
+    position, fitted = windows.data.position, regression.force(selected.posterior.state)
     is_dynamic = np.repeat(windows.weight > 0.5, 3)
-    raw, by_fit, by_others = (
-        statistics_by_regime(within_positions(rate, position).ravel(), is_dynamic)
-        for rate in (windows.angular_rate, fitted, left_out)
+    raw, by_fit = (
+        within_positions(rate, position).ravel() for rate in (windows.angular_rate, fitted)
     )
-    return tuple(
-        RateRow(section, raw[section], by_fit[section], by_others[section]) for section in raw
-    )
+    left_out = selected.score.drift.ravel()
+    known = np.isfinite(left_out)
+    tables = [statistics_by_regime(one, is_dynamic) for one in (raw, by_fit)]
+    tables.append(statistics_by_regime(left_out[known], is_dynamic[known]))
+    return tuple(RateRow(section, *(table[section] for table in tables)) for section in tables[0])

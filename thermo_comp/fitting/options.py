@@ -77,6 +77,8 @@ class FitOptions:
     prior: what is known beforehand, of the type or of this unit; its columns are the model
     ageing_bias, ageing_scale: sd of what each has changed by since the prior [m/s^2], [1]; both 0:
         what the bags show
+    mounting_sd: how well mounting and turn-on repeat, sd of the bias [m/s^2]; None: not known
+    gravity_sd: standard deviation of `gravity` [m/s^2]
     serial: unit serial; None takes the sources'
     input: unit of the samples
     full_scale: magnitude of a saturated sample; None takes 32767 for counts, and for m/s^2 the
@@ -98,6 +100,8 @@ class FitOptions:
     prior: Calibration | None = None
     ageing_bias: float = 0.0
     ageing_scale: float = 0.0
+    mounting_sd: float | None = None
+    gravity_sd: float = 0.0
     serial: str | None = None
     input: Literal['counts', 'm/s^2'] = 'counts'
     full_scale: float | None = None
@@ -114,11 +118,11 @@ class FitOptions:
             raise FitError(
                 f'local gravity {self.gravity:g} m/s^2 is not found on Earth ({low}..{high} m/s^2)'
             )
-        for name in ('min_rest_s', 'still_sd', 'full_scale'):
+        for name in ('min_rest_s', 'still_sd', 'full_scale', 'mounting_sd'):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise ValueError(f'`{name}` must be positive, got {value}')
-        for name in ('ageing_bias', 'ageing_scale'):
+        for name in ('ageing_bias', 'ageing_scale', 'gravity_sd'):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f'`{name}` must be 0 or positive, got {getattr(self, name)}')
         if self.offset is not None and not math.isfinite(self.offset):

@@ -30,9 +30,10 @@ from ..unit.calibration import (
 from ..unit.columns import Column
 from .assembly import blank_terms, file_parameters, parameters_of, union, with_parameters
 from .options import FitOptions
-from .posterior import Regression
+from .equations import as_vector
+from .regression import Regression
 from .start import ConstantCalibration
-from .unknowns import Known, State
+from .unknowns import InformativePrior, State
 from .windows import Sets
 
 #: A population needs so many units to have a scatter.
@@ -77,7 +78,7 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
     )
 
 
-def as_known(calibration: Calibration, regression: Regression, state: State) -> State:
+def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
     """Give a state the bias and weights of a calibration, whose scale is nominal."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
@@ -89,9 +90,9 @@ def as_known(calibration: Calibration, regression: Regression, state: State) -> 
     return replace(state, bias=both[0, :, 0], weights=both[..., 1:] * regression.rms)
 
 
-def known_of(
+def informative_priors(
     calibration: Calibration, regression: Regression, state: State, sets: Sets, options: FitOptions
-) -> list[Known]:
+) -> list[InformativePrior]:
     """
     Turn a calibration into priors on its columns, for the evidence, the last to begin with;
     FitError without claim.
@@ -121,7 +122,7 @@ def known_of(
     tried.append((tried[-1][0], _MORE_ALONE[-1]))
     layout = regression.layout(regression.windows.parts)
     to_file = file_parameters(regression, layout, state, sets, range(len(calibration.response)))
-    mean = regression.vector(state, layout)[: layout.n_unit]
+    mean = as_vector(state, layout)[: layout.n_unit]
     result = []
     for known, more in tried:
         diagonal = np.diag(known)
@@ -130,7 +131,7 @@ def known_of(
         scaled, correlation = to_file / root[:, None], known / np.outer(root, root)
         wider = correlation + (_EXACT + more) * np.eye(len(root))
         precision = scaled.T @ np.linalg.solve(wider, scaled)
-        result.append(Known(mean, (precision + precision.T) / 2.0))
+        result.append(InformativePrior(mean, (precision + precision.T) / 2.0))
     return result
 
 

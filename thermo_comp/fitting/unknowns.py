@@ -4,15 +4,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-#: Built-in prior, wide for any triad: bias [m/s^2], relative scale, elements of M [rad].
-BIAS_SD, SCALE_SD, SKEW_SD = 1.0, 0.05, 1e-3
+#: Standard deviation of the bias of a unit whose data were not seen [m/s^2]: 100 mg.
+BIAS_SD = 1.0
+#: The same of its relative scale factor.
+SCALE_SD = 0.05
+#: The same of each element of its misalignment [rad].
+MISALIGNMENT_SD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -21,38 +27,46 @@ class Windows:
     The data: windows sorted by position and time, with every column of the table.
 
     position, bag: numbers from 0; a position lies in one bag, shape (n,)
+    section: number of the program section, from 0, rising with time in each bag, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
     weight: samples of the window over those of a typical one, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
     columns: values of the columns, in their physical units, with start states at their prior mean,
         shape (n, m)
     groups: group of each column
+    kelvins: temperature change that the RMS of each column stands for [K], 0 for a column that
+        never moved, shape (m,)
     lag: the lag whose start state moves a column; -1 for none, shape (m,)
-    reach: how long a memory asks for each column [s]; 0 for none, shape (m,)
     start: derivative of each column by that state, shape (n, m)
     start_covariance: prior of the start states [K^2], shape (n_lags, n_lags)
     in_scale: which columns the scale may have as well as the bias, shape (m,)
-    lean: what a support may lean with, in units of their RMS, shape (n, k)
+    tilt: temperatures that a support may tilt with, relative to their RMS, shape (n, k)
     """
 
     position: Ints
     bag: Ints
+    section: Ints
     time: Floats
     weight: Floats
     mean: Floats
     columns: Floats
     groups: tuple[str, ...]
+    kelvins: Floats
     lag: Ints
-    reach: Floats
     start: Floats
     start_covariance: Floats
     in_scale: Bools
-    lean: Floats
+    tilt: Floats
 
     @property
     def n_positions(self) -> int:
         """Number of positions."""
         return int(self.position[-1]) + 1
+
+    @property
+    def n_sections(self) -> int:
+        """Number of program sections."""
+        return int(self.section.max()) + 1
 
     @property
     def parts(self) -> Bools:
@@ -65,9 +79,24 @@ class Windows:
         return self.bag[np.searchsorted(self.position, np.arange(self.n_positions))]
 
 
+class Noise(NamedTuple):
+    """
+    Gauss-Markov part of the noise: its stationary variance over that of the white noise of a
+    typical window, 0 for none, and its correlation time [s].
+    """
+
+    ratio: float = 0.0
+    time_s: float = 1.0
+
+    @property
+    def rate(self) -> float:
+        """Sd of the random walk that it is over short times, over the white sd [1/sqrt(s)]."""
+        return math.sqrt(2.0 * self.ratio / self.time_s)
+
+
 @dataclass(frozen=True)
-class Known:
-    """What is known of the unit's own parameters, as `Layout` has them: mean, 1 / covariance."""
+class InformativePrior:
+    """Prior of the unit's parameters in the order of `Layout`: mean and inverse covariance."""
 
     mean: Floats
     precision: Floats
@@ -79,54 +108,56 @@ class Prior:
     What is known beforehand; standard deviations, inf for nothing.
 
     bias_mean, bias_sd: [m/s^2], shape (3,)
-    scale_sd: of kappa, about 1
-    skew_sd: of the elements of M [rad]
-    widths: of the weights of each column, in units of its RMS, in the bias [m/s^2] and in the
+    scale_sd: of the scale ratio kappa, about 1
+    misalignment_sd: of the elements of M [rad]
+    column_sd: of the weights of each column, in units of its RMS, in the bias [m/s^2] and in the
         scale (relative); 0 for a column that takes no part, shape (2, m)
-    offset_sd: of the offset of each position and axis [m/s^2]
+    offset_sd: of the bias offset of each position and axis [m/s^2]: mounting and turn-on
     sigma: white noise of a typical window [m/s^2], shape (3,)
-    rho: variance per second of the walk over that of the white noise, shape (3,)
-    least_offset_sd: what offset_sd is at least, whatever the data say [m/s^2]
-    lean_sd: what the supports lean by [rad per RMS of what they lean with]
-    start_share: of the run-time prior's variance of the start states, what these bags have
-    known: takes the place of all widths of the unit's own parameters; these say only which columns
-        take part
+    noise: its Gauss-Markov companion
+    offset_scale: scale of the half-Student prior of offset_sd [m/s^2]; 0 keeps offset_sd
+    tilt_sd: of a support's tilt [rad per RMS of a temperature that it follows]
+    start_share: variance of the start states over that of the run-time prior
+    informative: takes the place of all the above for the unit's own parameters; column_sd then
+        only says which columns take part
     """
 
     bias_mean: Floats
     bias_sd: Floats
     scale_sd: float
-    skew_sd: float
-    widths: Floats
+    misalignment_sd: float
+    column_sd: Floats
     offset_sd: float
     sigma: Floats
-    rho: Floats
-    least_offset_sd: float = 0.0
-    lean_sd: float = 1e-7
+    noise: Noise = Noise()
+    offset_scale: float = 0.0
+    tilt_sd: float = 1e-7
     start_share: float = 1.0
-    known: Known | None = None
+    informative: InformativePrior | None = None
 
 
 @dataclass(frozen=True)
 class State:
     """
-    The unknowns; weights are of columns in units of their RMS, in bias and scale, shape (2, 3, m);
-    lean is of each position, along its tangents, shape (n_positions, k, 2).
+    The unknowns: scale ratio kappa and bias, shape (3,); weights of columns in units of their RMS,
+    in bias and scale, shape (2, 3, m); misalignment of the inverse of M, shape (3,); attitudes
+    (n_positions, 3); offsets (n_positions, 3); support tilts along each attitude's tangents
+    (n_positions, k, 2); start states of each bag, in units of their sd (n_bags, r).
     """
 
     kappa: Floats
     bias: Floats
     weights: Floats
-    skew: Floats
+    misalignment: Floats
     up: Floats
     offset: Floats
-    lean: Floats
+    tilt: Floats
     start: Floats
 
     @cached_property
     def inverse(self) -> Floats:
         """Return the inverse of M."""
-        return inverse_misalignment(self.skew)
+        return inverse_misalignment(self.misalignment)
 
     @cached_property
     def tangents(self) -> Floats:
@@ -139,23 +170,21 @@ class Layout:
     """
     Places of the unknowns in the vector of parameters, those of the unit first.
 
-    axis: all unknowns of each axis: kappa, bias, weights, shape (3, k)
+    axis: kappa, bias and weights of each axis, shape (3, k)
     weights: shape (2, 3, m); -1 for columns that take no part
     blocks: those of each bag
-    base: what takes part of the base columns
     """
 
     axis: Ints
     weights: Ints
-    skew: Ints
+    misalignment: Ints
     up: Ints
     offset: Ints
-    lean: Ints
+    tilt: Ints
     start: Ints
     n_unit: int
     blocks: tuple[slice, ...]
     n: int
-    base: Ints
 
     @property
     def kappa(self) -> Ints:
@@ -167,6 +196,41 @@ class Layout:
         """Places of the bias, shape (3,)."""
         return self.axis[:, 1]
 
+    @property
+    def used(self) -> Bools:
+        """Which columns of bias and scale take part, shape (2, m)."""
+        return np.asarray(self.weights[:, 0] >= 0)
+
+
+def lay_out(used: Bools, bag_of_position: Ints, n_tilts: int, n_starts: int) -> Layout:
+    """Give every unknown its place; `used`: columns of bias and scale, shape (2, m)."""
+    n = 0
+
+    def take(*shape: int) -> Ints:
+        nonlocal n
+        size = int(np.prod(shape))
+        n += size
+        return np.arange(n - size, n).reshape(shape)
+
+    axis = take(3, 2 + int(used.sum()))
+    weights = np.full((2, 3, used.shape[1]), -1)
+    weights.transpose(1, 0, 2)[:, used] = axis[:, 2:]
+    misalignment = take(3)
+    n_unit = n
+    n_positions, n_bags = len(bag_of_position), int(bag_of_position.max()) + 1
+    up = np.empty((n_positions, 2), dtype=np.int64)
+    offset = np.empty((n_positions, 3), dtype=np.int64)
+    tilt = np.empty((n_positions, n_tilts, 2), dtype=np.int64)
+    start = np.empty((n_bags, n_starts), dtype=np.int64)
+    blocks = []
+    for bag in range(n_bags):
+        first = n
+        for p in np.flatnonzero(bag_of_position == bag):
+            up[p], offset[p], tilt[p] = take(2), take(3), take(n_tilts, 2)
+        start[bag] = take(n_starts)
+        blocks.append(slice(first, n))
+    return Layout(axis, weights, misalignment, up, offset, tilt, start, n_unit, tuple(blocks), n)
+
 
 def tangent_basis(up: Floats) -> Floats:
     """Two unit vectors across each given one, shape (n, 3, 2)."""
@@ -177,24 +241,8 @@ def tangent_basis(up: Floats) -> Floats:
     return np.stack((first, np.cross(up, first)), axis=2)
 
 
-def inverse_misalignment(skew: Floats) -> Floats:
+def inverse_misalignment(misalignment: Floats) -> Floats:
     """Return A = M^-1: from the frame to the sensitivity axes, lower triangular, unit diagonal."""
     matrix = np.eye(3)
-    matrix[1, 0], matrix[2, 0], matrix[2, 1] = skew
+    matrix[1, 0], matrix[2, 0], matrix[2, 1] = misalignment
     return matrix
-
-
-def initial_state(
-    windows: Windows, n_bags: int, bias: Floats, kappa: Floats, skew: Floats, up: Floats
-) -> State:
-    """Make a state without any thermal term."""
-    return State(
-        kappa=kappa,
-        bias=bias,
-        weights=np.zeros((2, 3, len(windows.groups))),
-        skew=skew,
-        up=up,
-        offset=np.zeros((len(up), 3)),
-        lean=np.zeros((len(up), windows.lean.shape[1], 2)),
-        start=np.zeros((n_bags, len(windows.start_covariance))),
-    )

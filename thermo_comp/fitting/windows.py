@@ -32,6 +32,9 @@ _WINDOW_S = 60.0
 CURVE, SET = 'curve', 'set'
 #: A short rest still has so many windows: from less, no noise is learnt.
 FEWEST_WINDOWS = 20
+#: A position is cut into so many sections of equal length; chamber programs repeat over bags, so
+#: these are sections of the program.
+N_SECTIONS = 5
 # After this every lag has forgotten how it began [s].
 _EVER_S = 1e9
 
@@ -169,19 +172,23 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     k, m = len(columns), len(groups) + len(columns)
     moved_at, end = 4 + k + m, 4 + k + m + len(columns)
     lag = [spec.lags.index(one.lag) if one.lag and one.kind != 'play' else -1 for one in columns]
-    # A support follows the chamber: some of it the board, some what is around it.
-    lean = np.column_stack((rows[:, 0] - reference, rows[:, 3]))
-    size = np.sqrt(np.mean(lean**2, axis=0))
+    t, gradient = rows[:, 0] - reference, rows[:, 3]
+    # A support follows the chamber, linearly and not: partly the board, partly what is around it.
+    tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
+    tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
+    is_tilting = tilt_rms > 0.0
+    values = rows[:, 4 + k : moved_at]
     data = Windows(
         position=position,
         bag=bag_of,
+        section=_sections(position, time),
         time=time,
         weight=count / float(np.median(count)),
         mean=mean,
-        columns=rows[:, 4 + k : moved_at],
+        columns=values,
         groups=(*groups, *(column.group for column in columns)),
         lag=np.array([-1] * len(groups) + lag, dtype=np.int64),
-        reach=np.array([0.0] * len(groups) + [column.reach_s for column in columns]),
+        kelvins=_kelvins(sets, columns, values, rows[:, 4 : 4 + k], t, gradient),
         start=np.hstack((np.zeros((len(time), len(groups))), rows[:, moved_at:end])),
         start_covariance=start_covariance(spec.lags),
         # Fc is 1 at the reference in either regime, so the scale has no level of its own there;
@@ -190,7 +197,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
             [not (group == SET and is_level) for group, is_level in sets.levels()]
             + [column.kind != 'play' for column in columns]
         ),
-        lean=lean[:, size > 0.0] / size[size > 0.0],
+        tilt=tilt[:, is_tilting] / tilt_rms[is_tilting],
     )
     return ThermalWindows(
         model,
@@ -204,6 +211,37 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
         typical_count=float(np.median(count)),
         rests=tuple(rests),
     )
+
+
+def _sections(position: Ints, time: Floats) -> Ints:
+    """Number the section of each window of its position, shape (n,)."""
+    first = np.searchsorted(position, np.arange(int(position[-1]) + 1))
+    last = np.append(first[1:], len(position)) - 1
+    begin, end = time[first][position], time[last][position]
+    part = (time - begin) / np.maximum(end - begin, 1e-9)
+    return np.minimum((part * N_SECTIONS).astype(np.int64), N_SECTIONS - 1)
+
+
+def _kelvins(
+    sets: Sets, columns: Sequence[Column], values: Floats, raw: Floats, t: Floats, gradient: Floats
+) -> Floats:
+    """
+    Say for which temperature change the RMS of each column stands [K], shape (m,): the RMS over
+    the steepest slope that the column has in these data. It is 0 where a column never moved.
+    """
+    farthest = float(np.abs(t).max(initial=0.0))
+    flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
+    grid = np.linspace(float(t.min()), float(t.max()) + 1e-9, 100)
+    curves = sets.columns(grid, np.full_like(grid, 0.5))
+    slopes = [float(np.abs(np.gradient(one, grid)).max()) for one in curves]
+    rms = np.sqrt(np.mean(values**2, axis=0))
+    # The level of a set is of the size of what else tells ramps from soaks: a gradient.
+    levels = [is_level for _, is_level in sets.levels()]
+    steepest = [1.0 / flow if lev else one for lev, one in zip(levels, slopes, strict=True)]
+    for column, own in zip(columns, raw.T, strict=True):
+        steepest.append(column.steepest(own, flow) * farthest**column.power)
+    slope = np.array(steepest)
+    return np.where(slope > 0.0, rms / np.where(slope > 0.0, slope, 1.0), 0.0)
 
 
 def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[Floats, Floats, Bools]:

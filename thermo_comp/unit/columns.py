@@ -50,6 +50,9 @@ from .schema import Bounds, NotNegative, check_ranges
 
 #: A range that holds nothing back, of any value.
 UNBOUNDED: Final = (-1e9, 1e9)
+#: Lag of a board behind its case where bags do not tell it [s]: some 15 min, typical of a housing
+#: of some hundred grams in a chamber.
+USUAL_BOARD_LAG_S: Final = 900.0
 #: Time constants of the bank: from a few readings to the longest memory that bags can show [s].
 #: Lags themselves are fine enough for one of 100 ug/K between two of them; their products are not
 #: so large, and take every other.
@@ -128,10 +131,17 @@ class Column:
         """Which power of the temperatures the value grows with, before t multiplies it."""
         return {'square': 2, 'cube': 3}.get(self.kind, 1)
 
-    @property
-    def reach_s(self) -> float:
-        """How long a memory asks for the column [s]: for one of the third order, the longest."""
-        return math.inf if self.lag and self.order + self.power > 2 else self.tau_s
+    def steepest(self, raw: Floats, flow_k: float) -> float:
+        """
+        Return the steepest slope [1/K] that values before powers of t had by the temperature
+        difference they are made of; one without unit by the RMS of the gradient, `flow_k` [K].
+        """
+        if self.kind == 'even':
+            return 1.0 / flow_k
+        if self.kind == 'rate':
+            return 1.0 / USUAL_BOARD_LAG_S
+        largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
+        return self.order * largest ** (self.order - 1)
 
 
 def bank(

@@ -1,0 +1,359 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the linearised measurement equation of the windows, and its products over the windows.
+
+Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
+
+    N / K0 = kappa a (1 + S s) + b + B beta + o_p + kappa (A l_p)_i g + noise,
+    a = (A u_p)_i g,  A = M^-1,  l_p across u_p: tilt of the support
+
+B and S are columns of one table (`unit.columns`), each divided by its RMS. With g = 0 this is the
+equation of an angular rate: b, B beta and o_p remain. Everything is a combination of a few base
+series (one, columns, their derivatives by the start states, temperatures of the support, the
+measured values), so the products of the whitened base series of each position and section hold
+all that the regression asks of the windows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..typing import Bools, Floats, Ints
+from .noise import Whitener
+from .unknowns import Layout, Noise, Prior, State, Windows, lay_out
+
+#: Row and column of the elements of M^-1 that are unknown.
+MISALIGNMENT_ROWS = ((1, 0), (2, 0), (2, 1))
+# Start states vary along few directions: the others have less of the largest variance than this.
+_LEAST_START = 1e-6
+# A derivative by a start state that has faded below this is 0: denormal numbers are slow.
+_FADED = 1e-9
+
+
+@dataclass(frozen=True)
+class Products:
+    """
+    Products of the base series of the columns in use.
+
+    columns: the columns in use; moved: which of those a start state moves; lag: by which lag
+    means: mean of the base series in each position, shape (n_positions, n_base)
+    cells: products in each position and section, shape (n_cells, n_base, n_base)
+    first: first cell of each position; section: section of each cell
+    """
+
+    columns: Ints
+    moved: Ints
+    lag: Ints
+    means: Floats
+    cells: Floats
+    first: Ints
+    section: Ints
+
+    @cached_property
+    def whole(self) -> Floats:
+        """Products of each position, shape (n_positions, n_base, n_base)."""
+        return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
+
+    def without(self, section: int) -> Floats:
+        """Products of each position without one section, shape as of `whole`."""
+        result = self.whole.copy()
+        position = np.cumsum(np.isin(np.arange(len(self.cells)), self.first)) - 1
+        gone = np.flatnonzero(self.section == section)
+        result[position[gone]] -= self.cells[gone]
+        return result
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """
+    The equations about a state: derivative of each axis in each position by its unknowns, and
+    measured minus predicted, both as combinations of the base series: shapes
+    (n_positions, 3, n_base, n_unknowns) and (n_positions, 3, n_base).
+
+    The unknowns of an axis: kappa, bias, weights, misalignment (3), up (2), offset, tilts, starts.
+    """
+
+    derivatives: Floats
+    residual: Floats
+
+
+class Equations:
+    """
+    The measurement equations of a fit.
+
+    windows: the data
+    gravity: local gravity; 0 for an angular rate
+    nominal_scale: K0 [input units per m/s^2], shape (3,)
+    """
+
+    def __init__(self, windows: Windows, gravity: float, nominal_scale: Floats) -> None:
+        self.windows = windows
+        self.gravity = gravity
+        self.nominal_scale = nominal_scale
+        self.measured = windows.mean / nominal_scale
+        self.rms = np.sqrt(np.mean(windows.columns**2, axis=0))
+        self.rms[self.rms == 0.0] = 1.0
+        self.columns = windows.columns / self.rms
+        self.bag_of_position = windows.bag_of_position
+        self.n_bags = int(windows.bag.max()) + 1
+        self._starts = np.where(np.abs(windows.start) < _FADED, 0.0, windows.start) / self.rms
+        values, vectors = np.linalg.eigh(windows.start_covariance)
+        kept = values > _LEAST_START * values.max(initial=0.0)
+        #: Start states are this times their standardised components, shape (n_lags, r).
+        self.start_root = vectors[:, kept] * np.sqrt(values[kept])
+        first = np.searchsorted(windows.position, np.arange(windows.n_positions))
+        level = np.add.reduceat(self.measured, first, axis=0)
+        level /= np.diff(np.append(first, len(windows.position)))[:, None]
+        self.level = level
+        self._centred = self.measured - level[windows.position]
+        new_cell = np.diff(windows.position, prepend=-1) != 0
+        new_cell |= np.diff(windows.section, prepend=-1) != 0
+        self._cells = np.flatnonzero(new_cell)
+        self.whitener = Whitener(windows.position, windows.time)
+        self.reweigh(windows.weight)
+
+    def initial_state(self, bias: Floats, misalignment: Floats, up: Floats) -> State:
+        """Make a state without any effect of temperature, of the nominal scale factors."""
+        return State(
+            kappa=np.ones(3),
+            bias=bias,
+            weights=np.zeros((2, 3, len(self.windows.groups))),
+            misalignment=misalignment,
+            up=up,
+            offset=np.zeros((len(up), 3)),
+            tilt=np.zeros((len(up), self.windows.tilt.shape[1], 2)),
+            start=np.zeros((self.n_bags, self.start_root.shape[1])),
+        )
+
+    def reweigh(self, weight: Floats) -> None:
+        """Take other weights of the windows, shape (n,)."""
+        self.weight = weight
+        self.noise: Noise | None = None
+        self._products: tuple[Bools, Products] | None = None
+
+    def layout(self, used: Bools) -> Layout:
+        """Give every unknown its place; `used`: columns of bias and scale, shape (2, m)."""
+        moved = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
+        return lay_out(
+            used,
+            self.bag_of_position,
+            self.windows.tilt.shape[1],
+            self.start_root.shape[1] if moved else 0,
+        )
+
+    def whiten(self, noise: Noise) -> None:
+        """Filter all base series with a noise, unless that is done."""
+        if noise == self.noise:
+            return
+        gains = self.whitener.gains(self.weight, noise)
+        self.noise, self._products = noise, None
+        self.noise_determinant = self.whitener.log_determinant(gains)
+        others = np.hstack((np.ones((len(self.weight), 1)), self.windows.tilt, self._centred))
+        self._filtered_columns = self.whitener.filter(self.columns, gains)
+        self._filtered_starts = self.whitener.filter(self._starts, gains)
+        self._filtered_others = self.whitener.filter(others, gains)
+
+    def products(self, used: Bools) -> Products:
+        """Form the products of the columns in use, shape (2, m), under the current noise."""
+        taken = used.any(axis=0)
+        if self._products is not None and np.array_equal(self._products[0], taken):
+            return self._products[1]
+        columns = np.flatnonzero(taken)
+        moved = np.flatnonzero(self.windows.lag[columns] >= 0)
+        at_start = columns[moved]
+        filtered = self._filtered_others
+        base = np.hstack(
+            (
+                filtered[:, :1],
+                self._filtered_columns[:, columns],
+                self._filtered_starts[:, at_start],
+                filtered[:, 1:],
+            )
+        )
+        ends = np.append(self._cells[1:], len(base))
+        cells = np.stack([base[a:b].T @ base[a:b] for a, b in zip(self._cells, ends, strict=True)])
+        position = self.windows.position[self._cells]
+        plain = np.hstack(
+            (
+                np.ones((len(base), 1)),
+                self.columns[:, columns],
+                self._starts[:, at_start],
+                self.windows.tilt,
+                self._centred,
+            )
+        )
+        first = np.searchsorted(self.windows.position, np.arange(self.windows.n_positions))
+        count = np.diff(np.append(first, len(base)))[:, None]
+        result = Products(
+            columns,
+            moved,
+            self.windows.lag[at_start],
+            np.add.reduceat(plain, first, axis=0) / count,
+            cells,
+            np.flatnonzero(np.diff(position, prepend=-1) != 0),
+            self.windows.section[self._cells],
+        )
+        self._products = taken, result
+        return result
+
+    def absent_products(self, absent: Ints, used: Bools, p: int) -> tuple[Floats, Floats]:
+        """Products of absent columns of a position: among themselves, with the base in use."""
+        a, b = np.searchsorted(self.windows.position, (p, p + 1))
+        present = self.products(used)
+        own, filtered = self._filtered_columns[a:b, absent], self._filtered_others[a:b]
+        base = np.hstack(
+            (
+                filtered[:, :1],
+                self._filtered_columns[a:b, present.columns],
+                self._filtered_starts[a:b, present.columns[present.moved]],
+                filtered[:, 1:],
+            )
+        )
+        return own.T @ own, own.T @ base
+
+    def tangent(self, state: State, layout: Layout, products: Products) -> Tangent:
+        """Linearise the equations about a state."""
+        used, columns = layout.used, products.columns
+        n_positions, n_columns = self.windows.n_positions, len(columns)
+        n_tilts, n_starts = self.windows.tilt.shape[1], layout.start.shape[1]
+        n_base = products.cells.shape[1]
+        force = self.gravity * state.up @ state.inverse.T
+        effect = self._effect(state, products)
+        behind = 1 + n_columns + np.arange(len(products.moved))
+        on_bias, on_scale = state.weights[:, :, columns]
+        # Per axis: what multiplies kappa a, with the base series of one first.
+        scaled = np.swapaxes(effect @ on_scale.T, 1, 2)
+        scaled[:, :, 0] = 1.0
+        first_tilt = n_base - 3 - n_tilts
+        across = self._across(state)
+        in_bias, in_scale = (np.flatnonzero(one[columns]) for one in used)
+        n_own = 2 + len(in_bias) + len(in_scale)
+        n_all = n_own + 6 + 2 * n_tilts + n_starts
+        T = np.zeros((n_positions, 3, n_base, n_all))
+        T[..., 0] = force[:, :, None] * scaled
+        T[:, :, 0, 1] = 1.0
+        T[..., 2 : 2 + len(in_bias)] = effect[:, None, :, in_bias]
+        times = (state.kappa * force)[:, :, None, None]
+        T[..., 2 + len(in_bias) : n_own] = times * effect[:, None, :, in_scale]
+        for k, (row, source) in enumerate(MISALIGNMENT_ROWS):
+            turned = self.gravity * state.kappa[row] * state.up[:, source]
+            T[:, row, :, n_own + k] = turned[:, None] * scaled[:, row]
+        T[..., n_own + 3 : n_own + 5] = across[:, :, None, :] * scaled[..., None]
+        T[:, :, 0, n_own + 5] = 1.0
+        for k in range(n_tilts):
+            at = slice(n_own + 6 + 2 * k, n_own + 8 + 2 * k)
+            T[:, :, first_tilt + k, at] = across
+        if n_starts:
+            weight = on_bias + times[..., 0] * on_scale
+            moved = weight[:, :, products.moved, None] * self.start_root[products.lag]
+            T[:, :, behind, n_all - n_starts :] = moved
+        return Tangent(T, self.misfit(state, products))
+
+    def misfit(self, state: State, products: Products) -> Floats:
+        """Measured minus predicted as combinations of the base, (n_positions, 3, n_base)."""
+        n_base, n_tilts = products.cells.shape[1], self.windows.tilt.shape[1]
+        force = self.gravity * state.up @ state.inverse.T
+        on_bias, on_scale = state.weights[:, :, products.columns]
+        weight = on_bias + (state.kappa * force)[:, :, None] * on_scale
+        result = -weight @ np.swapaxes(self._effect(state, products), 1, 2)
+        result[:, :, 0] = self.level - (state.kappa * force + state.bias + state.offset)
+        tilted = np.einsum('pkt,pit->pik', state.tilt, self._across(state))
+        result[:, :, n_base - 3 - n_tilts : n_base - 3] = -tilted
+        result[:, [0, 1, 2], n_base - 3 + np.arange(3)] = 1.0
+        return np.asarray(result)
+
+    def _across(self, state: State) -> Floats:
+        """Say what a turn of each attitude does to each axis, (n_positions, 3, 2)."""
+        turned = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
+        return np.asarray(self.gravity * state.kappa[:, None] * turned)
+
+    def _effect(self, state: State, products: Products) -> Floats:
+        """
+        Say how each column acts as a combination of the base, (n_positions, n_base, n_columns):
+        by itself, and by what the start states of the bag add to it.
+        """
+        n_columns = len(products.columns)
+        start = state.start[self.bag_of_position] @ self.start_root.T
+        effect = np.zeros((self.windows.n_positions, products.cells.shape[1], n_columns))
+        effect[:, 1 + np.arange(n_columns), np.arange(n_columns)] = 1.0
+        behind = 1 + n_columns + np.arange(len(products.moved))
+        effect[:, behind, products.moved] = start[:, products.lag]
+        return effect
+
+    def residual(self, state: State, layout: Layout) -> Floats:
+        """Measured minus predicted, shape (n, 3) [m/s^2]."""
+        products = self.products(layout.used)
+        misfit = self.misfit(state, products)
+        at_start = products.columns[products.moved]
+        base = np.hstack(
+            (
+                np.ones((len(self.weight), 1)),
+                self.columns[:, products.columns],
+                self._starts[:, at_start],
+                self.windows.tilt,
+                self._centred,
+            )
+        )
+        of_window = misfit[self.windows.position]
+        return np.asarray(np.einsum('nb,nib->ni', base, of_window))
+
+    def force(self, state: State, rows: slice = slice(None)) -> Floats:
+        """Correct windows as the compensator would, that knows no offset, shape (n, 3)."""
+        columns = self.columns[rows]
+        along = self.measured[rows] - state.bias - columns @ state.weights[0].T
+        along /= state.kappa * (1.0 + columns @ state.weights[1].T)
+        return np.asarray(along @ np.linalg.inv(state.inverse).T)
+
+    def precision(self, prior: Prior, layout: Layout) -> Floats:
+        """Inverse variances of the prior, shape (n,); 0 for what an informative prior knows."""
+        result = np.zeros(layout.n)
+        result[layout.kappa] = prior.scale_sd**-2
+        result[layout.bias] = prior.bias_sd**-2.0
+        result[layout.axis[:, 2:]] = prior.column_sd[prior.column_sd > 0.0] ** -2.0
+        result[layout.misalignment] = prior.misalignment_sd**-2
+        if prior.informative is not None:
+            result[: layout.n_unit] = 0.0
+        result[layout.offset] = prior.offset_sd**-2
+        result[layout.tilt] = prior.tilt_sd**-2
+        result[layout.start] = 1.0 / prior.start_share
+        # Attitudes are flat on the sphere, and nothing to an angular rate: they stay there.
+        result[layout.up] = 0.0 if self.gravity else 1.0
+        return result
+
+    def prior_mean(self, prior: Prior, layout: Layout) -> Floats:
+        """Mean of the prior; 0 for all but kappa and bias, shape (n,)."""
+        mean = np.zeros(layout.n)
+        if prior.informative is not None:
+            mean[: layout.n_unit] = prior.informative.mean
+            return mean
+        mean[layout.kappa] = 1.0
+        mean[layout.bias] = prior.bias_mean
+        return mean
+
+
+#: Unknowns that a step is added to; attitudes move in their tangent planes.
+_ADDED = ('kappa', 'bias', 'weights', 'misalignment', 'offset', 'tilt', 'start')
+
+
+def as_vector(state: State, layout: Layout) -> Floats:
+    """Give the unknowns as a vector; attitudes as 0, they move in the tangent plane."""
+    result = np.zeros(layout.n + 1)
+    for name in _ADDED if layout.start.size else _ADDED[:-1]:
+        result[getattr(layout, name)] = getattr(state, name)
+    return result[:-1]
+
+
+def moved_by(state: State, step: Floats, layout: Layout) -> State:
+    """Add a step to a state; what takes no part is 0."""
+    padded = np.append(step, 0.0)
+    up = state.up + np.einsum('pij,pj->pi', state.tangents, padded[layout.up])
+    moved = {
+        name: getattr(state, name) + padded[getattr(layout, name)]
+        for name in (_ADDED if layout.start.size else _ADDED[:-1])
+    }
+    moved['weights'] = np.where(layout.weights >= 0, moved['weights'], 0.0)
+    return replace(state, up=up / np.linalg.norm(up, axis=1, keepdims=True), **moved)

@@ -1,0 +1,216 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the score of a model: the error of its correction on data that took no part in the fit.
+
+Left out are, in turn, each position and each section of the program in all positions at once. The
+left-out windows are corrected as the node would correct them: by the unit's parameters alone, with
+start states at their run-time mean, without mounting offsets and without tilts of the support.
+Judged are the drift, which is each axis less its mean over the position (a constant attitude needs
+no other knowledge), and the norm of the position where the other positions determine it.
+
+References
+----------
+.. [1] D. R. Roberts et al., Cross-validation strategies for data with temporal, spatial,
+   hierarchical, or phylogenetic structure, Ecography 40 (2017): leave out blocks.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..typing import Floats
+from .equations import moved_by
+from .regression import Normal, Posterior, Reduced, Regression
+from .unknowns import Prior, State
+
+# The norm of a left-out position counts where the others leave it no more than this times the
+# variance that all positions and the mounting leave it.
+_DETERMINED = 10.0
+# Fewer windows of a position have no drift to speak of.
+_FEWEST_WINDOWS = 8
+# Gauss-Newton steps that a fit without a section takes from the fit of everything.
+_SECTION_STEPS = 2
+# With one fold there is no scatter to take a standard error from.
+_ERROR_OF_ONE = 0.1
+
+
+@dataclass(frozen=True)
+class Folds:
+    """
+    Mean square error of each fold of one kind [(m/s^2)^2], NaN where it says nothing, and the
+    windows of each, shape (n,).
+    """
+
+    square: Floats
+    windows: Floats
+
+    @property
+    def rms(self) -> float:
+        """RMS error over all windows of the folds [m/s^2]; NaN without folds."""
+        known = np.isfinite(self.square)
+        if not known.any():
+            return float('nan')
+        return float(np.sqrt(np.average(self.square[known], weights=self.windows[known])))
+
+    def gain_of(self, other: Folds) -> tuple[float, float] | None:
+        """
+        Log ratio of the mean square error to that of another model, over the folds in common, and
+        its jackknife standard error; None without such folds.
+        """
+        known = np.isfinite(self.square) & np.isfinite(other.square)
+        n = int(known.sum())
+        if not n:
+            return None
+        before, after = ((one.square * one.windows)[known] + 1e-300 for one in (self, other))
+        gain = float(np.log(before.sum() / after.sum()))
+        if n == 1:
+            return gain, _ERROR_OF_ONE
+        without = np.log((before.sum() - before) / (after.sum() - after))
+        spread = np.sum((without - without.mean()) ** 2)
+        return gain, float(np.sqrt((n - 1) / n * spread))
+
+
+@dataclass(frozen=True)
+class Score:
+    """
+    Left-out errors of a model.
+
+    positions, sections: drift of left-out positions, and of left-out sections of the program
+    norms: ``|f| - g`` of left-out positions whose norm the others determine
+    force: corrected windows, each position by the others, NaN where its norm is not determined,
+        shape (n, 3)
+    drift: drift of each window by the others, or where there is one position, by the other
+        sections, shape (n, 3)
+    """
+
+    positions: Folds
+    sections: Folds
+    norms: Folds
+    force: Floats
+    drift: Floats
+
+    @property
+    def kinds(self) -> tuple[Folds, Folds, Folds]:
+        """Folds of each kind."""
+        return self.positions, self.sections, self.norms
+
+    @property
+    def rms(self) -> float:
+        """The headline: RMS drift of what was left out, the larger of the two kinds of folds."""
+        found = [one.rms for one in (self.positions, self.sections) if np.isfinite(one.rms)]
+        return max(found, default=float('nan'))
+
+
+def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Score:
+    """Leave out each position and each section, and judge the correction of the rest there."""
+    regression.whiten(prior.noise)
+    windows, state, layout = regression.windows, posterior.state, posterior.layout
+    tangent = regression.tangent(state, layout, regression.products(layout.used))
+    normal = regression.normal(tangent, regression.products(layout.used).whole, prior)
+    reduced = regression.reduce(normal, prior, layout, state)
+    n_positions = windows.n_positions
+    edges = np.searchsorted(windows.position, np.arange(n_positions + 1))
+    counts = np.diff(edges).astype(np.float64)
+    share = regression.weight / windows.weight
+    force = np.full((len(windows.time), 3), np.nan)
+    drift = np.full_like(force, np.nan)
+    squares, norms = np.full(n_positions, np.nan), np.full(n_positions, np.nan)
+    for p in range(n_positions) if n_positions > 1 else ():
+        rows = slice(edges[p], edges[p + 1])
+        moved, covariance = _without_position(regression, posterior, prior, normal, reduced, p)
+        own = regression.force(moved, rows)
+        weight = share[rows]
+        level = np.average(own, axis=0, weights=weight)
+        drift[rows] = own - level
+        if rows.stop - rows.start >= _FEWEST_WINDOWS:
+            square = np.mean(drift[rows] ** 2, axis=1)
+            squares[p] = np.average(square, weights=weight)
+        if _is_norm_determined(regression, posterior, prior, tangent.derivatives, covariance, p):
+            force[rows] = own
+            error = np.linalg.norm(own, axis=1) - regression.gravity
+            norms[p] = np.average(error**2, weights=weight)
+    by_section, section_drift = _sections(regression, posterior, prior, edges, share)
+    if n_positions == 1:
+        drift = section_drift
+    return Score(Folds(squares, counts), by_section, Folds(norms, counts), force, drift)
+
+
+def _without_position(
+    regression: Regression,
+    posterior: Posterior,
+    prior: Prior,
+    normal: Normal,
+    reduced: Reduced,
+    p: int,
+) -> tuple[State, Floats]:
+    """Fit the unit without a position, to first order: the state and the covariance."""
+    state, layout = posterior.state, posterior.layout
+    bag = regression.bag_of_position[[p]]
+    rest = regression.reduce(normal, prior, layout, state, bag, without=p)
+    information = reduced.information.sum(axis=0) - reduced.information[bag[0]]
+    pull = reduced.pull.sum(axis=0) - reduced.pull[bag[0]] + rest.pull[0]
+    step, factor = regression.unit_step(
+        information + rest.information[0], pull, prior, layout, state
+    )
+    whole = np.zeros(layout.n)
+    whole[: layout.n_unit] = step
+    inverse = np.linalg.inv(factor)
+    return moved_by(state, whole, layout), inverse.T @ inverse
+
+
+def _is_norm_determined(
+    regression: Regression,
+    posterior: Posterior,
+    prior: Prior,
+    derivatives: Floats,
+    covariance: Floats,
+    p: int,
+) -> bool:
+    """Whether the norm of a position is almost as sure by the others, whose covariance is given."""
+    if not regression.gravity:
+        return False
+    state, layout = posterior.state, posterior.layout
+    own = layout.axis.shape[1] + 3
+    base = regression.products(layout.used).means[p]
+    on_axes = np.linalg.inv(state.inverse).T @ state.up[p] / state.kappa
+    along = np.zeros(layout.n_unit)
+    for axis in range(3):
+        places = np.concatenate((layout.axis[axis], layout.misalignment))
+        along[places] += on_axes[axis] * (base @ derivatives[p, axis, :, :own])
+    everything = along @ posterior.covariance @ along + prior.offset_sd**2
+    return bool(along @ covariance @ along < _DETERMINED * everything)
+
+
+def _sections(
+    regression: Regression, posterior: Posterior, prior: Prior, edges: Floats, share: Floats
+) -> tuple[Folds, Floats]:
+    """Leave out each section in all positions; the drift is about the mean of what stayed."""
+    windows, layout = regression.windows, posterior.layout
+    products = regression.products(layout.used)
+    drift = np.full((len(windows.time), 3), np.nan)
+    n_sections = windows.n_sections
+    squares, counts = np.full(n_sections, np.nan), np.zeros(n_sections)
+    for section in range(n_sections) if n_sections > 1 else ():
+        grams = products.without(section)
+        state = posterior.state
+        for _ in range(_SECTION_STEPS):
+            step, *_rest = regression.step(state, prior, layout, grams)
+            state = moved_by(state, step, layout)
+        force = regression.force(state)
+        gone = windows.section == section
+        for p in range(windows.n_positions):
+            rows = np.arange(edges[p], edges[p + 1])
+            out, stayed = rows[gone[rows]], rows[~gone[rows]]
+            if len(out) and len(stayed) >= _FEWEST_WINDOWS:
+                level = np.average(force[stayed], axis=0, weights=share[stayed])
+                drift[out] = force[out] - level
+        known = gone & np.isfinite(drift[:, 0])
+        if known.any():
+            square = np.mean(drift[known] ** 2, axis=1)
+            squares[section] = np.average(square, weights=share[known])
+            counts[section] = known.sum()
+    return Folds(squares, counts), drift

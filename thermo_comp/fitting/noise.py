@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the noise of the windows: white plus exponentially correlated (first-order Gauss-Markov).
+
+Within a position the error of window k is ``c_k + e_k``: e_k is white with variance
+``sigma^2 / weight_k``, c_k a stationary Gauss-Markov process of variance ``ratio sigma^2`` and
+correlation time T (IEEE Std 952, Annex B.4.3); a random walk is its limit for a long T. The
+innovations of its Kalman filter, divided by their standard deviations, are white and carry the
+same information, so samples and columns that are filtered alike can be treated by ordinary least
+squares.
+
+References
+----------
+.. [1] A. C. Harvey, Forecasting, structural time series models and the Kalman filter, Cambridge
+   University Press (1989), section 3.4: likelihood by prediction errors.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..typing import Floats, Ints
+from .unknowns import Noise
+
+# Candidate variance ratios of the Gauss-Markov part.
+_RATIOS = 10.0 ** np.arange(-2.5, 3.6, 0.5)
+# Candidate correlation times: multiples of the shortest one, which is this many windows.
+_TIME_STEP, _SHORTEST_WINDOWS = 10.0**0.5, 3.0
+# A recording shows a correlation time that it holds this many times.
+_SPANS = 5.0
+# Twice the log likelihood that two further parameters must gain: 1 % of the chi-square.
+_LEAST_GAIN = 9.2
+
+
+class Whitener:
+    """Filters series of windows, in order of position and time, position by position."""
+
+    def __init__(self, position: Ints, time: Floats) -> None:
+        starts = np.flatnonzero(np.r_[True, position[1:] != position[:-1]])
+        lengths = np.diff(np.r_[starts, len(position)])
+        n_steps = int(lengths.max())
+        step = np.arange(n_steps)[:, None]
+        #: Row of the table at each step of each position; those beyond its end point to row 0.
+        self._is_there = step < lengths
+        self._row = np.where(self._is_there, starts + step, 0)
+        self._n = len(position)
+        interval = np.zeros((n_steps, len(starts)))
+        interval[1:] = np.where(
+            self._is_there[1:], time[self._row[1:]] - time[self._row[:-1]], 0.0
+        )
+        self._interval = interval
+        #: Correlation times that the positions are long enough to show [s].
+        span = float(interval.sum(axis=0).max())
+        typical = float(np.median(interval[1:][self._is_there[1:]])) if n_steps > 1 else 1.0
+        times = [_SHORTEST_WINDOWS * typical]
+        while times[-1] * _TIME_STEP <= span / _SPANS:
+            times.append(times[-1] * _TIME_STEP)
+        self.times_s = times if n_steps > 1 else []
+
+    def gains(self, weight: Floats, noise: Noise) -> tuple[Floats, Floats, Floats]:
+        """Return decay, Kalman gain and sd of the innovation [sigma], (n_steps, n_positions)."""
+        white = 1.0 / weight[self._row]
+        gain, root = np.zeros_like(white), np.sqrt(white)
+        decay = np.exp(-self._interval / noise.time_s)
+        if noise.ratio <= 0.0:
+            return decay, gain, root
+        variance = np.full(white.shape[1], noise.ratio)
+        for k in range(len(white)):
+            if k:
+                variance = noise.ratio + decay[k] ** 2 * (variance - noise.ratio)
+            total = variance + white[k]
+            gain[k] = variance / total
+            root[k] = np.sqrt(total)
+            variance = variance * (1.0 - gain[k])
+        return decay, gain, root
+
+    def filter(self, series: Floats, gains: tuple[Floats, Floats, Floats]) -> Floats:
+        """Whiten series, shape (n, k)."""
+        decay, gain, root = gains
+        result = np.empty_like(series)
+        if not gain.any():
+            scale = np.empty(self._n)
+            scale[self._row[self._is_there]] = 1.0 / root[self._is_there]
+            return np.asarray(series * scale[:, None])
+        level = np.zeros((self._row.shape[1], series.shape[1]))
+        for k, rows in enumerate(self._row):
+            level *= decay[k][:, None]
+            innovation = series[rows] - level
+            level += gain[k][:, None] * innovation
+            there = self._is_there[k]
+            result[rows[there]] = (innovation / root[k][:, None])[there]
+        return result
+
+    def log_determinant(self, gains: tuple[Floats, Floats, Floats]) -> float:
+        """Logarithm of the determinant of the noise's covariance, in units of sigma^2."""
+        return 2.0 * float(np.log(gains[2][self._is_there]).sum())
+
+    def estimate(self, residual: Floats, weight: Floats) -> Noise:
+        """
+        Find the Gauss-Markov noise of residuals, shape (n, 3), by their profile likelihood.
+
+        One ratio and one time serve the three axes, whose white noise is profiled out.
+        """
+        candidates = [Noise(float(r), t) for t in self.times_s for r in _RATIOS]
+        if not candidates:
+            return Noise()
+        white = float(self._deviances(residual, weight, [Noise()])[0])
+        deviances = self._deviances(residual, weight, candidates)
+        best = int(np.argmin(deviances))
+        if white - float(deviances[best]) < _LEAST_GAIN:
+            return Noise()
+        at, on = divmod(best, len(_RATIOS))
+        table = deviances.reshape(-1, len(_RATIOS))
+        log_ratio = np.log10(_RATIOS[on]) + 0.5 * _vertex(table[at], on)
+        log_time = np.log10(self.times_s[at]) + 0.5 * _vertex(table[:, on], at)
+        return Noise(float(10.0**log_ratio), float(10.0**log_time))
+
+    def _deviances(self, residual: Floats, weight: Floats, noises: Sequence[Noise]) -> Floats:
+        """Minus twice the profile log likelihood of each noise, shape (n_noises,)."""
+        ratio = np.array([one.ratio for one in noises])[:, None]
+        time_s = np.array([one.time_s for one in noises])[:, None]
+        shape = len(noises), self._row.shape[1]
+        level, variance = np.zeros((*shape, 3)), np.broadcast_to(ratio, shape)
+        square, size = np.zeros((len(noises), 3)), np.zeros(len(noises))
+        for k, rows in enumerate(self._row):
+            there = self._is_there[k]
+            decay = np.exp(-self._interval[k] / time_s)
+            if k:
+                variance = ratio + decay**2 * (variance - ratio)
+            total = variance + 1.0 / weight[rows]
+            level = level * decay[:, :, None]
+            innovation = residual[rows] - level
+            gain = variance / total
+            level = level + gain[:, :, None] * innovation
+            variance = variance * (1.0 - gain)
+            square += np.sum((innovation**2 / total[:, :, None])[:, there], axis=1)
+            size += np.log(total[:, there]).sum(axis=1)
+        return 3.0 * size + self._n * np.log(np.maximum(square, 1e-300) / self._n).sum(axis=1)
+
+
+def _vertex(values: Floats, at: int) -> float:
+    """Return where a parabola through a smallest value and its neighbours is least, -1 .. 1."""
+    if not 0 < at < len(values) - 1:
+        return 0.0
+    before, here, after = values[at - 1 : at + 2].tolist()
+    bend = before - 2.0 * here + after
+    return float(np.clip(0.5 * (before - after) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0

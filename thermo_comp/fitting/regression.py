@@ -1,0 +1,360 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the one regression: bias, scale, misalignment, attitudes, start states, given the prior.
+
+All unknowns have Gaussian priors (attitudes: flat on the sphere). Gauss-Newton finds the mode, the
+inverse of the Hessian is the covariance. The unknowns of each bag are eliminated first, so what a
+bag tells of the unit is one matrix and one vector, and leaving data out is a subtraction.
+
+References
+----------
+.. [1] D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992).
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve
+
+from ..typing import Bools, Floats, Ints
+from .equations import Equations, Tangent, as_vector, moved_by
+from .unknowns import Layout, Prior, State
+
+# Of a matrix of unit diagonal: what keeps it positive definite to the last digit.
+_JITTER = 1e-12
+# A step that promises less of twice the log density than this is the last one.
+_NEAR = 1e-3
+# How much stiffer the unknowns that enter as products are made where a step leads uphill.
+_STIFFER = (0.0, 1.0, 30.0, 1e3, 1e5)
+# Parts of their standard deviations in which columns that take no part are tried.
+_PARTS = 10.0 ** np.arange(-4.0, 1.01, 0.25)
+
+
+@dataclass(frozen=True)
+class Normal:
+    """
+    Normal equations of all positions, before any prior.
+
+    hessian, gradient: of each position and axis, shapes (n_positions, 3, k, k), (..., k), in the
+        order of `Tangent`
+    square: sum of squares of the whitened residuals of each axis, shape (3,)
+    """
+
+    hessian: Floats
+    gradient: Floats
+    square: Floats
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """
+    What some bags tell of the unit, their own unknowns eliminated.
+
+    information, pull: of each bag, shapes (n_bags, n_unit, n_unit), (n_bags, n_unit)
+    factors: of each bag the factor of its own block, its inverse times the cross block, and times
+        the gradient
+    log_determinant: of the blocks of all bags
+    """
+
+    information: Floats
+    pull: Floats
+    factors: tuple[tuple[Floats, Floats, Floats], ...]
+    log_determinant: float
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """
+    The mode and its surroundings.
+
+    determined: what of each unknown the data determined, not the prior, 0..1, shape (n,)
+    covariance: of what belongs to the unit, shape (n_unit, n_unit)
+    variance: of all unknowns, shape (n,)
+    square: sum of squares of the whitened residuals of each axis, shape (3,) [(m/s^2)^2]
+    log_evidence: logarithm of the marginal likelihood, but for a constant of the data
+    """
+
+    state: State
+    layout: Layout
+    determined: Floats
+    covariance: Floats
+    variance: Floats
+    square: Floats
+    log_evidence: float
+
+    @property
+    def effective_parameters(self) -> Floats:
+        """Effective parameters of each column in bias and scale, all axes, shape (2, m)."""
+        padded = np.append(self.determined, 0.0)
+        return np.asarray(padded[self.layout.weights].sum(axis=1))
+
+
+@dataclass(frozen=True)
+class Inactive:
+    """
+    What the data say of columns that take no part, beside all that do: the sparsity and quality
+    factors S and Q of sparse Bayesian learning (Tipping and Faul, 2003), as matrix and vector.
+
+    columns: the columns asked for, shape (k,); S: shape (2 k 3, 2 k 3); Q: shape (2 k 3,), in the
+    order part, column, axis
+    """
+
+    columns: Ints
+    S: Floats
+    Q: Floats
+
+    def gain(self, column_sd: Floats, wanted: Bools) -> float:
+        """
+        Return what columns, shape (m,), would add to the log evidence in one part of their prior
+        standard deviations, (2, m): ``(q (1 + S)^-1 q - log det(1 + S)) / 2`` in units of these.
+        """
+        sd = column_sd[:, self.columns] * wanted[self.columns]
+        sd = np.repeat(sd[..., None], 3, axis=2).ravel()
+        at = np.flatnonzero(sd > 0.0)
+        S, along = np.linalg.eigh(self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at]))
+        square = _PARTS[:, None] ** 2
+        S, q2 = square * np.maximum(S, 0.0), square * (along.T @ (sd[at] * self.Q[at])) ** 2
+        return 0.5 * float((q2 / (1.0 + S) - np.log1p(S)).sum(axis=1).max(initial=0.0))
+
+
+class Regression(Equations):
+    """Gauss-Newton on the measurement equations; see `Equations` for the parameters."""
+
+    def normal(self, tangent: Tangent, grams: Floats, prior: Prior) -> Normal:
+        """Form the normal equations from products of the base series (n_positions, k, k)."""
+        T, v = tangent.derivatives, tangent.residual
+        turned = grams[:, None] @ T
+        variance = prior.sigma**2
+        hessian = T.transpose(0, 1, 3, 2) @ turned / variance[:, None, None]
+        gradient = np.einsum('pibk,pib->pik', turned, v) / variance[:, None]
+        square = np.sum((v @ grams) * v, axis=(0, 2))
+        return Normal(hessian, gradient, np.maximum(square, 0.0))
+
+    def reduce(
+        self,
+        normal: Normal,
+        prior: Prior,
+        layout: Layout,
+        state: State,
+        bags: Ints | None = None,
+        without: int = -1,
+    ) -> Reduced:
+        """Eliminate what belongs to each bag alone; `without`: a position that is left out."""
+        n, own = layout.n_unit, layout.axis.shape[1]
+        of_axis = [slice(int(one[0]), int(one[0]) + own) for one in layout.axis]
+        common = slice(n - 3, n)
+        precision = self.precision(prior, layout)
+        away = as_vector(state, layout)
+        bags = np.arange(self.n_bags) if bags is None else bags
+        information, pull = np.zeros((len(bags), n, n)), np.zeros((len(bags), n))
+        factors, determinant = [], 0.0
+        for k, bag in enumerate(bags.tolist()):
+            block = layout.blocks[bag]
+            size = block.stop - block.start
+            H, cross, g = np.zeros((size, size)), np.zeros((size, n)), np.zeros(size)
+            A, a = information[k], pull[k]
+            for p in np.flatnonzero(self.bag_of_position == bag).tolist():
+                if p == without:
+                    continue
+                for axis in range(3):
+                    local = self._local(layout, p, axis) - block.start
+                    matrix, vector = normal.hessian[p, axis], normal.gradient[p, axis]
+                    at = of_axis[axis]
+                    A[at, at] += matrix[:own, :own]
+                    A[at, common] += matrix[:own, own : own + 3]
+                    A[common, at] += matrix[own : own + 3, :own]
+                    A[common, common] += matrix[own : own + 3, own : own + 3]
+                    a[at] += vector[:own]
+                    a[common] += vector[own : own + 3]
+                    H[local[:, None], local] += matrix[own + 3 :, own + 3 :]
+                    cross[local, at] += matrix[own + 3 :, :own]
+                    cross[local, common] += matrix[own + 3 :, own : own + 3]
+                    g[local] += vector[own + 3 :]
+            H[np.diag_indices(size)] += precision[block]
+            g -= precision[block] * away[block]
+            # Attitudes of which nothing is seen stay where they are.
+            blind = np.diag(H) <= 0.0
+            H[blind, blind] = 1.0
+            root = np.sqrt(np.diag(H))
+            scaled = H / np.outer(root, root)
+            scaled[np.diag_indices(size)] += _JITTER
+            factor = np.linalg.cholesky(scaled) * root[:, None]
+            solved = cho_solve((factor, True), np.column_stack((cross, g)), check_finite=False)
+            information[k] -= cross.T @ solved[:, :n]
+            pull[k] -= cross.T @ solved[:, n]
+            factors.append((factor, solved[:, :n], solved[:, n]))
+            determinant += 2.0 * float(np.log(np.diag(factor)).sum())
+        return Reduced(information, pull, tuple(factors), determinant)
+
+    def _local(self, layout: Layout, p: int, axis: int) -> Ints:
+        return np.concatenate(
+            (
+                layout.up[p],
+                layout.offset[p, axis : axis + 1],
+                layout.tilt[p].ravel(),
+                layout.start[self.bag_of_position[p]],
+            )
+        )
+
+    def unit_prior(self, prior: Prior, layout: Layout) -> Floats:
+        """Inverse covariance of the unit's own unknowns, shape (n_unit, n_unit)."""
+        if prior.informative is not None:
+            return prior.informative.precision
+        return np.diag(self.precision(prior, layout)[: layout.n_unit])
+
+    def unit_step(
+        self, information: Floats, pull: Floats, prior: Prior, layout: Layout, state: State
+    ) -> tuple[Floats, Floats]:
+        """Solve for the unit's own unknowns: the step, and the factor of their Hessian."""
+        known, n = self.unit_prior(prior, layout), layout.n_unit
+        away = (as_vector(state, layout) - self.prior_mean(prior, layout))[:n]
+        hessian = information + known
+        root = np.sqrt(np.diag(hessian))
+        scaled = hessian / np.outer(root, root)
+        scaled[np.diag_indices(n)] += _JITTER
+        factor = np.linalg.cholesky(scaled) * root[:, None]
+        step = cho_solve((factor, True), pull - known @ away, check_finite=False)
+        return step, factor
+
+    def step(
+        self, state: State, prior: Prior, layout: Layout, grams: Floats, stiffer: float = 0.0
+    ) -> tuple[Floats, Reduced, Floats, Floats]:
+        """
+        Take a Gauss-Newton step: the step, the reduced equations, the factor of the unit's
+        Hessian, and the sum of squares of each axis.
+        """
+        tangent = self.tangent(state, layout, self.products(layout.used))
+        normal = self.normal(tangent, grams, prior)
+        if stiffer:
+            n_starts = layout.start.shape[1]
+            diagonal = np.einsum('...ii->...i', normal.hessian)
+            diagonal[..., diagonal.shape[-1] - n_starts :] *= 1.0 + stiffer
+        reduced = self.reduce(normal, prior, layout, state)
+        whole, factor = self.unit_step(
+            reduced.information.sum(axis=0), reduced.pull.sum(axis=0), prior, layout, state
+        )
+        step = np.zeros(layout.n)
+        step[: layout.n_unit] = whole
+        for block, (_, cross, alone) in zip(layout.blocks, reduced.factors, strict=True):
+            step[block] = alone - cross @ whole
+        return step, reduced, factor, normal.square
+
+    def energy(self, state: State, prior: Prior, layout: Layout, grams: Floats) -> float:
+        """Minus twice the log density of data and state, but for constants of the prior."""
+        v = self.misfit(state, self.products(layout.used))
+        square = np.sum((v @ grams) * v, axis=(0, 2))
+        return self._size(np.maximum(square, 0.0), prior) + self._away(state, prior, layout)
+
+    def _size(self, square: Floats, prior: Prior) -> float:
+        n = len(self.weight)
+        each = square / prior.sigma**2 + 2.0 * n * np.log(prior.sigma) + self.noise_determinant
+        return float(each.sum())
+
+    def _away(self, state: State, prior: Prior, layout: Layout) -> float:
+        away = as_vector(state, layout) - self.prior_mean(prior, layout)
+        own = away[: layout.n_unit]
+        local = self.precision(prior, layout)[layout.n_unit :]
+        own_size = float(own @ self.unit_prior(prior, layout) @ own)
+        return own_size + float(local @ away[layout.n_unit :] ** 2)
+
+    def solve(self, state: State, prior: Prior, n_steps: int = 6) -> Posterior:
+        """Find the mode under a prior in so many steps at most; with none, stay where it is."""
+        self.whiten(prior.noise)
+        layout = self.layout(prior.column_sd > 0.0)
+        grams = self.products(layout.used).whole
+        state = moved_by(state, np.zeros(layout.n), layout)
+        energy = self.energy(state, prior, layout, grams)
+        for k in range(n_steps + 1):
+            step, reduced, factor, square = self.step(state, prior, layout, grams)
+            if k == n_steps:
+                break
+            for stiffer in _STIFFER:
+                if stiffer:
+                    step, *_ = self.step(state, prior, layout, grams, stiffer)
+                found = moved_by(state, step, layout)
+                reached = self.energy(found, prior, layout, grams)
+                if reached <= energy:
+                    break
+            else:
+                break
+            gained, energy, state = energy - reached, reached, found
+            if gained < _NEAR:
+                break
+        return self._posterior(state, prior, layout, reduced, factor, square)
+
+    def _posterior(
+        self,
+        state: State,
+        prior: Prior,
+        layout: Layout,
+        reduced: Reduced,
+        factor: Floats,
+        square: Floats,
+    ) -> Posterior:
+        n = layout.n_unit
+        covariance = cho_solve((factor, True), np.eye(n), check_finite=False)
+        precision = self.precision(prior, layout)
+        variance = [np.diag(covariance)]
+        for own, cross, _ in reduced.factors:
+            inverse = np.linalg.inv(own)
+            variance.append((inverse**2).sum(axis=0) + ((cross @ covariance) * cross).sum(axis=1))
+        everything = np.concatenate(variance)
+        determined = 1.0 - precision * everything
+        known = self.unit_prior(prior, layout)
+        if prior.informative is not None:
+            determined[:n] = 1.0 - np.einsum('ij,ji->i', known, covariance)
+        of_prior = float(np.log(precision[n:][precision[n:] > 0.0]).sum())
+        of_prior += float(np.linalg.slogdet(known)[1])
+        log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
+        size = self._size(square, prior) + self._away(state, prior, layout)
+        evidence = -0.5 * (size + log_hessian - of_prior)
+        return Posterior(state, layout, determined, covariance, everything, square, evidence)
+
+    def inactive(self, posterior: Posterior, prior: Prior, asked: Bools) -> Inactive:
+        """Ask the data for columns that take no part, shape (m,), beside the mode."""
+        state, layout = posterior.state, posterior.layout
+        used, n = layout.used, layout.n_unit
+        columns = np.flatnonzero(asked & ~used.any(axis=0))
+        k = len(columns)
+        products = self.products(used)
+        tangent = self.tangent(state, layout, products)
+        normal = self.normal(tangent, products.whole, prior)
+        reduced = self.reduce(normal, prior, layout, state)
+        own = layout.axis.shape[1]
+        of_unit = np.hstack((layout.axis, np.tile(layout.misalignment, (3, 1))))
+        S = np.zeros((2, k, 3, 2, k, 3))
+        Q = np.zeros((2, k, 3))
+        cross = np.zeros((n, 2, k, 3))
+        local = [np.zeros((one.stop - one.start, 2, k, 3)) for one in layout.blocks]
+        force = self.gravity * state.up @ state.inverse.T
+        for p, bag in enumerate(self.bag_of_position.tolist()):
+            among, beside = self.absent_products(columns, used, p)
+            for axis in range(3):
+                acts = np.array([1.0, state.kappa[axis] * force[p, axis]])
+                variance = prior.sigma[axis] ** 2
+                both = np.multiply.outer(np.outer(acts, acts), among) / variance
+                S[:, :, axis, :, :, axis] += both.transpose(0, 2, 1, 3)
+                seen = beside @ tangent.residual[p, axis] / variance
+                Q[:, :, axis] += np.outer(acts, seen)
+                with_all = beside @ tangent.derivatives[p, axis] / variance
+                each = np.multiply.outer(acts, with_all).transpose(2, 0, 1)
+                cross[of_unit[axis], :, :, axis] += each[: own + 3]
+                at = self._local(layout, p, axis) - layout.blocks[bag].start
+                local[bag][at, :, :, axis] += each[own + 3 :]
+        size = 2 * k * 3
+        S, Q, cross = S.reshape(size, size), Q.ravel(), cross.reshape(n, size)
+        for bag, (factor, of_cross, alone) in enumerate(reduced.factors):
+            own_cross = local[bag].reshape(-1, size)
+            solved = cho_solve((factor, True), own_cross, check_finite=False)
+            S -= own_cross.T @ solved
+            Q -= own_cross.T @ alone
+            cross -= of_cross.T @ own_cross
+        step, whole = self.unit_step(
+            reduced.information.sum(axis=0), reduced.pull.sum(axis=0), prior, layout, state
+        )
+        S -= cross.T @ cho_solve((whole, True), cross, check_finite=False)
+        return Inactive(columns, S, Q - cross.T @ step)

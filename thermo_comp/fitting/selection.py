@@ -1,0 +1,316 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the choice of the model: it grows from constants, one group of columns at a time.
+
+The log evidence says which groups are worth a trial; the left-out score says whether a group
+stays. It stays if the correction of data that took no part improves by more than its standard
+error over the folds, for positions and for sections of the program alike: a group that only
+explains one recording, or one program, fails one of the two.
+
+References
+----------
+.. [1] A. Vehtari, A. Gelman, J. Gabry, Practical Bayesian model evaluation using leave-one-out
+   cross-validation, Statistics and Computing 27 (2017).
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..typing import Bools, Floats
+from .hyperparameters import downweigh, pruned, settle, white_noise
+from .left_out import Score, score_of
+from .regression import Posterior, Regression
+from .unknowns import InformativePrior, Prior, State
+from .windows import CURVE
+
+# A group is worth a trial if it could add this to the log evidence: e^4 = 55 to one.
+_WORTH_A_TRIAL = 4.0
+# So many groups are tried in a round, the most promising first.
+_TRIALS = 3
+# Groups that one law of physics needs together: a part that lags by m has the curve of its own
+# temperature, (t - m)^2 = t^2 - 2 t m + m^2; of a part between two thermometers, m is mixed.
+_TOGETHER = (('product', 'square'), ('product', 'mixed', 'square'))
+# A column of the chosen model stays if the log evidence falls by this without it: e^3 = 20 to one.
+_LEAST_GAIN = 3.0
+# Logarithms of mean squares that differ by less than this are equal: 5 % of an RMS.
+_EQUAL = 0.1
+# Norms of left-out positions alone decide for a group if they gain so many standard errors.
+_SURE_ERRORS = 2.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """
+    A model that was looked at.
+
+    groups: its groups of columns; () for constants
+    score: its left-out errors
+    posterior, prior: its fit
+    typical: widths that the priors of its columns centre on, shape (2, m)
+    is_chosen: whether it is the one
+    is_near: whether it is as good as the chosen one within the standard error of their difference
+    """
+
+    groups: tuple[str, ...]
+    score: Score
+    posterior: Posterior
+    prior: Prior
+    typical: Floats
+    is_chosen: bool = False
+    is_near: bool = False
+
+
+@dataclass(frozen=True)
+class Selected:
+    """The chosen model: its fit, its left-out score, and all models that were looked at."""
+
+    posterior: Posterior
+    prior: Prior
+    score: Score
+    trials: tuple[Trial, ...]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """
+    What may take part.
+
+    typical, largest: widths that the prior of each column centres on and never exceeds, in units
+        of its RMS, shape (2, m); 0 for a column that may not take part
+    forced: columns that stay whatever they gain, shape (m,)
+    fixed: columns that keep their width and their place, shape (2, m)
+    """
+
+    typical: Floats
+    largest: Floats
+    forced: Bools
+    fixed: Bools
+
+    @property
+    def kept(self) -> Bools:
+        """Which columns are never dropped, shape (2, m)."""
+        return self.fixed | self.forced
+
+
+def select(
+    regression: Regression,
+    state: State,
+    prior: Prior,
+    candidates: Candidates,
+    progress: Callable[[float], None] = lambda _part: None,
+) -> Selected:
+    """Choose the groups of columns by left-out data, and fit them."""
+    names = np.array(regression.windows.groups)
+    may = candidates.typical.any(axis=0)
+    forced = tuple(dict.fromkeys(names[candidates.forced & may].tolist()))
+    asked = [name for name in dict.fromkeys(names[may].tolist()) if name not in forced]
+    grow = _Growth(regression, candidates, names)
+    chosen = grow.fit(forced, state, prior, candidates.typical)
+    trials, round_number = [chosen], 0
+    while True:
+        absent = [name for name in asked if name not in chosen.groups]
+        found = grow.trials(chosen, absent)
+        trials += found
+        better = [one for one in found if _gain(chosen.score, one.score) > 0.0]
+        round_number += 1
+        progress(1.0 - 0.6**round_number)
+        if not better:
+            break
+        chosen = _simplest_of_the_best(chosen, better)
+        if chosen.groups[-1] == CURVE:
+            downweigh(regression, chosen.posterior, chosen.prior)
+            state, prior = chosen.posterior.state, chosen.prior
+            chosen = grow.fit(chosen.groups, state, prior, chosen.typical)
+            trials[-len(found) :] = [
+                chosen if one.groups == chosen.groups else one for one in found
+            ]
+    settled = replace(candidates, typical=chosen.typical)
+    posterior, prior, score = finish(regression, chosen.posterior, chosen.prior, settled)
+    marked = []
+    for one in trials:
+        is_chosen = one.groups == chosen.groups
+        is_near = not is_chosen and _is_near(chosen.score, one.score)
+        kept = replace(one, score=score) if is_chosen else one
+        marked.append(replace(kept, is_chosen=is_chosen, is_near=is_near))
+    return Selected(posterior, prior, score, tuple(marked))
+
+
+def fit_all(
+    regression: Regression,
+    state: State,
+    prior: Prior,
+    candidates: Candidates,
+    informative: Sequence[InformativePrior] = (),
+) -> Selected:
+    """Fit all columns that may take part; of priors of the unit the likeliest is taken."""
+    posterior, prior = _settle(regression, state, prior, candidates)
+    downweigh(regression, posterior, prior)
+    posterior, prior = _settle(regression, posterior.state, prior, candidates)
+    if informative:
+        tried = [
+            regression.solve(posterior.state, replace(prior, informative=one), n_steps=3)
+            for one in informative
+        ]
+        best = int(np.argmax([one.log_evidence for one in tried]))
+        prior = replace(prior, informative=informative[best])
+        posterior, prior = _settle(regression, tried[best].state, prior, candidates)
+    posterior, prior = _with_slow_noise(regression, posterior, prior, candidates)
+    score = score_of(regression, posterior, prior)
+    groups = tuple(dict.fromkeys(regression.windows.groups))
+    trial = Trial(groups, score, posterior, prior, candidates.typical, is_chosen=True)
+    return Selected(posterior, prior, score, (trial,))
+
+
+def finish(
+    regression: Regression, posterior: Posterior, prior: Prior, candidates: Candidates
+) -> tuple[Posterior, Prior, Score]:
+    """
+    Settle the chosen model: knocks, columns that gain too little, and slow noise.
+
+    Exponentially correlated noise explains as well what the model misses of the temperature: it is
+    kept only if the correction of left-out data is no worse with it.
+    """
+    downweigh(regression, posterior, prior)
+    white = _pruned(regression, *_settle(regression, posterior.state, prior, candidates), candidates)
+    score = score_of(regression, *white)
+    slow = _with_slow_noise(regression, *white, candidates)
+    if slow[1].noise != white[1].noise:
+        slow = _pruned(regression, *slow, candidates)
+        found = score_of(regression, *slow)
+        if not is_better(found, score):
+            return *slow, found
+    return *white, score
+
+
+def _pruned(
+    regression: Regression, posterior: Posterior, prior: Prior, candidates: Candidates
+) -> tuple[Posterior, Prior]:
+    while True:
+        fewer = pruned(posterior, prior, candidates.kept, _LEAST_GAIN)
+        if np.array_equal(fewer.column_sd, prior.column_sd):
+            return posterior, prior
+        posterior, prior = _settle(regression, posterior.state, fewer, candidates)
+
+
+def _settle(
+    regression: Regression, state: State, prior: Prior, candidates: Candidates, rounds: int = 25
+) -> tuple[Posterior, Prior]:
+    return settle(
+        regression, state, prior, candidates.typical, candidates.largest, candidates.fixed, rounds
+    )
+
+
+def _with_slow_noise(
+    regression: Regression, posterior: Posterior, prior: Prior, candidates: Candidates
+) -> tuple[Posterior, Prior]:
+    """Estimate the exponentially correlated noise from the residuals, and settle with it."""
+    residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
+    noise = regression.whitener.estimate(residual, regression.weight)
+    if noise == prior.noise:
+        return posterior, prior
+    prior = replace(prior, noise=noise)
+    looked = regression.solve(posterior.state, prior, n_steps=0)
+    prior = replace(prior, sigma=white_noise(regression, looked))
+    return _settle(regression, posterior.state, prior, candidates)
+
+
+class _Growth:
+    """Fits models of some groups, each beginning from the fit of a smaller one."""
+
+    def __init__(self, regression: Regression, candidates: Candidates, names: Floats) -> None:
+        self._regression = regression
+        self._candidates = candidates
+        self._names = names
+
+    def fit(
+        self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats
+    ) -> Trial:
+        """Fit a model; columns that a smaller model dropped are asked again."""
+        candidates = replace(self._candidates, typical=typical)
+        wanted = np.isin(self._names, groups)
+        begin = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
+        prior = replace(prior, column_sd=np.where(wanted, begin, 0.0))
+        posterior, prior = _settle(self._regression, state, prior, candidates, 6)
+        prior = pruned(posterior, prior, candidates.kept, _LEAST_GAIN)
+        posterior, prior = _settle(self._regression, posterior.state, prior, candidates, 8)
+        score = score_of(self._regression, posterior, prior)
+        return Trial(groups, score, posterior, prior, typical)
+
+    def trials(self, chosen: Trial, absent: list[str]) -> list[Trial]:
+        """Fit the groups that could add most to the log evidence, each beside the chosen ones."""
+        if not absent:
+            return []
+        if not chosen.groups and CURVE in absent:
+            # A curve comes before all that is relative to it.
+            absent = [CURVE]
+        typical = self._candidates.typical
+        columns = np.isin(self._names, absent) & typical.any(axis=0)
+        inactive = self._regression.inactive(chosen.posterior, chosen.prior, columns)
+        asked = [(name,) for name in absent]
+        asked += [names for names in _TOGETHER if set(names) <= set(absent)]
+        gains = {
+            names: inactive.gain(typical, np.isin(self._names, names)) for names in asked
+        }
+        likely = [names for names in asked if gains[names] > _WORTH_A_TRIAL]
+        likely.sort(key=gains.__getitem__, reverse=True)
+        state, prior = chosen.posterior.state, chosen.prior
+        return [
+            self.fit((*chosen.groups, *names), state, prior, self._typical(chosen, names))
+            for names in likely[:_TRIALS]
+        ]
+
+    def _typical(self, chosen: Trial, names: tuple[str, ...]) -> Floats:
+        """Typical widths once a group is added: those of its columns explain what is left."""
+        kelvins = self._regression.windows.kelvins
+        moved = float(kelvins[0]) or 1.0
+        left = float(np.sqrt(np.mean(self._regression.residual(chosen.posterior.state, chosen.posterior.layout) ** 2)))
+        slope = left / moved
+        units = np.array([[1.0], [1.0 / (self._regression.gravity or 1.0)]])
+        own = np.minimum(slope * units * kelvins, self._candidates.typical)
+        return np.where(np.isin(self._names, names), own, chosen.typical)
+
+
+def _simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
+    """Take the largest gain, or of smaller models the first that is as good within the error."""
+    best = max(better, key=lambda one: _gain(before.score, one.score))
+    for one in sorted(better, key=lambda one: len(one.groups)):
+        if one is best or not is_better(one.score, best.score):
+            return one
+    return best
+
+
+def is_better(before: Score, after: Score) -> bool:
+    """Whether left-out data show a model to be better, by more than their standard error."""
+    return _gain(before, after) > 0.0
+
+
+def _gain(before: Score, after: Score) -> float:
+    """
+    Return the sum of log gains of the drift if a model is better by more than the errors, else 0.
+    """
+    positions, sections, norms = _gains(before, after)
+    drift = [one for one in (positions, sections) if one]
+    if norms and norms[0] < -norms[1]:
+        return 0.0
+    if drift and all(gain > error for gain, error in drift):
+        return sum(gain for gain, _ in drift)
+    if norms and norms[0] > _SURE_ERRORS * norms[1]:
+        if all(abs(gain) < _EQUAL for gain, _ in drift):
+            return norms[0]
+    return 0.0
+
+
+def _is_near(chosen: Score, other: Score) -> bool:
+    """Whether another model differs from the chosen one by no more than one standard error."""
+    found = [one for one in _gains(chosen, other) if one]
+    return bool(found) and all(gain > -error for gain, error in found)
+
+
+def _gains(before: Score, after: Score) -> list[tuple[float, float] | None]:
+    return [b.gain_of(a) for b, a in zip(before.kinds, after.kinds, strict=True)]
