@@ -16,6 +16,7 @@ INSTALL = [
     'numpy>=1.26',
     'PyYAML>=6.0',
     'scipy>=1.11',
+    'threadpoolctl>=3.1',
     'typer>=0.20',
     'rich>=13.7',
     'rosbags>=0.11',

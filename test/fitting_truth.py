@@ -6,14 +6,19 @@ Owns window tables with known truth for the tests of the regression, without sam
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from thermo_comp.fitting.posterior import Regression
-from thermo_comp.fitting.unknowns import Prior, State, Windows, initial_state, tangent_basis
+from thermo_comp.fitting.beginning import STEEPEST
+from thermo_comp.fitting.equations import as_vector, moved_by
+from thermo_comp.fitting.regression import Posterior, Regression
+from thermo_comp.fitting.selection import Candidates
+from thermo_comp.fitting.unknowns import WHITE, Layout, Noise, Prior, State, Windows, tangent_basis
+from thermo_comp.fitting.windows import N_SECTIONS
 from thermo_comp.simulation.campaign import positions
-from thermo_comp.typing import Floats
+from thermo_comp.typing import Floats, Ints
 
 GRAVITY = 9.81
 NOMINAL = np.array([1000.0, 1010.0, 990.0])
@@ -36,19 +41,29 @@ class Truth:
     on_scale: Floats = field(
         default_factory=lambda: np.outer([1.0, 0.7, 1.3], [5e-6, 3e-8, 1e-6, 4e-7, 0.0, 0.0])
     )
-    skew: Floats = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
+    misalignment: Floats = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
     start_sd: float = 0.0
     sigma: Floats = field(default_factory=lambda: np.full(3, 2.0 * MICRO))
-    #: Random walk of the bias, m/s^2 per root second.
-    walk: float = 0.0
+    #: Gauss-Markov noise of the bias beside the white noise.
+    noise: Noise = WHITE
     offset_sd: float = 0.0
-    #: What supports lean by, rad per RMS of what they lean with.
-    lean_sd: float = 0.0
+    #: Sd of the supports' tilts [rad per RMS of a temperature].
+    tilt_sd: float = 0.0
 
     @property
     def weights(self) -> Floats:
         """Weights in bias and scale, shape (2, 3, m)."""
         return np.stack((self.on_bias, self.on_scale))
+
+    def errors(self, regression: Regression, found: Posterior) -> dict[str, Floats]:
+        """Return errors over claimed standard deviations, of each kind of unknown."""
+        errors, sd = {}, np.sqrt(found.variance)
+        for name in ('kappa', 'bias', 'misalignment', 'weights'):
+            true = getattr(self, name) * (regression.rms if name == 'weights' else 1.0)
+            places = getattr(found.layout, name)
+            used = places >= 0
+            errors[name] = (getattr(found.state, name) - true)[used] / sd[places[used]]
+        return errors
 
 
 def table_of(
@@ -68,11 +83,12 @@ def table_of(
     share = np.zeros((n_windows, len(GROUPS)))
     share[:, 2:4] = np.exp(-time[:, None] / TAUS)
     A = np.eye(3)
-    A[1, 0], A[2, 0], A[2, 1] = truth.skew
+    A[1, 0], A[2, 0], A[2, 1] = truth.misalignment
     means = []
-    lean = np.concatenate(shapes)[:, [0, 2]]
-    lean /= np.sqrt(np.mean(lean**2, axis=0))
-    leaning = truth.lean_sd * rng.standard_normal((n_positions, 2, 2)) if truth.lean_sd else None
+    tilt = np.concatenate(shapes)[:, [0, 2]]
+    tilt /= np.sqrt(np.mean(tilt**2, axis=0))
+    tilts = truth.tilt_sd * rng.standard_normal((n_positions, 2, 2)) if truth.tilt_sd else None
+    decay = np.exp(-step_s / truth.noise.time_s)
     for p, (columns, direction) in enumerate(zip(shapes, up, strict=True)):
         moved = columns.copy()
         moved[:, 2:4] += share[:, 2:4] * (truth.start_sd * rng.standard_normal(2))
@@ -80,29 +96,33 @@ def table_of(
         clean = truth.kappa * force * (1.0 + moved @ truth.on_scale.T)
         clean = clean + truth.bias + moved @ truth.on_bias.T
         clean += truth.offset_sd * rng.standard_normal(3)
-        if leaning is not None:
-            across = tangent_basis(up)[p] @ leaning[p].T
-            own = lean[p * n_windows : (p + 1) * n_windows]
+        if tilts is not None:
+            across = tangent_basis(up)[p] @ tilts[p].T
+            own = tilt[p * n_windows : (p + 1) * n_windows]
             clean += truth.kappa * GRAVITY * (own @ (A @ across).T)
-        steps = rng.standard_normal((n_windows, 3)) * truth.walk * np.sqrt(step_s)
-        steps[0] = 0.0
-        white = rng.standard_normal((n_windows, 3)) * truth.sigma
-        means.append(NOMINAL * (clean + np.cumsum(steps, axis=0) + white))
+        slow = rng.standard_normal((n_windows, 3)) * np.sqrt(truth.noise.ratio)
+        for k in range(1, n_windows):
+            slow[k] = decay * slow[k - 1] + np.sqrt(1.0 - decay**2) * slow[k]
+        white = rng.standard_normal((n_windows, 3))
+        means.append(NOMINAL * (clean + (slow + white) * truth.sigma))
     number = np.repeat(np.arange(n_positions), n_windows)
+    columns = np.concatenate(shapes)
+    steepest = np.array([1.0, 2.0 * np.abs(columns[:, 0]).max(), 1.0, 1.0, 1.0, 1.0])
     windows = Windows(
         position=number,
         bag=number,
+        section=np.tile(np.arange(n_windows) * N_SECTIONS // n_windows, n_positions),
         time=np.tile(time, n_positions),
         weight=np.ones(len(number)),
         mean=np.concatenate(means),
-        columns=np.concatenate(shapes),
+        columns=columns,
         groups=GROUPS,
+        kelvins=np.sqrt(np.mean(columns**2, axis=0)) / steepest,
         lag=np.array([-1, -1, 0, 1, -1, -1]),
-        reach=np.array([0.0, 0.0, *TAUS, 0.0, 0.0]),
         start=np.tile(share, (n_positions, 1)),
         start_covariance=START,
         in_scale=np.ones(len(GROUPS), dtype=bool),
-        lean=lean,
+        tilt=tilt,
     )
     return windows, up
 
@@ -123,27 +143,55 @@ def _columns(time: Floats, step_s: float, turns: float) -> Floats:
     return np.column_stack([np.interp(time, fine, column) for column in table.T])
 
 
-def widths(names: tuple[str, ...], bias_sd: float, scale_sd: float) -> Floats:
-    """Width of each column in bias and scale: 0 where it takes no part."""
+def rows_of(windows: Windows, rows: Ints) -> Windows:
+    """Take rows of a table, position by position; positions and bags count as they appear."""
+    names = ('section', 'time', 'weight', 'mean', 'columns', 'start', 'tilt')
+    taken = {name: getattr(windows, name)[rows] for name in names}
+    for name in ('position', 'bag'):
+        _, first, number = np.unique(
+            getattr(windows, name)[rows], return_index=True, return_inverse=True
+        )
+        taken[name] = np.argsort(np.argsort(first))[number]
+    return replace(windows, **taken)
+
+
+def without_starts(windows: Windows) -> Windows:
+    """Take the unknown start states away: their products with the weights are not linear."""
+    return replace(
+        windows, lag=np.full_like(windows.lag, -1), start=np.zeros_like(windows.start),
+        start_covariance=np.zeros((0, 0)),
+    )  # fmt: skip
+
+
+def column_sd(names: tuple[str, ...], bias_sd: float, scale_sd: float) -> Floats:
+    """Prior sd of each column in bias and scale: 0 where it takes no part."""
     return np.outer((bias_sd, scale_sd), np.isin(GROUPS, names))
 
 
-def prior_of(
-    truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: object
-) -> Prior:
+def prior_of(truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: Any) -> Prior:
     """Return a wide prior with the true noises."""
-    known: dict[str, object] = {
+    known: dict[str, Any] = {
         'bias_mean': np.zeros(3),
         'bias_sd': np.full(3, 1.0),
         'scale_sd': 0.05,
-        'skew_sd': 1e-2,
-        'widths': widths(names, 1e-2, 1e-3),
+        'misalignment_sd': 1e-2,
+        'column_sd': column_sd(names, 1e-2, 1e-3),
         'offset_sd': max(truth.offset_sd, 1e-9),
-        'lean_sd': max(truth.lean_sd, 1e-9),
+        'tilt_sd': max(truth.tilt_sd, 1e-9),
         'sigma': truth.sigma,
-        'rho': (truth.walk / truth.sigma) ** 2,
+        'noise': truth.noise,
     }
-    return Prior(**(known | changes))  # type: ignore[arg-type]
+    return Prior(**(known | changes))
+
+
+def candidates_of(windows: Windows, forced: tuple[str, ...] = ()) -> Candidates:
+    """Let all columns take part, with slopes of some ug/K."""
+    none = np.zeros((2, len(windows.groups)), dtype=bool)
+    typical, largest = (
+        np.outer(slope, windows.kelvins) * windows.parts
+        for slope in (np.array([5e-5, 5e-6]), STEEPEST)
+    )
+    return Candidates(typical, largest, np.isin(windows.groups, forced), none)
 
 
 def begin(windows: Windows, up: Floats) -> tuple[Regression, State]:
@@ -151,5 +199,19 @@ def begin(windows: Windows, up: Floats) -> tuple[Regression, State]:
     regression = Regression(windows, GRAVITY, NOMINAL)
     turned = up + np.array([2e-3, -1e-3, 3e-3])
     turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
-    state = initial_state(windows, regression.n_bags, np.zeros(3), np.ones(3), np.zeros(3), turned)
-    return regression, state
+    return regression, regression.initial_state(np.zeros(3), np.zeros(3), turned)
+
+
+def mode_of(regression: Regression, state: State, prior: Prior) -> Posterior:
+    """Find the mode to the last digits: Newton steps from where a fit would end."""
+    found = regression.solve(state, prior, n_steps=12)
+    state, grams = found.state, regression.products(found.layout.used).whole
+    for _ in range(6):
+        step, *_ = regression.step(state, prior, found.layout, grams)
+        state = moved_by(state, step, found.layout)
+    return regression.solve(state, prior, n_steps=0)
+
+
+def unit_of(state: State, layout: Layout) -> Floats:
+    """Return the unit's own unknowns as a vector."""
+    return as_vector(state, layout)[: layout.n_unit]

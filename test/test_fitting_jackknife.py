@@ -4,16 +4,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from builders import ArrayBlock
+from fitting_truth import rows_of
 
 from thermo_comp.fitting import FitOptions, FitSource, fit_bags
-from thermo_comp.fitting.posterior import Regression
 from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.fitting.regression import Regression
 from thermo_comp.fitting.windows import FEWEST_WINDOWS
+from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
@@ -28,19 +31,25 @@ def ratio(path: Path) -> float:
     short = {'window_s': 1.0, 'cell_s': 0.2, 'min_rest_s': 1.0, 'fewest_windows': FEWEST_WINDOWS}
     bags = [reduce_source(source, full_scale=None, **short)]
     result = fit_bags(bags, options)
-    posterior, prior = result.learnt.posterior, result.learnt.prior
-    axes = (result.calibration.axes.x, result.calibration.axes.y, result.calibration.axes.z)
-    nominal = np.array([axis.scale_factor for axis in axes]) / posterior.state.kappa
-    regression = Regression(result.windows.data, STANDARD_GRAVITY, nominal)
-    places = np.concatenate((posterior.layout.kappa, posterior.layout.bias, posterior.layout.skew))
+    posterior, prior = result.selected.posterior, result.selected.prior
+    calibration, data = result.calibration, result.windows.data
+    assert calibration.posterior is not None
+    K = np.array([axis.scale_factor for axis in calibration.axes])
     found = []
-    for p in range(result.windows.data.n_positions):
-        state = regression.without(posterior, prior, p)
-        if state is not None:
-            found.append(np.concatenate((state.kappa, state.bias, state.skew)))
-    n = len(found)
-    scatter = np.var(np.array(found), axis=0) * (n - 1)
-    return float(np.sqrt(np.mean(scatter / posterior.variance[places])))
+    for p in range(data.n_positions):
+        kept = np.flatnonzero(data.position != p)
+        rest = Regression(rows_of(data, kept), STANDARD_GRAVITY, K / posterior.state.kappa)
+        others = np.arange(data.n_positions) != p
+        local = {name: getattr(posterior.state, name)[others] for name in ('up', 'offset', 'tilt')}
+        state = rest.solve(replace(posterior.state, **local), prior, n_steps=3).state
+        found.append(np.concatenate((state.kappa, state.bias, state.misalignment)))
+    scatter = np.var(np.array(found), axis=0) * (len(found) - 1)
+    variance = np.diag(calibration.posterior.covariance())
+    layout = parameter_layout(calibration)
+    levels = [variance[[block.static for block in part]] for part in (layout.scale, layout.bias)]
+    units = (posterior.state.kappa**2, (posterior.state.kappa / K) ** 2)
+    claimed = [level * unit for level, unit in zip(levels, units, strict=True)]
+    return float(np.sqrt(np.mean(scatter / np.concatenate((*claimed, variance[-3:])))))
 
 
 def test_claimed_sd_is_the_jackknife_s(real_data: Path) -> None:

@@ -5,15 +5,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 import pytest
 from builders import ArrayBlock
 
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit_bags, reduce_bag
+from thermo_comp.fitting.claim import Claim, claim_of
 from thermo_comp.fitting.options import sets_of
 from thermo_comp.fitting.reduction import Readings, ReducedBag
-from thermo_comp.fitting.windows import Model, ThermalWindows, thermal_windows
+from thermo_comp.fitting.windows import N_SECTIONS, Model, ThermalWindows, thermal_windows
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import arrays
@@ -184,27 +187,21 @@ def test_each_column_stands_without_the_others(bags: list[ReducedBag]) -> None:
         np.testing.assert_array_equal(alone.start[:, 6], together.start[:, 6 + number])
 
 
-def test_the_lag_of_a_column_moves_it_as_its_start_says(bags: list[ReducedBag]) -> None:
-    # A lag that began half a kelvin elsewhere, through the columns' own formula.
+def test_the_lag_of_a_column_moves_it_as_its_slope_says() -> None:
+    # A lag that began a microkelvin elsewhere, through the columns' own formula.
     spec = memory_of(bank())
     layout, table = Layout(spec), ColumnTable(bank(), spec, 20.0)
-    state = np.zeros(layout.width)
-    state[0] = 27.0
+    state = np.zeros((layout.width, 1))
+    state[0], state[layout.gradients['case']] = 27.0, 0.4
     for lag, place in layout.lags.items():
         state[place] = 0.3 + 1e-4 * lag[1]
-    before = table.values(state[:, np.newaxis])
-    for column_number, column in enumerate(bank()):
-        if not column.lag or column.kind == 'play':
-            continue
-        moved = state.copy()
-        moved[layout.lags[column.lag]] += 1e-6
-        after = table.values(moved[:, np.newaxis])
-        slope = (after - before)[column_number, 0] / 1e-6
-        u = state[layout.lags[column.lag]]
-        expected = {'square': 2.0 * u, 'cube': 3.0 * u * u}.get(
-            column.kind, 1.0
-        ) * 7.0**column.power
-        assert slope == pytest.approx(expected, rel=1e-4)
+    expected = (table.slopes(state) * table.factors(state[0], state[3])[0])[:, 0]
+    for k, column in enumerate(bank()):
+        if column.lag and column.kind != 'play':
+            step = np.zeros_like(state)
+            step[layout.lags[column.lag]] = 1e-6
+            slope = (table.values(state + step) - table.values(state - step))[k, 0] / 2e-6
+            assert slope == pytest.approx(expected[k], rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -235,11 +232,22 @@ def test_curves(bags, options, static, dynamic, is_shared) -> None:  # type: ign
 
 
 @pytest.fixture(scope='module', params=['golovach', 'linear', 'exponential', 'spline'])
-def result(request: pytest.FixtureRequest, all_bags: list[ReducedBag]) -> FitResult:
-    if request.param == 'golovach':
-        return fit_bags(all_bags, replace(OPTIONS, model='golovach'))
+def fitted(request: pytest.FixtureRequest, all_bags: list[ReducedBag]) -> tuple[FitResult, Claim]:
     groups = ('curve', 'set', *(['board'] if request.param == 'exponential' else []))
-    return fit_bags(all_bags, replace(OPTIONS, static_curve=request.param, groups=groups))
+    is_paper = request.param == 'golovach'
+    chosen: Any = {'static_curve': request.param, 'groups': groups}
+    options = replace(OPTIONS, gravity_sd=1e-4, **({'model': 'golovach'} if is_paper else chosen))
+    claims: list[Claim] = []
+
+    def keep(*given: Any) -> Claim:
+        claims.append(claim_of(*given))
+        return claims[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(import_module('thermo_comp.fitting.fit'), 'claim_of', keep)
+        result = fit_bags(all_bags, options)
+    (claim,) = claims
+    return result, claim
 
 
 def states_of(windows: ThermalWindows, calibration: Calibration) -> Floats:
@@ -261,11 +269,12 @@ def states_of(windows: ThermalWindows, calibration: Calibration) -> Floats:
     return states.T
 
 
-def test_the_file_corrects_as_the_regression(result: FitResult) -> None:
+def test_the_file_corrects_as_the_regression(fitted: tuple[FitResult, Claim]) -> None:
     # Curves, sets and linear columns through the calibration's own correction. Windows are means
     # over a minute: powers of means are not means of powers, which at 1 K/min is some ppm.
+    result, _ = fitted
     windows, calibration = result.windows, result.calibration
-    state, prior = result.learnt.posterior.state, result.learnt.prior
+    state, prior = result.selected.posterior.state, result.selected.prior
     correction = Correction(calibration)
     pairs = correction.bias_scale(states_of(windows, calibration)).swapaxes(0, 1)
     force = np.column_stack(
@@ -280,25 +289,41 @@ def test_the_file_corrects_as_the_regression(result: FitResult) -> None:
     assert prior.sigma.min() > 0.0
 
 
-def test_covariance_of_the_file_is_that_of_the_posterior(result: FitResult) -> None:
-    # The variance of the bias at some state, through the file's parameters and through the
-    # regression's: the same linear form of the claim.
-    calibration, posterior = result.calibration, result.learnt.claim
+def test_covariance_of_the_file_is_that_of_the_claim(fitted: tuple[FitResult, Claim]) -> None:
+    # The variance of levels through the file's parameters and through the regression's: the same
+    # linear form of the claim.
+    result, claim = fitted
+    calibration = result.calibration
     assert calibration.posterior is not None
     layout = parameter_layout(calibration)
     covariance = calibration.posterior.covariance()
     assert covariance.shape == (layout.n_parameters, layout.n_parameters)
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    nominal = np.array([axis.scale_factor for axis in axes]) / posterior.state.kappa
+    state = result.selected.posterior.state
+    K = np.array([axis.scale_factor for axis in calibration.axes])
+    sd = np.sqrt(np.diag(claim.covariance))
+    found = np.sqrt(np.diag(covariance))
     for axis in range(3):
-        at = posterior.layout.bias[axis]
-        expected = np.sqrt(posterior.covariance[at, at]) * nominal[axis]
-        found = np.sqrt(covariance[layout.bias[axis].static, layout.bias[axis].static])
-        assert found == pytest.approx(expected, rel=1e-4)
-        at = posterior.layout.kappa[axis]
-        expected = np.sqrt(posterior.covariance[at, at]) / posterior.state.kappa[axis]
-        found = np.sqrt(covariance[layout.scale[axis].static, layout.scale[axis].static])
-        assert found == pytest.approx(expected, rel=1e-4)
-    skew = posterior.layout.skew[[0, 2]]
-    sd = np.sqrt(np.diag(covariance)[-3:][[0, 2]])
-    np.testing.assert_allclose(sd, np.sqrt(posterior.variance[skew]), rtol=1e-4)
+        bias, scale = layout.bias[axis].static, layout.scale[axis].static
+        expected = sd[claim.layout.bias[axis]] * K[axis] / state.kappa[axis]
+        assert found[bias] == pytest.approx(expected, rel=1e-4)
+        expected = sd[claim.layout.kappa[axis]] / state.kappa[axis]
+        assert found[scale] == pytest.approx(expected, rel=1e-4)
+        # The stated error of gravity is a part of it.
+        assert found[scale] > 1e-4 / STANDARD_GRAVITY
+    places = claim.layout.misalignment[[0, 2]]
+    np.testing.assert_allclose(found[-3:][[0, 2]], sd[places], rtol=1e-4)
+
+
+def test_sections_and_kelvins_by_hand(bags: list[ReducedBag]) -> None:
+    windows = windows_of(bags)
+    data, t = windows.data, windows.temperature - 20.0
+    for p in range(data.n_positions):
+        # Equal parts of the program, in order.
+        own = data.section[data.position == p]
+        assert (np.diff(own) >= 0).all()
+        assert np.ptp(np.bincount(own, minlength=N_SECTIONS)) <= 2
+    rms = np.sqrt(np.mean(data.columns**2, axis=0))
+    # A line stands for its own RMS; t^2 is steepest, 2 t, at the farthest temperature.
+    lines = [0, *(k for k, one in enumerate(bank(), start=6) if one.group == 'board')]
+    np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
+    assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

@@ -18,6 +18,7 @@ from .output import Cell, Output, micro, micro_g, millidegrees, picked
 
 if TYPE_CHECKING:
     from ..fitting import FitResult
+    from ..fitting.selection import Trial
 
 Curve = Literal['linear', 'quadratic', 'cubic', 'spline', 'exponential']
 
@@ -64,7 +65,8 @@ def fit(
     the prior's uncertainty. Local gravity is yours to give.
 
     Groups: curve, set, now, board, neighbour, product, mixed, square, even,
-    change, play. Those that the evidence does not want leave by themselves.
+    change, play. A group stays if data that took no part are corrected better
+    with it.
 
     Example:
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
@@ -262,6 +264,19 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
             ],
             title='positions at rest',
         )
+    out.table(
+        ('', 'model', 'positions', 'sections', 'norm'),
+        [
+            (
+                '*' if one.is_chosen else '~' if one.is_near else '',
+                ' + '.join(one.groups) or 'constants',
+                *(micro_g(folds.rms) for folds in one.score.kinds),
+            )
+            for one in result.selected.trials
+        ],
+        title='models on data left out, RMS in ug: drift of an axis on each position, and on each '
+        'section of the program, |f| - g on each position; *: chosen, ~: as good',
+    )
     if calibration.evidence:
         out.table(
             ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
@@ -281,7 +296,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     out.table(
         ('section', 'windows', *steps.values(), 'left out'),
         _steps(result.residuals, (*steps, 'left_out'), micro_g),
-        title='|f| - g at rest, RMS in ug; left out: each position by the others',
+        title='|f| - g at rest, RMS in ug; left out: on data that took no part in the fit',
     )
     if gyroscope is not None:
         out.table(
@@ -299,7 +314,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     out.points(one.message for one in result.findings if one.level != 'good')
     headline = counted(len(result.positions), 'position')
     if left_out.n:
-        headline += f', {spoken(left_out.rms)} RMS of |f| - g on each by the others alone'
+        headline += f', {spoken(left_out.rms)} RMS on data left out'
     out.line(f'{output}: unit {calibration.unit.serial}, {model}, {headline}')
     if page is not None:
         out.line(f'{page}: certificate')
@@ -310,10 +325,18 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
         gravity=calibration.gravity_m_s2,
         left_out_rms_m_s2=left_out.rms,
         residuals_m_s2=result.residuals,
+        models=[_model(one) for one in result.selected.trials],
         **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
         gyroscope=gyroscope and picked(gyroscope, rates) | {'residuals_rad_s': result.rates},
         **picked(result, 'positions least_known findings'),
     )
+
+
+def _model(trial: 'Trial') -> dict[str, Any]:
+    """Say of a model that was looked at what it left on data left out [m/s^2]."""
+    names = ('positions', 'sections', 'norms')
+    left_out = {name: folds.rms for name, folds in zip(names, trial.score.kinds, strict=True)}
+    return {'groups': trial.groups, 'is_chosen': trial.is_chosen, 'left_out_rms_m_s2': left_out}
 
 
 def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> str:

@@ -150,6 +150,11 @@ def reading(input_: Input = INPUT, names: dict[str, str] = names) -> Any:
     return _reading(input_, names, None, None)
 
 
+#: Gravity in mountains differs from that of the ellipsoid by this much, sd [m/s^2]: some 50 mGal
+#: (EGM2008, Pavlis et al., Journal of Geophysical Research 117 (2012): anomalies of 30 mGal RMS).
+NORMAL_GRAVITY_SD = 5e-4
+
+
 @expanded
 def place(
     gravity: float | None = option('Local gravity in m/s^2.', metavar='G'),
@@ -168,6 +173,30 @@ def place(
 
 
 @expanded
+def site(
+    gravity: float | None = option('Local gravity in m/s^2.', metavar='G'),
+    latitude: float | None = option('Latitude in degrees, with --height.'),
+    height: float | None = option('Height above the ellipsoid in m.'),
+    gravity_sd: str | None = option(
+        'Standard uncertainty of gravity: 5ug; else 0 of --gravity, 50ug of --latitude.'
+    ),
+) -> dict[str, float]:
+    """Give local gravity and its standard deviation; a usage error where nothing was said."""
+    found = gravity
+    if gravity is None:
+        if latitude is None or height is None:
+            raise usage('give --gravity, or --latitude and --height')
+        from ..fitting import normal_gravity
+
+        with usage_of():
+            found = normal_gravity(latitude, height)
+    sd = acceleration(gravity_sd, '--gravity-sd')
+    if sd is None:
+        sd = NORMAL_GRAVITY_SD if gravity is None else 0.0
+    return {'gravity': found or 0.0, 'gravity_sd': sd}
+
+
+@expanded
 def judging(
     gravity: float | None = place,
     window_s: float = option(
@@ -182,7 +211,7 @@ def judging(
 
 @expanded
 def fitting(
-    gravity: float | None = place,
+    where: dict[str, float] = site,
     model: Literal['response', 'golovach'] = option(
         "The thermal response, or the paper's two sets alone.", 'response'
     ),
@@ -200,13 +229,22 @@ def fitting(
     still_sd: str = option(
         "Largest scatter of samples at rest: a few times the sensor's noise.", '50mg'
     ),
+    mounting_sd: str | None = option(
+        'How well mounting and turn-on repeat, sd of the bias: 30ug; else what the bags show.'
+    ),
     allow: list[str] | None = option('Refusal to override, as its message names it.'),
 ) -> dict[str, Any]:
     """Give keywords of FitOptions."""
     given = locals()
-    if gravity is None:
-        raise usage('give --gravity, or --latitude and --height')
-    return given | {'still_sd': acceleration(still_sd, '--still-sd'), 'allow': tuple(allow or ())}
+    return (
+        {name: value for name, value in given.items() if name != 'where'}
+        | where
+        | {
+            'still_sd': acceleration(still_sd, '--still-sd'),
+            'mounting_sd': acceleration(mounting_sd, '--mounting-sd'),
+            'allow': tuple(allow or ()),
+        }
+    )
 
 
 def acceleration(text: str | None, name: str) -> float | None:

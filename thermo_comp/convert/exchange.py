@@ -203,8 +203,8 @@ def import_calibration(
         # Of words with an offset, such as 32768, on either side of it.
         full_scale = full_scale * float(K.max()) + float(np.abs(content.bias[:, 0]).max())
     one = Polynomial((1.0,))
-    sets = [unit.AxisSet(curve, one) for curve in _curves(content.bias)]
-    regime = unit.RegimeSet(content.range_c, (-60.0, 60.0), *sets)
+    x_set, y_set, z_set = (unit.AxisSet(curve, one) for curve in _curves(content.bias))
+    regime = unit.RegimeSet(content.range_c, (-60.0, 60.0), x_set, y_set, z_set)
     gyroscope = None
     if content.rate_bias is not None:
         rates = RateSet(*map(RateCurve, _curves(content.rate_bias)))

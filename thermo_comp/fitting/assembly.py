@@ -32,9 +32,10 @@ from ..unit.columns import USUAL_BOARD_LAG_S, Column
 from ..unit.functions import TemperatureFunction
 from ..unit.posterior import posterior_of
 from .bayes_factors import group_evidence
-from .evidence import ResidualRow
 from .claim import Claim
 from .equations import as_vector
+from .evidence import ResidualRow
+from .lack_of_fit import lack_of_fit
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Selected
@@ -80,14 +81,19 @@ def build_calibration(
     rates = _widened(windows.rate * 60.0, _LINEAR_REACH, rate_margin)
     slow = _slow_error(prior, claim).tolist()
     earlier = (None, None) if known is None else known.regime_sets()
-    static, dynamic = (
-        RegimeSet(
-            temperatures if one is None else union((temperatures, one.temperature_range_c)),
-            rates if one is None else union((rates, one.rate_range_k_min)),
-            *(_blank(family, sd) for sd in slow),
+    lacks = lack_of_fit(windows, regression, selected, claim) if regression.gravity else ((), ())
+    regimes = []
+    for family, one, lack in zip(model.sets.families, earlier, lacks, strict=True):
+        x, y, z = (_blank(family, sd) for sd in slow)
+        regimes.append(
+            RegimeSet(
+                temperatures if one is None else union((temperatures, one.temperature_range_c)),
+                rates if one is None else union((rates, one.rate_range_k_min)),
+                *(x, y, z),
+                lack_of_fit=lack,
+            )
         )
-        for family, one in zip(model.sets.families, earlier, strict=True)
-    )
+    static, dynamic = regimes
     seen = [_column_range(model.columns[k], windows.raw[:, k]) for k in used]
     columns = [
         replace(

@@ -30,6 +30,9 @@ STEEPEST = np.array([5e-3, 2e-4])
 _FLATTEST = 1e-6
 # Widths of the paper's sets, which stay whatever they gain, over the steepest: as good as free.
 _FREE = 10.0
+# P attitudes show 3 P drifts; a unit has 6, bias and scale of each axis, a support 2 P: with fewer
+# attitudes than 6 a tilt could be any drift of the unit.
+_DIRECTIONS_FOR_TILTS = 6
 # The noise begins with this [m/s^2].
 _SIGMA = 1e-5
 # Mounting and turn-on repeat to some times the noise in 1 Hz: 20 .. 50 ug for a navigation sensor,
@@ -50,9 +53,8 @@ def regress(
     """
     data = windows.data
     has_one_direction = len(distinct_directions(up)) == 1
-    if options.model == 'golovach' or has_one_direction:
-        # What the sets alone leave is no tilt of the supports; in one attitude a tilt may be any
-        # drift of the bias.
+    if options.model == 'golovach' or len(distinct_directions(up)) < _DIRECTIONS_FOR_TILTS:
+        # What the sets alone leave is no tilt of the supports.
         data = replace(data, tilt=data.tilt[:, :0])
     regression = Regression(data, options.gravity, start.scale)
     inverse = np.asarray(np.linalg.inv(start.misalignment), dtype=np.float64)
@@ -99,7 +101,7 @@ def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> floa
     bend = np.diff(data.mean / start.scale, n=2, axis=0)[same]
     sigma = float(np.median(np.abs(bend))) / (0.6745 * np.sqrt(6.0))
     density = sigma * np.sqrt(float(np.median(np.diff(data.time)[same])))
-    return max(_MOUNTING_OVER_NOISE * density, _FLATTEST)
+    return float(max(_MOUNTING_OVER_NOISE * density, _FLATTEST))
 
 
 def _candidates(

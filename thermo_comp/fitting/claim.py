@@ -3,9 +3,10 @@
 """
 Owns what a calibration claims beyond the covariance of one fit: what the data do not determine.
 
-The repeatability of the mounting (and of the turn-on) is integrated over: the covariance is that of
-the mixture of fits over its standard deviation, each weighted by its evidence and a prior that is flat
-in the logarithm below a scale and falls like Student's t above it. Gravity adds its stated error to the three scale factors at once.
+How well mounting and turn-on repeat is integrated over: the covariance is that of the mixture of
+fits over this standard deviation, each weighted by its evidence and by a prior that is flat in the
+logarithm below a scale and falls like Student's t above it. Gravity adds its stated error to the
+three scale factors at once.
 
 References
 ----------
@@ -83,7 +84,7 @@ def _with_unseen(
     S what they say of it beside the columns that stayed. Where that is more than some standard
     deviations of a window's noise, the covariance has it with that width; its weight stays 0.
     """
-    inactive = regression.inactive(posterior, prior, typical.any(axis=0))
+    inactive = regression.inactive(posterior, prior, np.any(typical > 0.0, axis=0))
     k = len(inactive.columns)
     seen = np.diag(inactive.S).reshape(2, k, 3).mean(axis=2)
     sd = np.zeros_like(typical)

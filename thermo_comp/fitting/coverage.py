@@ -20,7 +20,7 @@ from ..typing import Floats
 from ..unit.calibration import Calibration, parameter_layout
 from ..unit.gravity import STANDARD_GRAVITY
 from .start import constant_calibration
-from .unknowns import BIAS_SD, SCALE_SD, MISALIGNMENT_SD
+from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD
 
 PRIOR_SD = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, MISALIGNMENT_SD], 3)
 # What is easily held is proposed if it is worth this part of the best there is ...

@@ -60,7 +60,7 @@ class Products:
 
     def without(self, section: int) -> Floats:
         """Products of each position without one section, shape as of `whole`."""
-        result = self.whole.copy()
+        result: Floats = self.whole.copy()
         position = np.cumsum(np.isin(np.arange(len(self.cells)), self.first)) - 1
         gone = np.flatnonzero(self.section == section)
         result[position[gone]] -= self.cells[gone]
@@ -159,7 +159,7 @@ class Equations:
 
     def products(self, used: Bools) -> Products:
         """Form the products of the columns in use, shape (2, m), under the current noise."""
-        taken = used.any(axis=0)
+        taken: Bools = np.any(used, axis=0)
         if self._products is not None and np.array_equal(self._products[0], taken):
             return self._products[1]
         columns = np.flatnonzero(taken)

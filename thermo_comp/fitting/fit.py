@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from ..errors import FitError
 from ..text import valid_serial
@@ -24,10 +25,10 @@ from ..unit.gravity import STANDARD_GRAVITY
 from . import verdict
 from .assembly import build_calibration
 from .beginning import first_guess, regress
+from .claim import claim_of
 from .coverage import LeastKnown, least_known, rough_centre
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
-from .claim import claim_of
 from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
@@ -99,6 +100,12 @@ def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
     """Fit a calibration to bags that have been reduced; FitError if they contradict themselves."""
+    # Thousands of small products: threads would wait for each other.
+    with threadpool_limits(1, 'blas'):
+        return _fit_words(bags, options, progress)
+
+
+def _fit_words(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) -> FitResult:
     offset = find_offset(bags, options)
     if not offset.any():
         return _fit(bags, options, progress)

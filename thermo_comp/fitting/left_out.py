@@ -22,14 +22,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..typing import Floats
+from ..typing import Floats, Ints
 from .equations import moved_by
 from .regression import Normal, Posterior, Reduced, Regression
 from .unknowns import Prior, State
 
-# The norm of a left-out position counts where the others leave it no more than this times the
-# variance that all positions and the mounting leave it.
+# A left-out position counts where the others leave its norm, or its drift, no more than this times
+# the variance that all positions leave it, with mounting and noise.
 _DETERMINED = 10.0
+# So many windows of a position show the variance of its drift.
+_DRIFT_WINDOWS = 50
 # Fewer windows of a position have no drift to speak of.
 _FEWEST_WINDOWS = 8
 # Gauss-Newton steps that a fit without a section takes from the fit of everything.
@@ -59,19 +61,27 @@ class Folds:
     def gain_of(self, other: Folds) -> tuple[float, float] | None:
         """
         Log ratio of the mean square error to that of another model, over the folds in common, and
-        its jackknife standard error; None without such folds.
+        its standard error; None without such folds.
+
+        Two estimates: the mean over folds of their log ratios, which a few large folds cannot
+        rule, and the log ratio of the sums with its jackknife error, which small folds cannot. If
+        they agree in sign the surer one counts, else there is no gain.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
         if not n:
             return None
         before, after = ((one.square * one.windows)[known] + 1e-300 for one in (self, other))
-        gain = float(np.log(before.sum() / after.sum()))
+        whole = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            return gain, _ERROR_OF_ONE
+            return whole, _ERROR_OF_ONE
+        each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))
-        spread = np.sum((without - without.mean()) ** 2)
-        return gain, float(np.sqrt((n - 1) / n * spread))
+        spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+        found = [(whole, spread), (float(each.mean()), float(each.std(ddof=1) / np.sqrt(n)))]
+        if found[0][0] * found[1][0] < 0.0:
+            return 0.0, max(error for _, error in found)
+        return max(found, key=lambda one: abs(one[0]) / max(one[1], 1e-12))
 
 
 @dataclass(frozen=True)
@@ -126,7 +136,8 @@ def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Scor
         weight = share[rows]
         level = np.average(own, axis=0, weights=weight)
         drift[rows] = own - level
-        if rows.stop - rows.start >= _FEWEST_WINDOWS:
+        is_told = _is_drift_determined(regression, posterior, prior, covariance, rows)
+        if rows.stop - rows.start >= _FEWEST_WINDOWS and is_told:
             square = np.mean(drift[rows] ** 2, axis=1)
             squares[p] = np.average(square, weights=weight)
         if _is_norm_determined(regression, posterior, prior, tangent.derivatives, covariance, p):
@@ -151,15 +162,37 @@ def _without_position(
     state, layout = posterior.state, posterior.layout
     bag = regression.bag_of_position[[p]]
     rest = regression.reduce(normal, prior, layout, state, bag, without=p)
-    information = reduced.information.sum(axis=0) - reduced.information[bag[0]]
-    pull = reduced.pull.sum(axis=0) - reduced.pull[bag[0]] + rest.pull[0]
-    step, factor = regression.unit_step(
-        information + rest.information[0], pull, prior, layout, state
-    )
+    information, pull = reduced.whole
+    information = information - reduced.information[bag[0]] + rest.information[0]
+    pull = pull - reduced.pull[bag[0]] + rest.pull[0]
+    step, factor = regression.unit_step(information, pull, prior, layout, state)
     whole = np.zeros(layout.n)
     whole[: layout.n_unit] = step
     inverse = np.linalg.inv(factor)
     return moved_by(state, whole, layout), inverse.T @ inverse
+
+
+def _is_drift_determined(
+    regression: Regression, posterior: Posterior, prior: Prior, covariance: Floats, rows: slice
+) -> bool:
+    """Whether the others, whose covariance is given, make the drift of a position as sure."""
+    state, layout = posterior.state, posterior.layout
+    in_bias, in_scale = layout.used
+    if not in_bias.any():
+        return True
+    some = regression.columns[rows][:: max((rows.stop - rows.start) // _DRIFT_WINDOWS, 1)]
+    some = some - some.mean(axis=0)
+    p = regression.windows.position[rows.start]
+    force = regression.gravity * state.inverse @ state.up[p]
+    by_others = everything = 0.0
+    for axis in range(3):
+        along = np.hstack((some[:, in_bias], force[axis] * some[:, in_scale]))
+        at = layout.axis[axis, 2:]
+        where = np.ix_(at, at)
+        by_others += float(np.sum((along @ covariance[where]) * along))
+        everything += float(np.sum((along @ posterior.covariance[where]) * along))
+    noise = float(np.sum(prior.sigma**2)) * len(some)
+    return by_others < _DETERMINED * (everything + noise)
 
 
 def _is_norm_determined(
@@ -170,7 +203,7 @@ def _is_norm_determined(
     covariance: Floats,
     p: int,
 ) -> bool:
-    """Whether the norm of a position is almost as sure by the others, whose covariance is given."""
+    """Whether the others, whose covariance is given, make the norm of a position as sure."""
     if not regression.gravity:
         return False
     state, layout = posterior.state, posterior.layout
@@ -186,7 +219,7 @@ def _is_norm_determined(
 
 
 def _sections(
-    regression: Regression, posterior: Posterior, prior: Prior, edges: Floats, share: Floats
+    regression: Regression, posterior: Posterior, prior: Prior, edges: Ints, share: Floats
 ) -> tuple[Folds, Floats]:
     """Leave out each section in all positions; the drift is about the mean of what stayed."""
     windows, layout = regression.windows, posterior.layout

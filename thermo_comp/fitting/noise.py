@@ -61,6 +61,10 @@ class Whitener:
             times.append(times[-1] * _TIME_STEP)
         self.times_s = times if n_steps > 1 else []
 
+    def shows(self, time_s: float) -> bool:
+        """Whether the positions are long enough, and the windows short enough, for a time."""
+        return bool(self.times_s) and self.times_s[0] <= time_s <= self.times_s[-1] * _TIME_STEP
+
     def gains(self, weight: Floats, noise: Noise) -> tuple[Floats, Floats, Floats]:
         """Return decay, Kalman gain and sd of the innovation [sigma], (n_steps, n_positions)."""
         white = 1.0 / weight[self._row]
@@ -139,7 +143,8 @@ class Whitener:
             variance = variance * (1.0 - gain)
             square += np.sum((innovation**2 / total[:, :, None])[:, there], axis=1)
             size += np.log(total[:, there]).sum(axis=1)
-        return 3.0 * size + self._n * np.log(np.maximum(square, 1e-300) / self._n).sum(axis=1)
+        spread = np.log(np.maximum(square, 1e-300) / self._n).sum(axis=1)
+        return np.asarray(3.0 * size + self._n * spread)
 
 
 def _vertex(values: Floats, at: int) -> float:

@@ -29,8 +29,8 @@ from ..unit.calibration import (
 )
 from ..unit.columns import Column
 from .assembly import blank_terms, file_parameters, parameters_of, union, with_parameters
-from .options import FitOptions
 from .equations import as_vector
+from .options import FitOptions
 from .regression import Regression
 from .start import ConstantCalibration
 from .unknowns import InformativePrior, State

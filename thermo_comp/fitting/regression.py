@@ -15,6 +15,7 @@ References
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,12 +25,15 @@ from ..typing import Bools, Floats, Ints
 from .equations import Equations, Tangent, as_vector, moved_by
 from .unknowns import Layout, Prior, State
 
-# Of a matrix of unit diagonal: what keeps it positive definite to the last digit.
-_JITTER = 1e-12
+# Of a matrix of unit diagonal: what keeps it positive definite to the last digit, the least first.
+_JITTERS = (1e-13, 1e-11, 1e-9, 1e-7)
 # A step that promises less of twice the log density than this is the last one.
 _NEAR = 1e-3
-# How much stiffer the unknowns that enter as products are made where a step leads uphill.
-_STIFFER = (0.0, 1.0, 30.0, 1e3, 1e5)
+# Shares of a step that leads uphill, and how much stiffer what is held is made.
+_SHARES = (1.0, 0.25, 0.06, 0.015, 0.004, 0.001)
+_HELD = 1e9
+# Sd of the mean of the start states of all bags, over that of each: it is next to nothing.
+_COMMON_START = 0.1
 # Parts of their standard deviations in which columns that take no part are tried.
 _PARTS = 10.0 ** np.arange(-4.0, 1.01, 0.25)
 
@@ -50,6 +54,24 @@ class Normal:
 
 
 @dataclass(frozen=True)
+class Common:
+    """
+    The bound on the sum of the start states over the bags, as its own small system: factor of its
+    matrix, its cross block with the unit's unknowns, the sum once the bags have moved, and how the
+    unknowns of each bag answer to it.
+    """
+
+    factor: Floats
+    cross: Floats
+    sum: Floats
+    answers: tuple[Floats, ...]
+
+    def solve(self, right: Floats) -> Floats:
+        """Solve with the matrix of the bound."""
+        return np.asarray(cho_solve((self.factor, True), right, check_finite=False))
+
+
+@dataclass(frozen=True)
 class Reduced:
     """
     What some bags tell of the unit, their own unknowns eliminated.
@@ -58,12 +80,28 @@ class Reduced:
     factors: of each bag the factor of its own block, its inverse times the cross block, and times
         the gradient
     log_determinant: of the blocks of all bags
+    common: what the bound on the mean of the start states adds to the information and to the pull;
+        None where there is none
     """
 
     information: Floats
     pull: Floats
     factors: tuple[tuple[Floats, Floats, Floats], ...]
     log_determinant: float
+    common: Common | None = None
+
+    @property
+    def whole(self) -> tuple[Floats, Floats]:
+        """Information and pull of all bags."""
+        information, pull = self.information.sum(axis=0), self.pull.sum(axis=0)
+        if self.common is None:
+            return information, pull
+        solved = self.common.solve(np.column_stack((self.common.cross, self.common.sum)))
+        n = len(pull)
+        return (
+            information + self.common.cross.T @ solved[:, :n],
+            pull + self.common.cross.T @ solved[:, n],
+        )
 
 
 @dataclass(frozen=True)
@@ -121,6 +159,19 @@ class Inactive:
         return 0.5 * float((q2 / (1.0 + S) - np.log1p(S)).sum(axis=1).max(initial=0.0))
 
 
+def factored(matrix: Floats) -> Floats:
+    """Return the lower Cholesky factor of a positive definite matrix, but for rounding."""
+    root = np.sqrt(np.diag(matrix))
+    scaled = matrix / np.outer(root, root)
+    diagonal = np.diag_indices(len(matrix))
+    for jitter in _JITTERS[:-1]:
+        scaled[diagonal] += jitter
+        with suppress(np.linalg.LinAlgError):
+            return np.asarray(np.linalg.cholesky(scaled) * root[:, None])
+    scaled[diagonal] += _JITTERS[-1]
+    return np.asarray(np.linalg.cholesky(scaled) * root[:, None])
+
+
 class Regression(Equations):
     """Gauss-Newton on the measurement equations; see `Equations` for the parameters."""
 
@@ -146,12 +197,12 @@ class Regression(Equations):
         """Eliminate what belongs to each bag alone; `without`: a position that is left out."""
         n, own = layout.n_unit, layout.axis.shape[1]
         of_axis = [slice(int(one[0]), int(one[0]) + own) for one in layout.axis]
-        common = slice(n - 3, n)
+        shared = slice(n - 3, n)
         precision = self.precision(prior, layout)
         away = as_vector(state, layout)
         bags = np.arange(self.n_bags) if bags is None else bags
         information, pull = np.zeros((len(bags), n, n)), np.zeros((len(bags), n))
-        factors, determinant = [], 0.0
+        factors, answers, determinant = [], [], 0.0
         for k, bag in enumerate(bags.tolist()):
             block = layout.blocks[bag]
             size = block.stop - block.start
@@ -165,30 +216,56 @@ class Regression(Equations):
                     matrix, vector = normal.hessian[p, axis], normal.gradient[p, axis]
                     at = of_axis[axis]
                     A[at, at] += matrix[:own, :own]
-                    A[at, common] += matrix[:own, own : own + 3]
-                    A[common, at] += matrix[own : own + 3, :own]
-                    A[common, common] += matrix[own : own + 3, own : own + 3]
+                    A[at, shared] += matrix[:own, own : own + 3]
+                    A[shared, at] += matrix[own : own + 3, :own]
+                    A[shared, shared] += matrix[own : own + 3, own : own + 3]
                     a[at] += vector[:own]
-                    a[common] += vector[own : own + 3]
+                    a[shared] += vector[own : own + 3]
                     H[local[:, None], local] += matrix[own + 3 :, own + 3 :]
                     cross[local, at] += matrix[own + 3 :, :own]
-                    cross[local, common] += matrix[own + 3 :, own : own + 3]
+                    cross[local, shared] += matrix[own + 3 :, own : own + 3]
                     g[local] += vector[own + 3 :]
             H[np.diag_indices(size)] += precision[block]
             g -= precision[block] * away[block]
             # Attitudes of which nothing is seen stay where they are.
             blind = np.diag(H) <= 0.0
             H[blind, blind] = 1.0
-            root = np.sqrt(np.diag(H))
-            scaled = H / np.outer(root, root)
-            scaled[np.diag_indices(size)] += _JITTER
-            factor = np.linalg.cholesky(scaled) * root[:, None]
-            solved = cho_solve((factor, True), np.column_stack((cross, g)), check_finite=False)
+            factor = factored(H)
+            own_starts = np.eye(size)[:, layout.start[bag] - block.start]
+            solved = cho_solve(
+                (factor, True), np.column_stack((cross, g, own_starts)), check_finite=False
+            )
             information[k] -= cross.T @ solved[:, :n]
             pull[k] -= cross.T @ solved[:, n]
             factors.append((factor, solved[:, :n], solved[:, n]))
+            answers.append(solved[:, n + 1 :])
             determinant += 2.0 * float(np.log(np.diag(factor)).sum())
-        return Reduced(information, pull, tuple(factors), determinant)
+        common = None
+        if len(bags) == self.n_bags > 1 and layout.start.size:
+            common = self._common(prior, layout, state, factors, answers)
+            determinant += 2.0 * float(np.log(np.diag(common.factor)).sum())
+        return Reduced(information, pull, tuple(factors), determinant, common)
+
+    def _common(
+        self,
+        prior: Prior,
+        layout: Layout,
+        state: State,
+        factors: list[tuple[Floats, Floats, Floats]],
+        answers: list[Floats],
+    ) -> Common:
+        """
+        Bound what the start states of all bags have in common: that is no start, it is a response
+        of the unit that another start would show.
+        """
+        at = [places - one.start for places, one in zip(layout.start, layout.blocks, strict=True)]
+        bound = (_COMMON_START * self.n_bags) ** 2 * prior.start_share
+        matrix = sum(one[own] for one, own in zip(answers, at, strict=True))
+        matrix = np.asarray(matrix) + bound * np.eye(layout.start.shape[1])
+        cross = sum(one[own] for (_, one, _), own in zip(factors, at, strict=True))
+        moved = sum(one[own] for (_, _, one), own in zip(factors, at, strict=True))
+        total = state.start.sum(axis=0) + moved
+        return Common(factored(matrix), np.asarray(cross), total, tuple(answers))
 
     def _local(self, layout: Layout, p: int, axis: int) -> Ints:
         return np.concatenate(
@@ -213,34 +290,34 @@ class Regression(Equations):
         known, n = self.unit_prior(prior, layout), layout.n_unit
         away = (as_vector(state, layout) - self.prior_mean(prior, layout))[:n]
         hessian = information + known
-        root = np.sqrt(np.diag(hessian))
-        scaled = hessian / np.outer(root, root)
-        scaled[np.diag_indices(n)] += _JITTER
-        factor = np.linalg.cholesky(scaled) * root[:, None]
+        factor = factored(hessian)
         step = cho_solve((factor, True), pull - known @ away, check_finite=False)
         return step, factor
 
     def step(
-        self, state: State, prior: Prior, layout: Layout, grams: Floats, stiffer: float = 0.0
+        self, state: State, prior: Prior, layout: Layout, grams: Floats, *, held: bool = False
     ) -> tuple[Floats, Reduced, Floats, Floats]:
         """
         Take a Gauss-Newton step: the step, the reduced equations, the factor of the unit's
-        Hessian, and the sum of squares of each axis.
+        Hessian, and the sum of squares of each axis; `held`: only what enters linearly moves.
         """
         tangent = self.tangent(state, layout, self.products(layout.used))
         normal = self.normal(tangent, grams, prior)
-        if stiffer:
-            n_starts = layout.start.shape[1]
+        if held:
+            own, n_starts = layout.axis.shape[1], layout.start.shape[1]
             diagonal = np.einsum('...ii->...i', normal.hessian)
-            diagonal[..., diagonal.shape[-1] - n_starts :] *= 1.0 + stiffer
+            k = diagonal.shape[-1]
+            diagonal[..., [0, *range(own, own + 5), *range(k - n_starts, k)]] *= _HELD
         reduced = self.reduce(normal, prior, layout, state)
-        whole, factor = self.unit_step(
-            reduced.information.sum(axis=0), reduced.pull.sum(axis=0), prior, layout, state
-        )
+        whole, factor = self.unit_step(*reduced.whole, prior, layout, state)
         step = np.zeros(layout.n)
         step[: layout.n_unit] = whole
         for block, (_, cross, alone) in zip(layout.blocks, reduced.factors, strict=True):
             step[block] = alone - cross @ whole
+        if (common := reduced.common) is not None:
+            bound = common.solve(common.sum - common.cross @ whole)
+            for block, answer in zip(layout.blocks, common.answers, strict=True):
+                step[block] -= answer @ bound
         return step, reduced, factor, normal.square
 
     def energy(self, state: State, prior: Prior, layout: Layout, grams: Floats) -> float:
@@ -258,8 +335,12 @@ class Regression(Equations):
         away = as_vector(state, layout) - self.prior_mean(prior, layout)
         own = away[: layout.n_unit]
         local = self.precision(prior, layout)[layout.n_unit :]
-        own_size = float(own @ self.unit_prior(prior, layout) @ own)
-        return own_size + float(local @ away[layout.n_unit :] ** 2)
+        size = float(own @ self.unit_prior(prior, layout) @ own)
+        size += float(local @ away[layout.n_unit :] ** 2)
+        if self.n_bags > 1 and layout.start.size:
+            bound = (_COMMON_START * self.n_bags) ** 2 * prior.start_share
+            size += float(np.sum(state.start.sum(axis=0) ** 2)) / bound
+        return size
 
     def solve(self, state: State, prior: Prior, n_steps: int = 6) -> Posterior:
         """Find the mode under a prior in so many steps at most; with none, stay where it is."""
@@ -272,19 +353,42 @@ class Regression(Equations):
             step, reduced, factor, square = self.step(state, prior, layout, grams)
             if k == n_steps:
                 break
-            for stiffer in _STIFFER:
-                if stiffer:
-                    step, *_ = self.step(state, prior, layout, grams, stiffer)
-                found = moved_by(state, step, layout)
-                reached = self.energy(found, prior, layout, grams)
-                if reached <= energy:
-                    break
-            else:
+            found, reached = self._descend(state, step, prior, layout, grams, energy)
+            if reached > energy:
                 break
             gained, energy, state = energy - reached, reached, found
             if gained < _NEAR:
                 break
         return self._posterior(state, prior, layout, reduced, factor, square)
+
+    def _descend(
+        self,
+        state: State,
+        step: Floats,
+        prior: Prior,
+        layout: Layout,
+        grams: Floats,
+        energy: float,
+    ) -> tuple[State, float]:
+        """
+        Take a step; where it leads uphill, shares of it in the unknowns that enter as products,
+        while the others, which enter linearly, follow. Returns the state and its energy.
+        """
+        found = moved_by(state, step, layout)
+        reached = self.energy(found, prior, layout, grams)
+        if reached <= energy:
+            return found, reached
+        bends = np.zeros(layout.n, dtype=bool)
+        for places in (layout.kappa, layout.misalignment, layout.up, layout.start):
+            bends[places] = True
+        for share in _SHARES:
+            turned = moved_by(state, np.where(bends, share * step, 0.0), layout)
+            follow, *_ = self.step(turned, prior, layout, grams, held=True)
+            found = moved_by(turned, np.where(bends, 0.0, follow), layout)
+            reached = self.energy(found, prior, layout, grams)
+            if reached <= energy:
+                break
+        return found, reached
 
     def _posterior(
         self,
@@ -320,15 +424,17 @@ class Regression(Equations):
         used, n = layout.used, layout.n_unit
         columns = np.flatnonzero(asked & ~used.any(axis=0))
         k = len(columns)
+        if not k:
+            return Inactive(columns, np.zeros((0, 0)), np.zeros(0))
         products = self.products(used)
         tangent = self.tangent(state, layout, products)
         normal = self.normal(tangent, products.whole, prior)
         reduced = self.reduce(normal, prior, layout, state)
         own = layout.axis.shape[1]
         of_unit = np.hstack((layout.axis, np.tile(layout.misalignment, (3, 1))))
-        S = np.zeros((2, k, 3, 2, k, 3))
-        Q = np.zeros((2, k, 3))
-        cross = np.zeros((n, 2, k, 3))
+        S: Floats = np.zeros((2, k, 3, 2, k, 3))
+        Q: Floats = np.zeros((2, k, 3))
+        cross: Floats = np.zeros((n, 2, k, 3))
         local = [np.zeros((one.stop - one.start, 2, k, 3)) for one in layout.blocks]
         force = self.gravity * state.up @ state.inverse.T
         for p, bag in enumerate(self.bag_of_position.tolist()):
@@ -346,15 +452,16 @@ class Regression(Equations):
                 at = self._local(layout, p, axis) - layout.blocks[bag].start
                 local[bag][at, :, :, axis] += each[own + 3 :]
         size = 2 * k * 3
-        S, Q, cross = S.reshape(size, size), Q.ravel(), cross.reshape(n, size)
+        S, Q, cross = (
+            one.reshape(shape)
+            for one, shape in ((S, (size, size)), (Q, (size,)), (cross, (n, size)))
+        )
         for bag, (factor, of_cross, alone) in enumerate(reduced.factors):
             own_cross = local[bag].reshape(-1, size)
             solved = cho_solve((factor, True), own_cross, check_finite=False)
             S -= own_cross.T @ solved
             Q -= own_cross.T @ alone
             cross -= of_cross.T @ own_cross
-        step, whole = self.unit_step(
-            reduced.information.sum(axis=0), reduced.pull.sum(axis=0), prior, layout, state
-        )
+        step, whole = self.unit_step(*reduced.whole, prior, layout, state)
         S -= cross.T @ cho_solve((whole, True), cross, check_finite=False)
         return Inactive(columns, S, Q - cross.T @ step)

@@ -26,16 +26,21 @@ from ..typing import Bools, Floats
 from .hyperparameters import downweigh, pruned, settle, white_noise
 from .left_out import Score, score_of
 from .regression import Posterior, Regression
-from .unknowns import InformativePrior, Prior, State
+from .unknowns import InformativePrior, Noise, Prior, State
 from .windows import CURVE
 
 # A group is worth a trial if it could add this to the log evidence: e^4 = 55 to one.
 _WORTH_A_TRIAL = 4.0
 # So many groups are tried in a round, the most promising first.
 _TRIALS = 3
-# Groups that one law of physics needs together: a part that lags by m has the curve of its own
-# temperature, (t - m)^2 = t^2 - 2 t m + m^2; of a part between two thermometers, m is mixed.
-_TOGETHER = (('product', 'square'), ('product', 'mixed', 'square'))
+# Groups that one law of physics needs together: parts that lag by m have the curve of their own
+# temperature, (t - m)^2 = t^2 - 2 t m + m^2; where m is of the flow between two thermometers, the
+# product is mixed.
+_LAGS = ('now', 'board', 'neighbour')
+_TOGETHER = (('product', 'square'), (*_LAGS, 'product', 'mixed', 'square'))
+# The noise is sought in steps of this factor, then of its roots; its white part follows in so many
+# rounds.
+_NOISE_STEP, _NOISE_ROUNDS = 3.0, 2
 # A column of the chosen model stays if the log evidence falls by this without it: e^3 = 20 to one.
 _LEAST_GAIN = 3.0
 # Logarithms of mean squares that differ by less than this are equal: 5 % of an RMS.
@@ -111,25 +116,26 @@ def select(
     forced = tuple(dict.fromkeys(names[candidates.forced & may].tolist()))
     asked = [name for name in dict.fromkeys(names[may].tolist()) if name not in forced]
     grow = _Growth(regression, candidates, names)
-    chosen = grow.fit(forced, state, prior, candidates.typical)
-    trials, round_number = [chosen], 0
+    constants = chosen = grow.fit(forced, state, prior, candidates.typical)
+    trials, round_number = [constants], 0
+    if CURVE in asked:
+        # All else is relative to a curve, which may help only together with it.
+        chosen = grow.fit((*forced, CURVE), chosen.posterior.state, chosen.prior, chosen.typical)
+        downweigh(regression, chosen.posterior, chosen.prior)
+        state, prior = chosen.posterior.state, chosen.prior
+        chosen = grow.fit(chosen.groups, state, prior, chosen.typical)
+        trials.append(chosen)
     while True:
-        absent = [name for name in asked if name not in chosen.groups]
-        found = grow.trials(chosen, absent)
+        found = grow.trials(chosen, [name for name in asked if name not in chosen.groups])
         trials += found
-        better = [one for one in found if _gain(chosen.score, one.score) > 0.0]
+        better = [one for one in found if is_better(chosen.score, one.score)]
         round_number += 1
         progress(1.0 - 0.6**round_number)
         if not better:
             break
         chosen = _simplest_of_the_best(chosen, better)
-        if chosen.groups[-1] == CURVE:
-            downweigh(regression, chosen.posterior, chosen.prior)
-            state, prior = chosen.posterior.state, chosen.prior
-            chosen = grow.fit(chosen.groups, state, prior, chosen.typical)
-            trials[-len(found) :] = [
-                chosen if one.groups == chosen.groups else one for one in found
-            ]
+    if chosen is not constants and not is_better(constants.score, chosen.score):
+        chosen = constants
     settled = replace(candidates, typical=chosen.typical)
     posterior, prior, score = finish(regression, chosen.posterior, chosen.prior, settled)
     marked = []
@@ -177,7 +183,9 @@ def finish(
     kept only if the correction of left-out data is no worse with it.
     """
     downweigh(regression, posterior, prior)
-    white = _pruned(regression, *_settle(regression, posterior.state, prior, candidates), candidates)
+    white = _pruned(
+        regression, *_settle(regression, posterior.state, prior, candidates), candidates
+    )
     score = score_of(regression, *white)
     slow = _with_slow_noise(regression, *white, candidates)
     if slow[1].noise != white[1].noise:
@@ -189,13 +197,21 @@ def finish(
 
 
 def _pruned(
-    regression: Regression, posterior: Posterior, prior: Prior, candidates: Candidates
+    regression: Regression,
+    posterior: Posterior,
+    prior: Prior,
+    candidates: Candidates,
+    rounds: int = 25,
 ) -> tuple[Posterior, Prior]:
+    """Drop columns that gain too little, as long as the log evidence agrees once they are gone."""
     while True:
         fewer = pruned(posterior, prior, candidates.kept, _LEAST_GAIN)
         if np.array_equal(fewer.column_sd, prior.column_sd):
             return posterior, prior
-        posterior, prior = _settle(regression, posterior.state, fewer, candidates)
+        found = _settle(regression, posterior.state, fewer, candidates, rounds)
+        if found[0].log_evidence < posterior.log_evidence - _LEAST_GAIN:
+            return posterior, prior
+        posterior, prior = found
 
 
 def _settle(
@@ -211,13 +227,33 @@ def _with_slow_noise(
 ) -> tuple[Posterior, Prior]:
     """Estimate the exponentially correlated noise from the residuals, and settle with it."""
     residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
-    noise = regression.whitener.estimate(residual, regression.weight)
-    if noise == prior.noise:
+    best = regression.whitener.estimate(residual, regression.weight)
+    if best == prior.noise:
         return posterior, prior
-    prior = replace(prior, noise=noise)
-    looked = regression.solve(posterior.state, prior, n_steps=0)
-    prior = replace(prior, sigma=white_noise(regression, looked))
-    return _settle(regression, posterior.state, prior, candidates)
+
+    def with_noise(noise: Noise) -> tuple[Posterior, Prior]:
+        trial = replace(prior, noise=noise)
+        for _ in range(_NOISE_ROUNDS):
+            looked = regression.solve(posterior.state, trial, n_steps=1)
+            trial = replace(trial, sigma=white_noise(regression, looked))
+        return looked, trial
+
+    # Residuals lack what the parameters took of the noise; the log evidence counts it.
+    looked, found = with_noise(best)
+    step = _NOISE_STEP
+    while step > _NOISE_STEP**0.2:
+        around = [
+            with_noise(Noise(best.ratio * ratio, best.time_s * time))
+            for ratio, time in ((step, 1.0), (1.0 / step, 1.0), (1.0, step), (1.0, 1.0 / step))
+            if regression.whitener.shows(best.time_s * time)
+        ]
+        nearby = max(around, key=lambda one: one[0].log_evidence)
+        if nearby[0].log_evidence > looked.log_evidence:
+            looked, found = nearby
+            best = found.noise
+        else:
+            step = step**0.5
+    return _settle(regression, looked.state, found, candidates)
 
 
 class _Growth:
@@ -228,17 +264,14 @@ class _Growth:
         self._candidates = candidates
         self._names = names
 
-    def fit(
-        self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats
-    ) -> Trial:
+    def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
         """Fit a model; columns that a smaller model dropped are asked again."""
         candidates = replace(self._candidates, typical=typical)
         wanted = np.isin(self._names, groups)
         begin = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
         prior = replace(prior, column_sd=np.where(wanted, begin, 0.0))
         posterior, prior = _settle(self._regression, state, prior, candidates, 6)
-        prior = pruned(posterior, prior, candidates.kept, _LEAST_GAIN)
-        posterior, prior = _settle(self._regression, posterior.state, prior, candidates, 8)
+        posterior, prior = _pruned(self._regression, posterior, prior, candidates, 8)
         score = score_of(self._regression, posterior, prior)
         return Trial(groups, score, posterior, prior, typical)
 
@@ -246,17 +279,13 @@ class _Growth:
         """Fit the groups that could add most to the log evidence, each beside the chosen ones."""
         if not absent:
             return []
-        if not chosen.groups and CURVE in absent:
-            # A curve comes before all that is relative to it.
-            absent = [CURVE]
         typical = self._candidates.typical
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self._regression.inactive(chosen.posterior, chosen.prior, columns)
-        asked = [(name,) for name in absent]
-        asked += [names for names in _TOGETHER if set(names) <= set(absent)]
-        gains = {
-            names: inactive.gain(typical, np.isin(self._names, names)) for names in asked
-        }
+        asked: list[tuple[str, ...]] = [(name,) for name in absent]
+        together = (tuple(name for name in names if name in absent) for names in _TOGETHER)
+        asked += [names for names in together if len(names) > 1]
+        gains = {names: inactive.gain(typical, np.isin(self._names, names)) for names in asked}
         likely = [names for names in asked if gains[names] > _WORTH_A_TRIAL]
         likely.sort(key=gains.__getitem__, reverse=True)
         state, prior = chosen.posterior.state, chosen.prior
@@ -269,7 +298,13 @@ class _Growth:
         """Typical widths once a group is added: those of its columns explain what is left."""
         kelvins = self._regression.windows.kelvins
         moved = float(kelvins[0]) or 1.0
-        left = float(np.sqrt(np.mean(self._regression.residual(chosen.posterior.state, chosen.posterior.layout) ** 2)))
+        left = float(
+            np.sqrt(
+                np.mean(
+                    self._regression.residual(chosen.posterior.state, chosen.posterior.layout) ** 2
+                )
+            )
+        )
         slope = left / moved
         units = np.array([[1.0], [1.0 / (self._regression.gravity or 1.0)]])
         own = np.minimum(slope * units * kelvins, self._candidates.typical)
@@ -300,9 +335,9 @@ def _gain(before: Score, after: Score) -> float:
         return 0.0
     if drift and all(gain > error for gain, error in drift):
         return sum(gain for gain, _ in drift)
-    if norms and norms[0] > _SURE_ERRORS * norms[1]:
-        if all(abs(gain) < _EQUAL for gain, _ in drift):
-            return norms[0]
+    is_sure = norms is not None and norms[0] > _SURE_ERRORS * norms[1]
+    if is_sure and norms and all(abs(gain) < _EQUAL for gain, _ in drift):
+        return norms[0]
     return 0.0
 
 

@@ -94,6 +94,10 @@ class Noise(NamedTuple):
         return math.sqrt(2.0 * self.ratio / self.time_s)
 
 
+#: White noise alone.
+WHITE = Noise()
+
+
 @dataclass(frozen=True)
 class InformativePrior:
     """Prior of the unit's parameters in the order of `Layout`: mean and inverse covariance."""
@@ -129,7 +133,7 @@ class Prior:
     column_sd: Floats
     offset_sd: float
     sigma: Floats
-    noise: Noise = Noise()
+    noise: Noise = WHITE
     offset_scale: float = 0.0
     tilt_sd: float = 1e-7
     start_share: float = 1.0

@@ -214,12 +214,12 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
 
 
 def _sections(position: Ints, time: Floats) -> Ints:
-    """Number the section of each window of its position, shape (n,)."""
+    """Return the number of the section of each window in its position, shape (n,)."""
     first = np.searchsorted(position, np.arange(int(position[-1]) + 1))
     last = np.append(first[1:], len(position)) - 1
     begin, end = time[first][position], time[last][position]
     part = (time - begin) / np.maximum(end - begin, 1e-9)
-    return np.minimum((part * N_SECTIONS).astype(np.int64), N_SECTIONS - 1)
+    return np.asarray(np.minimum((part * N_SECTIONS).astype(np.int64), N_SECTIONS - 1))
 
 
 def _kelvins(

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -112,6 +113,14 @@ class AxisSet:
 
 
 @dataclass(frozen=True)
+class LackOfFit:
+    """What a set misses near one board temperature, as a slow error beside all that is claimed."""
+
+    temperature_c: Annotated[Celsius, 'Board temperature [degC].']
+    sd_m_s2: Annotated[NotNegatives, 'Standard deviation of each axis.']
+
+
+@dataclass(frozen=True)
 class RegimeSet:
     """The set of one regime; outside its ranges it is held, and the covariance grows."""
 
@@ -120,9 +129,21 @@ class RegimeSet:
     x: AxisSet
     y: AxisSet
     z: AxisSet
+    lack_of_fit: Annotated[
+        tuple[LackOfFit, ...],
+        'What left-out data show beyond the claim: linear in variance between the temperatures, '
+        'held outside.',
+    ] = ()
 
     def __post_init__(self) -> None:
         check_ranges(self, 'temperature_range_c', 'rate_range_k_min')
+        at = [one.temperature_c for one in self.lack_of_fit]
+        for k, (before, after) in enumerate(pairwise(at)):
+            if not before < after:
+                raise ValueError(
+                    f'`lack_of_fit[{k + 1}].temperature_c` must be above the one before '
+                    f'({before:g}), got {after:g}'
+                )
 
     def axes(self) -> tuple[AxisSet, AxisSet, AxisSet]:
         """Return the three axes in order."""
@@ -339,6 +360,7 @@ class Calibration:
             self.posterior is not None
             or any(self.misalignment_sd)
             or any(axis.residual_sd_m_s2 for part in self.regime_sets() for axis in part.axes())
+            or any(part.lack_of_fit for part in self.regime_sets())
         )
 
 

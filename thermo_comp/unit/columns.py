@@ -141,7 +141,7 @@ class Column:
         if self.kind == 'rate':
             return 1.0 / USUAL_BOARD_LAG_S
         largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
-        return self.order * largest ** (self.order - 1)
+        return float(self.order * largest ** (self.order - 1))
 
 
 def bank(

@@ -71,10 +71,17 @@ class Curves:
         biases = [axis.bias for axis in calibration.axes]
         deltas = [[axis.delta for axis in one.axes()] for one in sets]
         self._levels = np.add(biases, deltas)[:, :, np.newaxis]
-        #: What each axis' set leaves unexplained, as a variance [m^2/s^4], shape (2, 3, 1).
-        self.residuals = np.array(
+        self._residuals = np.array(
             [[[axis.residual_sd_m_s2**2] for axis in one.axes()] for one in sets]
         )
+        self._lacks = [
+            (
+                np.array([point.temperature_c for point in one.lack_of_fit]),
+                np.array([point.sd_m_s2 for point in one.lack_of_fit]).T ** 2,
+            )
+            for one in sets
+        ]
+        self._has_lacks = any(one.lack_of_fit for one in sets)
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats]:
         """
@@ -98,6 +105,22 @@ class Curves:
         if (held != t).any():
             here, edge = (hold(one, *self._t_range[:, ::-1]) for one in (t, held))
             result += self._others.evaluate(here) - self._others.evaluate(edge)
+        return result
+
+    def unexplained(self, board: Floats) -> Floats:
+        """Evaluate what each axis' set leaves unexplained, a variance [m^2/s^4], (2, 3, n)."""
+        if not self._has_lacks:
+            return self._residuals
+        result = np.repeat(self._residuals, len(board), axis=2)
+        for regime, (at, variance) in enumerate(self._lacks):
+            if len(at) == 1:
+                result[regime] += variance
+            elif len(at):
+                held = hold(board, at[0], at[-1])
+                left = np.minimum(np.searchsorted(at, held, side='right') - 1, len(at) - 2)
+                share = (held - at[left]) / (at[left + 1] - at[left])
+                change = variance[:, left + 1] - variance[:, left]
+                result[regime] += variance[:, left] + change * share
         return result
 
     def slopes(self, board: Floats) -> Floats:
@@ -299,7 +322,7 @@ class Correction:
         on_board = self._weigh(raw * factors[1], in_order(self._signs * felt, 0))
         slopes = self.curves.slopes(board)
         v = self._spread(np.concatenate(variances), np.concatenate((slopes + on_board, felt)))
-        v[:, 0] += (shares[:, np.newaxis] * self.curves.residuals).sum(axis=0)
+        v[:, 0] += (shares[:, np.newaxis] * self.curves.unexplained(board)).sum(axis=0)
         v += slow
         is_beyond = bool(over.any())
         # A part that lags the board may be outside when the board is back.

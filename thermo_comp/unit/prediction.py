@@ -115,7 +115,9 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
     slow = SlowUncertainty(calibration, correction)
     forgotten = [0.0] * len(correction.memory.lags)
     variance = np.array([slow.at(state, forgotten) for state in states.tolist()]).reshape(-1, 3, 3)
-    unexplained = correction.curves.residuals[np.rint(states[:, WEIGHT]).astype(int), :, 0]
+    is_dynamic = np.rint(states[:, WEIGHT]) == 1.0
+    both = np.broadcast_to(correction.curves.unexplained(states[:, BOARD]), (2, 3, len(states)))
+    unexplained = np.where(is_dynamic, both[1], both[0]).T
     a, c = variance[:, :, 0] + unexplained, np.maximum(variance[:, :, 2], 0.0)
     return np.sqrt(a), np.sqrt(c)
 

@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the lack of fit: how far the errors on left-out data exceed what the calibration claims.
+
+Per regime and temperature, the mean square of the left-out drift less its claimed variance. So a
+kink of the curve, a tilt of the support or a drift of the bias is claimed even if no column says
+it. Models that left-out data cannot tell from the chosen one add their difference from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..typing import Bools, Floats
+from ..unit.calibration import LackOfFit
+from .claim import Claim
+from .equations import Equations
+from .regression import Regression
+from .selection import Selected
+from .windows import ThermalWindows
+
+# Temperatures at which the lack of fit of a regime is told, at most.
+_TEMPERATURES = 5
+# Fewer windows show no mean square worth telling.
+_FEWEST_WINDOWS = 10
+# Neighbouring windows have much of their error in common: this many count for one.
+_ALIKE = 10.0
+# An excess counts beyond this many standard errors.
+_ERRORS = 2.0
+# A model within one standard error is as likely as the chosen one: half of the squared difference.
+_SHARE_OF_OTHERS = 0.5
+
+
+@dataclass(frozen=True)
+class Excess:
+    """Excess of the left-out mean square over the claim, by window and axis [(m/s^2)^2]."""
+
+    square: Floats
+    others: Floats
+
+
+def lack_of_fit(
+    windows: ThermalWindows, regression: Regression, selected: Selected, claim: Claim
+) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:
+    """Return the lack of fit of the static and of the dynamic regime; () where there is none."""
+    excess = _excess(regression, selected, claim)
+    is_dynamic = windows.weight > 0.5
+    return _points(windows, excess, ~is_dynamic), _points(windows, excess, is_dynamic)
+
+
+def _excess(regression: Regression, selected: Selected, claim: Claim) -> Excess:
+    prior = selected.prior
+    noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.ratio)
+    square = selected.score.drift**2 - noise - _drift_variance(regression, selected, claim)
+    mine = _drift(regression, regression.force(selected.posterior.state))
+    others = np.zeros_like(mine)
+    near = [one for one in selected.trials if one.is_near]
+    for one in near:
+        away = _drift(regression, regression.force(one.posterior.state)) - mine
+        others = np.maximum(others, _SHARE_OF_OTHERS * away**2)
+    return Excess(square, others)
+
+
+def _drift(regression: Equations, values: Floats) -> Floats:
+    """Take the mean of its position from each window, shape (n, k)."""
+    position = regression.windows.position
+    first = np.searchsorted(position, np.arange(regression.windows.n_positions))
+    count = np.diff(np.append(first, len(position)))[:, None]
+    return np.asarray(values - (np.add.reduceat(values, first, axis=0) / count)[position])
+
+
+def _drift_variance(regression: Regression, selected: Selected, claim: Claim) -> Floats:
+    """Variance that the unit's covariance claims of the drift of each window, shape (n, 3)."""
+    state, layout = selected.posterior.state, claim.layout
+    in_bias, in_scale = (np.flatnonzero(one) for one in layout.used)
+    on_bias, on_scale = (
+        _drift(regression, regression.columns[:, one]) for one in (in_bias, in_scale)
+    )
+    force = regression.gravity * state.up @ state.inverse.T
+    result = np.zeros((len(on_bias), 3))
+    for axis in range(3):
+        a = force[regression.windows.position, axis][:, None]
+        along = np.hstack((on_bias, a * on_scale))
+        at = layout.axis[axis, 2:]
+        result[:, axis] = np.sum((along @ claim.covariance[np.ix_(at, at)]) * along, axis=1)
+    return result
+
+
+def _points(windows: ThermalWindows, excess: Excess, rows: Bools) -> tuple[LackOfFit, ...]:
+    rows = rows & np.isfinite(excess.square[:, 0])
+    n = int(rows.sum())
+    n_bins = min(_TEMPERATURES, n // _FEWEST_WINDOWS)
+    if not n_bins:
+        return ()
+    temperature = windows.temperature[rows]
+    order = np.argsort(temperature, kind='stable')
+    points = []
+    for part in np.array_split(order, n_bins):
+        square = excess.square[rows][part]
+        mean = square.mean(axis=0)
+        error = square.std(axis=0) / np.sqrt(max(len(part) / _ALIKE, 1.0))
+        mean = np.where(mean > _ERRORS * error, mean, 0.0)
+        x, y, z = np.sqrt(mean + excess.others[rows][part].mean(axis=0)).tolist()
+        points.append(LackOfFit(float(temperature[part].mean()), (x, y, z)))
+    rising = [
+        one
+        for k, one in enumerate(points)
+        if not k or one.temperature_c > points[k - 1].temperature_c
+    ]
+    return tuple(rising) if any(any(one.sd_m_s2) for one in rising) else ()
