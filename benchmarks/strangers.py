@@ -1,0 +1,332 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the accuracy on bags that strangers bring: the fit beside curves drawn by hand.
+
+Run ``python benchmarks/strangers.py`` for every case (many hours), or a part with fewer units:
+``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A case may
+name one of its studies: ``--cases 'turn-on:9 at 30 ug'``.
+
+Units and recordings come from `strangers_units.py` and `strangers_cases.py`, which share no code
+with the package; the package is used only through its fit and its correction of arrays. Every row
+corrects recordings that the fit has not seen, except a row which says so. Errors are RMS of means
+over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio is the
+RMS of error over claimed sd. Figures are RMS over the units. MISS marks a limit of
+`strangers_limits.py` that a row misses; the exit code is then 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from strangers_baselines import WINDOW_S, Minutes, by_drift, by_norm, means, minutes, slots
+from strangers_cases import CASES, Study
+from strangers_limits import Result, Row, Score, misses, rms, rows_of
+from strangers_recorded import cats, samples
+from strangers_units import GRAVITY, REFERENCE_C, UG, Bag, Floats
+
+import thermo_comp
+from thermo_comp.fitting import FitOptions
+
+#: Options of the models by the package: the fit, and two baselines beside constants and cubic.
+PACKAGE: dict[str, dict[str, Any]] = {
+    'fit': {},
+    'golovach': {'model': 'golovach'},
+    'sets': {'groups': ('curve', 'set')},
+}
+BASELINES = ('constants', 'cubic', 'golovach', 'sets')
+#: Cases of recordings, which have one unit.
+RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """
+    Corrected means over 60 s of one bag.
+
+    Parameters
+    ----------
+    force : ndarray, shape (w, 3)
+        Specific force [m/s^2].
+    claim : ndarray, shape (w, 3, 3)
+        Published covariance of the means [m^2/s^4].
+    white : ndarray, shape (3,)
+        The part of the variance that is independent from one mean to the next [m^2/s^4].
+
+    """
+
+    force: Floats
+    claim: Floats
+    white: Floats
+
+
+def fitted(
+    study: Study, prior: thermo_comp.Calibration | None = None, **model: Any
+) -> thermo_comp.Calibration:
+    """Fit a study's bags; `model` holds further options."""
+    # The sd of gravity can be given only to a fit that has this option.
+    known = {option.name for option in fields(FitOptions)}
+    options = {name: value for name, value in study.options.items() if name in known}
+    if prior is not None:
+        options['prior'] = prior
+    columns = [
+        thermo_comp.Columns(bag.time_s, bag.samples, dict(bag.temperatures), name=bag.name)
+        for bag in study.bags
+    ]
+    return thermo_comp.fit(columns, gravity=study.gravity, **options, **model)
+
+
+def chosen_by(calibration: thermo_comp.Calibration) -> str:
+    """List the groups of a calibration, each with its number of columns."""
+    columns = Counter(term.group for term in calibration.response)
+    others = {entry.group for entry in calibration.evidence} - set(columns)
+    return ' '.join([*sorted(others), *(f'{group}:{n}' for group, n in columns.items())])
+
+
+def corrected(calibration: thermo_comp.Calibration, bag: Bag) -> Corrected:
+    """Correct a bag and average it."""
+    known = ('board', *calibration.sensors)
+    given = {key: value for key, value in bag.temperatures.items() if key in known}
+    out = calibration.correct(bag.time_s, bag.samples, **given)
+    first, size = slots(bag)
+    force, claim = means(out.specific_force, first, size), means(out.covariance, first, size)
+    # The published covariance is that of one sample. Its white noise and the rounding of the
+    # converter average down over a minute; the rest is common to all samples of a minute.
+    density = np.square(calibration.noise_density_m_s2_sqrt_hz)
+    scale = np.array([axis.scale_factor for axis in calibration.axes])
+    rounding = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0
+    sample = density / calibration.unit.cycle_time_s + rounding / scale**2
+    M = np.array(calibration.misalignment)
+    common = claim - (M * sample) @ M.T
+    diagonal = range(3)
+    common[:, diagonal, diagonal] = np.maximum(common[:, diagonal, diagonal], 0.0)
+    white = (M * density / WINDOW_S) @ M.T
+    return Corrected(force, common + white, np.diag(white))
+
+
+def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool) -> Score:
+    """Compare corrected means of a minute with the truth and with their claim."""
+    forces = [out.force for out in outs]
+    if not all(np.isfinite(force).all() for force in forces):
+        return Score(np.inf, np.inf, np.inf, np.inf, np.inf)
+    plain = error_of(forces, bags, is_drift=is_drift)
+    if is_drift:
+        # The constants of a pose cancel in its drift. Their variance is the smallest of the pose:
+        # that at the middle of the data, where the curve over temperature adds nothing.
+        own = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
+        sd = np.sqrt(np.concatenate(
+            [one - one.min(axis=0) + out.white for one, out in zip(own, outs, strict=True)]
+        ))  # fmt: skip
+        return Score(np.nan, plain.vector, np.nan, rms(_drift(forces, bags) / sd), rms(sd) / UG)
+    force, claim = np.concatenate(forces), np.concatenate([out.claim for out in outs])
+    size = np.linalg.norm(force, axis=1, keepdims=True)
+    along = np.sqrt(np.einsum('wi,wij,wj->w', force / size, claim, force / size))
+    sd = np.sqrt(np.diagonal(claim, axis1=1, axis2=2))
+    vector = force - np.concatenate([bag.force for bag in bags])
+    return Score(
+        plain.norm,
+        plain.vector,
+        rms((size[:, 0] - GRAVITY) / along),
+        rms(vector / sd),
+        rms(np.linalg.norm(sd, axis=1)) / UG,
+    )
+
+
+def error_of(forces: Sequence[Floats], bags: Sequence[Minutes], *, is_drift: bool) -> Score:
+    """Compare forces, which claim nothing, with the truth."""
+    if is_drift:
+        return Score(vector=rms(_drift(forces, bags)) / UG)
+    force, truth = np.concatenate(forces), np.concatenate([bag.force for bag in bags])
+    norm = np.linalg.norm(force, axis=1) - GRAVITY
+    return Score(rms(norm) / UG, rms(np.linalg.norm(force - truth, axis=1)) / UG)
+
+
+def _drift(forces: Sequence[Floats], bags: Sequence[Minutes]) -> Floats:
+    """Give the error of each axis less its mean over the bag, shape (w, 3)."""
+    errors = [force - bag.force for force, bag in zip(forces, bags, strict=True)]
+    return np.concatenate([error - error.mean(axis=0) for error in errors])
+
+
+def by_hand(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
+    """Fit constants and a cubic per axis by scipy."""
+    bags = [minutes(bag) for bag in study.by_hand or study.bags]
+    orders = {'constants': 0, 'cubic': 3}
+    if study.is_drift:
+        # In one pose the scale is that of the norm.
+        scale = rms(np.linalg.norm(bags[0].samples, axis=1)) / GRAVITY
+        return {name: by_drift(bags, scale, order=order) for name, order in orders.items()}
+    return {name: by_norm(bags, study.gravity, order=order) for name, order in orders.items()}
+
+
+def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
+    """Correct half an hour at the reference temperature without a force: the rest is the error."""
+    assert study.bound is not None
+    unit, time_s = study.bound.unit, np.arange(1.0, 1801.0)
+    samples_ = np.broadcast_to(unit.counts * study.bound.bias, (len(time_s), 3))
+    rest = {'board': REFERENCE_C, 'case': REFERENCE_C - unit.heat_k}
+    temperatures = {key: (time_s, np.full(len(time_s), celsius)) for key, celsius in rest.items()}
+    out = corrected(calibration, Bag('zero', time_s, samples_, temperatures))
+    error, sd = out.force[-1], np.sqrt(np.diag(out.claim[-1]))
+    return Score(
+        vector=float(np.linalg.norm(error)) / UG,
+        ratio=rms(error / sd),
+        claim=float(np.linalg.norm(sd)) / UG,
+        bound_ratio=rms(error / study.bound.sd),
+    )
+
+
+def scored(
+    study: Study, model: thermo_comp.Calibration, tests: dict[str, list[Minutes]]
+) -> dict[str, Score]:
+    """Score a calibration on each set of held-out bags."""
+    if study.bound is not None:
+        return {'': bias_score(model, study)}
+    return {
+        test: score([corrected(model, bag) for bag in study.tests[test]], bags,
+                    is_drift=study.is_drift)
+        for test, bags in tests.items()
+    }  # fmt: skip
+
+
+def run(
+    case: str, unit: int, study: Study, done: dict[str, thermo_comp.Calibration]
+) -> list[Result]:
+    """Fit all models to a study and score them; `done` keeps calibrations by study."""
+    title = f'{case} {study.label}'.strip()
+    prior = done.get(study.prior_of)
+    tests = {test: [minutes(bag) for bag in bags] for test, bags in study.tests.items()}
+    scores: dict[str, dict[str, Score]] = {test: {} for test in tests or ('',)}
+    chosen, refused, fit_s = '', '', np.nan
+    for model, options in PACKAGE.items():
+        if model != 'fit' and (study.prior_of or study.bound):
+            continue
+        began = time.process_time()
+        try:
+            calibration = fitted(study, prior, **options)
+        except (thermo_comp.ThermoCompError, ValueError) as error:
+            refused = refused or (str(error) if model == 'fit' else '')
+            continue
+        if model == 'fit':
+            fit_s = time.process_time() - began
+            chosen, done[study.label] = chosen_by(calibration), calibration
+        for test, found in scored(study, calibration, tests).items():
+            scores[test][model] = found
+    if not (study.prior_of or study.bound):
+        for model, correct in by_hand(study).items():
+            for test, bags in tests.items():
+                forces = [correct(bag) for bag in bags]
+                scores[test][model] = error_of(forces, bags, is_drift=study.is_drift)
+    return [
+        Result(title + (f': {test}' if test else ''), unit, found, chosen, fit_s, refused)
+        for test, found in scores.items()
+    ]
+
+
+def studies_of(case: str, unit: int, path: Path | None) -> Iterator[Study]:
+    """Give the studies of one unit of a case."""
+    if case != 'cats':
+        return samples(case) if case in RECORDED else CASES[case][0](unit)
+    assert path is not None
+    return cats(path)
+
+
+def run_case(case: str, label: str, units: int, path: Path | None) -> list[Result]:
+    """Run a case, or the one study of it that has the label."""
+    results = []
+    for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
+        done: dict[str, thermo_comp.Calibration] = {}
+        studies = list(studies_of(case, unit, path))
+        needed = {study.prior_of for study in studies if study.label == label}
+        for study in studies:
+            if not label or study.label == label or study.label in needed:
+                print(f'{case} {study.label}, unit {unit}', file=sys.stderr, flush=True)
+                results += run(case, unit, study, done)
+    return results
+
+
+HEAD = (
+    '| row | fit: norm / vector | ratio: norm / axes / worst | claim | '
+    + ' | '.join(BASELINES)
+    + ' | fit CPU s | chosen | |\n'
+    + '|---' * (len(BASELINES) + 7)
+    + '|'
+)
+
+
+def pair(found: Score | None) -> str:
+    """Format the two errors of a model."""
+    if found is None:
+        return '-'
+    return ' / '.join('-' if np.isnan(x) else f'{x:.3g}' for x in (found.norm, found.vector))
+
+
+def line_of(row: Row, missed: Sequence[str]) -> str:
+    """Format a row of the table."""
+    fit = row.scores.get('fit', Score())
+    ratios = ' / '.join(
+        '-' if np.isnan(x) else f'{x:.2f}' for x in (fit.norm_ratio, fit.ratio, row.worst)
+    )
+    cells = [row.title, pair(row.scores.get('fit')), ratios, f'{fit.claim:.3g}']
+    cells += [pair(row.scores.get(model)) for model in BASELINES]
+    bound = '' if np.isnan(fit.bound_ratio) else f'bias / bound {fit.bound_ratio:.2f}; '
+    marks = '; '.join(f'MISS {text}' for text in missed)
+    cells += [f'{row.fit_s:.1f}', row.refused or row.chosen, bound + marks]
+    return '| ' + ' | '.join(cells) + ' |'
+
+
+def main() -> int:
+    """Run the cases that are asked for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    names = (*RECORDED, *CASES)
+    parser.add_argument('--cases', type=lambda text: text.split(','), default=list(names),
+                        help=f'default: all of {", ".join(names)}')  # fmt: skip
+    parser.add_argument('--units', type=int, default=0, help='units; default: 3 to 100, by case')
+    parser.add_argument('--cats', type=Path, help='cats_temperature_calib.nc (needs h5py)')
+    parser.add_argument('--json', type=Path, help='file for all figures')
+    options = parser.parse_args()
+    wanted = [name.partition(':')[::2] for name in options.cases]
+    for case, _ in wanted:
+        if case not in names:
+            parser.error(f'--cases: {case!r} is none of {", ".join(names)}')
+    if options.cases == list(names) and options.cats is None:
+        print('The case cats is left out: it needs --cats FILE.', file=sys.stderr)
+        wanted.remove(('cats', ''))
+    if options.cats is None and any(case == 'cats' for case, _ in wanted):
+        parser.error('--cases: cats needs --cats FILE')
+    results, told = [], []
+    print(HEAD, flush=True)
+    for case, label in wanted:
+        found = run_case(case, label, options.units, options.cats)
+        if not found:
+            parser.error(f'--cases: {case} has no study {label!r}')
+        rows = rows_of(found)
+        for row in rows:
+            missed = misses(row, rows)
+            print(line_of(row, missed), flush=True)
+            told.append({**asdict(row), 'missed': missed})
+        results += found
+    if options.json:
+        figures = {
+            'version': thermo_comp.__version__,
+            'rows': told,
+            'units': [asdict(result) for result in results],
+        }
+        options.json.write_text(json.dumps(figures, indent=1), encoding='utf-8')
+    n_missed = sum(bool(row['missed']) for row in told)
+    print(f'\n{n_missed} of {len(told)} rows miss a limit')
+    return int(n_missed > 0)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
