@@ -23,7 +23,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from strangers_recorded import cats, samples
 from strangers_units import GRAVITY, REFERENCE_C, UG, Bag, Floats
 
 import thermo_comp
+from thermo_comp import CompensatorConfig
 from thermo_comp.fitting import FitOptions
 
 #: Options of the models by the package: the fit, and two baselines beside constants and cubic.
@@ -44,6 +45,9 @@ PACKAGE: dict[str, dict[str, Any]] = {
     'sets': {'groups': ('curve', 'set')},
 }
 BASELINES = ('constants', 'cubic', 'golovach', 'sets')
+#: Smallest share of the minutes that a correction must publish as a whole: the node waits for its
+#: first reading.
+LEAST_PUBLISHED = 0.98
 #: Cases of recordings, which have one unit.
 RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
 
@@ -92,11 +96,13 @@ def chosen_by(calibration: thermo_comp.Calibration) -> str:
     return ' '.join([*sorted(others), *(f'{group}:{n}' for group, n in columns.items())])
 
 
-def corrected(calibration: thermo_comp.Calibration, bag: Bag) -> Corrected:
+def corrected(
+    calibration: thermo_comp.Calibration, bag: Bag, config: CompensatorConfig | None = None
+) -> Corrected:
     """Correct a bag and average it."""
     known = ('board', *calibration.sensors)
     given = {key: value for key, value in bag.temperatures.items() if key in known}
-    out = calibration.correct(bag.time_s, bag.samples, **given)
+    out = calibration.correct(bag.time_s, bag.samples, config=config, **given)
     first, size = slots(bag)
     force, claim = means(out.specific_force, first, size), means(out.covariance, first, size)
     # The published covariance is that of one sample. Its white noise and the rounding of the
@@ -115,9 +121,18 @@ def corrected(calibration: thermo_comp.Calibration, bag: Bag) -> Corrected:
 
 def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool) -> Score:
     """Compare corrected means of a minute with the truth and with their claim."""
-    forces = [out.force for out in outs]
-    if not all(np.isfinite(force).all() for force in forces):
+    published = [np.isfinite(out.force).all(axis=1) for out in outs]
+    if np.mean(np.concatenate(published)) < LEAST_PUBLISHED:
         return Score(np.inf, np.inf, np.inf, np.inf, np.inf)
+    outs = [
+        replace(out, force=out.force[rows], claim=out.claim[rows])
+        for out, rows in zip(outs, published, strict=True)
+    ]
+    bags = [
+        replace(bag, samples=bag.samples[rows], board=bag.board[rows], force=bag.force[rows])
+        for bag, rows in zip(bags, published, strict=True)
+    ]
+    forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
         # The constants of a pose cancel in its drift. Their variance is the smallest of the pose:
@@ -174,7 +189,9 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     samples_ = np.broadcast_to(unit.counts * study.bound.bias, (len(time_s), 3))
     rest = {'board': REFERENCE_C, 'case': REFERENCE_C - unit.heat_k}
     temperatures = {key: (time_s, np.full(len(time_s), celsius)) for key, celsius in rest.items()}
-    out = corrected(calibration, Bag('zero', time_s, samples_, temperatures))
+    # No force is none of gravity, and such samples stand still: the node would doubt both.
+    config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+    out = corrected(calibration, Bag('zero', time_s, samples_, temperatures), config)
     error, sd = out.force[-1], np.sqrt(np.diag(out.claim[-1]))
     return Score(
         vector=float(np.linalg.norm(error)) / UG,

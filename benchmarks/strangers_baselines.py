@@ -13,8 +13,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.optimize import least_squares
 from strangers_units import GRAVITY, REFERENCE_C, Bag, Floats
+
+Ints = npt.NDArray[np.int64]
 
 WINDOW_S = 60.0  # length of the means that are judged [s]
 SPAN_K = 15.0  # temperatures of a cubic are in this unit, which keeps its powers alike [K]
@@ -29,7 +32,7 @@ class Minutes:
     force: Floats
 
 
-def slots(bag: Bag) -> tuple[Floats, Floats]:
+def slots(bag: Bag) -> tuple[Ints, Ints]:
     """Give the first rows of whole windows, and how many rows each has."""
     number = np.floor((bag.time_s - bag.time_s[0]) / WINDOW_S)
     first = np.flatnonzero(np.diff(number, prepend=-1.0))
@@ -38,11 +41,11 @@ def slots(bag: Bag) -> tuple[Floats, Floats]:
     return first[is_whole], size[is_whole]
 
 
-def means(values: Floats, first: Floats, size: Floats) -> Floats:
+def means(values: Floats, first: Ints, size: Ints) -> Floats:
     """Average rows window by window."""
-    total = np.concatenate((np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)))
-    shape = (-1, *[1] * (values.ndim - 1))
-    return np.asarray((total[first + size] - total[first]) / size.reshape(shape))
+    edges = np.stack((first, first + size), axis=1).ravel()
+    total = np.add.reduceat(values, edges[edges < len(values)], axis=0)[::2]
+    return np.asarray(total / size.reshape(-1, *[1] * (values.ndim - 1)))
 
 
 def minutes(bag: Bag) -> Minutes:

@@ -115,7 +115,7 @@ LIMITS = {
     'board-twice': _ONE_THERMOMETER,
     'cats even to odd': _REAL_UNIT,
     'cats odd to even': _REAL_UNIT,
-    'cats rest': Limit(high=1.4),
+    'cats rests left out': Limit(high=1.4),
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),

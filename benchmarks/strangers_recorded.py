@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 from strangers_cases import Study
-from strangers_units import GRAVITY, Bag, Floats
+from strangers_units import GRAVITY, Bag
 
+import thermo_comp
 from thermo_comp.recording.reader import read_recording
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,21 +32,10 @@ LEAST_MINUTES = 4
 
 def sample_bag(path: Path) -> Bag:
     """Read one sample bag, whose metadata hold its true attitude."""
-    recording = read_recording(path, None, require=['accel'])
-    columns = recording.columns
-    start_ns = int(columns.accel_stamp_ns[0]) - 10_000_000_000
-
-    def since(stamps: Floats) -> Floats:
-        return np.asarray(1e-9 * (stamps - start_ns))
-
-    temperatures = {
-        name: (since(one.stamp_ns), one.value)
-        for name, one in columns.temperatures.items()
-        if len(one.value)
-    }
-    truth = json.loads(recording.info.metadata['truth'])
+    columns = thermo_comp.read(path)
+    truth = json.loads(read_recording(path, None, require=['accel']).info.metadata['truth'])
     force = GRAVITY * np.array(truth['up'])
-    return Bag(path.stem, since(columns.accel_stamp_ns), columns.accel, temperatures, force)
+    return Bag(path.stem, columns.time_s, columns.counts, columns.temperatures, force)
 
 
 def samples(which: str) -> Iterator[Study]:
@@ -113,11 +103,12 @@ def cats(path: Path) -> Iterator[Study]:
     for rest in rests:
         for number, bag in blocks_of(rest, rest.name).items():
             still[number % 2].append(bag)
-    bags = list(blocks_of(whole, 'block').values())
+    blocks = blocks_of(whole, 'block')
     options = {'input': 'm/s^2'}
     for own, name in enumerate(('even to odd', 'odd to even')):
         tests = {'': tuple(still[1 - own])}
-        yield Study(name, tuple(bags[own::2]), tests, options, by_hand=tuple(still[own]))
+        bags = tuple(bag for number, bag in blocks.items() if number % 2 == own)
+        yield Study(name, bags, tests, options, by_hand=tuple(still[own]))
     for k, rest in enumerate(rests):
         others = tuple(rests[:k] + rests[k + 1 :])
-        yield Study(f'rest {k} left out', others, {'': (rest,)}, options)
+        yield Study('rests left out', others, {'': (rest,)}, options)
