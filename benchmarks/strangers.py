@@ -12,7 +12,8 @@ with the package; the package is used only through its fit and its correction of
 corrects recordings that the fit has not seen, except a row which says so. Errors are RMS of means
 over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio is the
 RMS of error over claimed sd. Figures are RMS over the units. MISS marks a limit of
-`strangers_limits.py` that a row misses; the exit code is then 1.
+`strangers_limits.py` that a row misses; the exit code is then 1. Most of the time goes into the
+baselines by the package; ``--baselines strangers.json`` takes them from an earlier run.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -215,35 +216,58 @@ def scored(
 
 
 def run(
-    case: str, unit: int, study: Study, done: dict[str, thermo_comp.Calibration]
+    case: str,
+    unit: int,
+    study: Study,
+    done: dict[str, thermo_comp.Calibration],
+    earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
-    """Fit all models to a study and score them; `done` keeps calibrations by study."""
+    """
+    Fit all models to a study and score them.
+
+    Parameters
+    ----------
+    case, unit, study : str, int, Study
+        What is fitted.
+    done : dict of str to Calibration
+        Fits of this unit by study, for those that take one as a prior; the fit is added.
+    earlier : mapping of (str, int) to mapping of str to Score
+        Scores of the baselines by title and unit, from an earlier run; others are computed.
+
+    Returns
+    -------
+    list of Result
+        One for each set of held-out bags.
+
+    """
     title = f'{case} {study.label}'.strip()
-    prior = done.get(study.prior_of)
     tests = {test: [minutes(bag) for bag in bags] for test, bags in study.tests.items()}
-    scores: dict[str, dict[str, Score]] = {test: {} for test in tests or ('',)}
+    titles = {test: title + (f': {test}' if test else '') for test in tests or ('',)}
+    known = {test: earlier.get((titles[test], unit), {}) for test in titles}
+    scores: dict[str, dict[str, Score]] = {test: {} for test in titles}
+    has_baselines = not (study.prior_of or study.bound)
     chosen, refused, fit_s = '', '', np.nan
     for model, options in PACKAGE.items():
-        if model != 'fit' and (study.prior_of or study.bound):
+        if model != 'fit' and (not has_baselines or all(known.values())):
             continue
         began = time.process_time()
         try:
-            calibration = fitted(study, prior, **options)
+            calibration = fitted(study, done.get(study.prior_of), **options)
         except (thermo_comp.ThermoCompError, ValueError) as error:
-            refused = refused or (str(error) if model == 'fit' else '')
+            refused = str(error) if model == 'fit' else refused
             continue
         if model == 'fit':
             fit_s = time.process_time() - began
             chosen, done[study.label] = chosen_by(calibration), calibration
         for test, found in scored(study, calibration, tests).items():
             scores[test][model] = found
-    if not (study.prior_of or study.bound):
+    if has_baselines and not all(known.values()):
         for model, correct in by_hand(study).items():
             for test, bags in tests.items():
                 forces = [correct(bag) for bag in bags]
                 scores[test][model] = error_of(forces, bags, is_drift=study.is_drift)
     return [
-        Result(title + (f': {test}' if test else ''), unit, found, chosen, fit_s, refused)
+        Result(titles[test], unit, {**found, **known[test]}, chosen, fit_s, refused)
         for test, found in scores.items()
     ]
 
@@ -256,18 +280,38 @@ def studies_of(case: str, unit: int, path: Path | None) -> Iterator[Study]:
     return cats(path)
 
 
-def run_case(case: str, label: str, units: int, path: Path | None) -> list[Result]:
-    """Run a case, or the one study of it that has the label."""
+def run_case(
+    case: str,
+    label: str,
+    units: int,
+    path: Path | None,
+    earlier: Mapping[tuple[str, int], Mapping[str, Score]],
+) -> list[Result]:
+    """Run a case, or the studies of it that have the label."""
     results = []
     for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
         done: dict[str, thermo_comp.Calibration] = {}
         studies = list(studies_of(case, unit, path))
         needed = {study.prior_of for study in studies if study.label == label}
+        seen = Counter[str]()
         for study in studies:
             if not label or study.label == label or study.label in needed:
-                print(f'{case} {study.label}, unit {unit}', file=sys.stderr, flush=True)
-                results += run(case, unit, study, done)
+                # Recordings that are left out in turn are numbered as units are.
+                number = unit + seen[study.label]
+                seen[study.label] += 1
+                print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)
+                results += run(case, number, study, done, earlier)
     return results
+
+
+def baselines_in(path: Path) -> dict[tuple[str, int], dict[str, Score]]:
+    """Read the scores of the baselines from the figures of an earlier run."""
+    found: dict[tuple[str, int], dict[str, Score]] = {}
+    for unit in json.loads(path.read_text(encoding='utf-8'))['units']:
+        found[unit['title'], unit['unit']] = {
+            model: Score(**score) for model, score in unit['scores'].items() if model in BASELINES
+        }
+    return found
 
 
 HEAD = (
@@ -310,6 +354,8 @@ def main() -> int:
                         help=f'default: all of {", ".join(names)}')  # fmt: skip
     parser.add_argument('--units', type=int, default=0, help='units; default: 3 to 100, by case')
     parser.add_argument('--cats', type=Path, help='cats_temperature_calib.nc (needs h5py)')
+    parser.add_argument('--baselines', type=Path, metavar='JSON',
+                        help='scores of the baselines, from an earlier --json')  # fmt: skip
     parser.add_argument('--json', type=Path, help='file for all figures')
     options = parser.parse_args()
     wanted = [name.partition(':')[::2] for name in options.cases]
@@ -321,10 +367,11 @@ def main() -> int:
         wanted.remove(('cats', ''))
     if options.cats is None and any(case == 'cats' for case, _ in wanted):
         parser.error('--cases: cats needs --cats FILE')
+    earlier = baselines_in(options.baselines) if options.baselines else {}
     results, told = [], []
     print(HEAD, flush=True)
     for case, label in wanted:
-        found = run_case(case, label, options.units, options.cats)
+        found = run_case(case, label, options.units, options.cats, earlier)
         if not found:
             parser.error(f'--cases: {case} has no study {label!r}')
         rows = rows_of(found)
@@ -333,13 +380,14 @@ def main() -> int:
             print(line_of(row, missed), flush=True)
             told.append({**asdict(row), 'missed': missed})
         results += found
-    if options.json:
-        figures = {
-            'version': thermo_comp.__version__,
-            'rows': told,
-            'units': [asdict(result) for result in results],
-        }
-        options.json.write_text(json.dumps(figures, indent=1), encoding='utf-8')
+        if options.json:
+            # After each case: a run of all cases takes hours.
+            figures = {
+                'version': thermo_comp.__version__,
+                'rows': told,
+                'units': [asdict(result) for result in results],
+            }
+            options.json.write_text(json.dumps(figures, indent=1), encoding='utf-8')
     n_missed = sum(bool(row['missed']) for row in told)
     print(f'\n{n_missed} of {len(told)} rows miss a limit')
     return int(n_missed > 0)

@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -453,11 +454,32 @@ def test_blocks_go_by_the_clock_and_share_no_sample() -> None:
 def test_one_study_of_a_case_can_be_asked_for(capsys, monkeypatch) -> None:
     ran = []
     monkeypatch.setattr(
-        strangers, 'run', lambda _, unit, study, __: ran.append((unit, study.label)) or []
+        strangers, 'run', lambda _, unit, study, *__: ran.append((unit, study.label)) or []
     )
     monkeypatch.setattr(cases, 'record', lambda *_, name, **__: Bag(name, None, None, {}))
-    strangers.run_case('turn-on', '9 at 30 ug', 2, None)
+    strangers.run_case('turn-on', '9 at 30 ug', 2, None, {})
     assert ran == [(1, '9 at 30 ug'), (2, '9 at 30 ug')]
+
+
+def test_baselines_come_from_an_earlier_run(tmp_path, monkeypatch) -> None:
+    path = tmp_path / 'earlier.json'
+    scores = {'fit': asdict(Score(1.0, 2.0)), 'cubic': asdict(Score(3.0))}
+    unit = {'title': 'ageing', 'unit': 1, 'scores': scores}
+    path.write_text(json.dumps({'units': [unit]}))
+    earlier = strangers.baselines_in(path)
+    assert list(earlier) == [('ageing', 1)]
+    assert list(earlier['ageing', 1]) == ['cubic']
+    assert earlier['ageing', 1]['cubic'].norm == 3.0
+
+    def refused(study, prior, **options):
+        assert not options
+        raise ValueError('no rest')
+
+    monkeypatch.setattr(strangers, 'fitted', refused)
+    bag = Bag('', np.arange(1.0, 301.0), np.ones((300, 3)), {}, LEVEL)
+    study = cases.Study('', (bag,), {'': (bag,)})
+    [result] = strangers.run('ageing', 1, study, {}, earlier)
+    assert (result.refused, list(result.scores)) == ('no rest', ['cubic'])
 
 
 @pytest.mark.parametrize(
