@@ -246,13 +246,14 @@ def run(
     known = {test: earlier.get((titles[test], unit), {}) for test in titles}
     scores: dict[str, dict[str, Score]] = {test: {} for test in titles}
     has_baselines = not (study.prior_of or study.bound)
+    prior = done[study.prior_of] if study.prior_of else None
     chosen, refused, fit_s = '', '', np.nan
     for model, options in PACKAGE.items():
         if model != 'fit' and (not has_baselines or all(known.values())):
             continue
         began = time.process_time()
         try:
-            calibration = fitted(study, done.get(study.prior_of), **options)
+            calibration = fitted(study, prior, **options)
         except (thermo_comp.ThermoCompError, ValueError) as error:
             refused = str(error) if model == 'fit' else refused
             continue

@@ -482,6 +482,27 @@ def test_baselines_come_from_an_earlier_run(tmp_path, monkeypatch) -> None:
     assert (result.refused, list(result.scores)) == ('no rest', ['cubic'])
 
 
+def test_only_a_study_that_asks_for_a_prior_gets_one(monkeypatch) -> None:
+    priors = []
+
+    def fitted(study, prior, **options):
+        priors.append((study.label, prior, len(options)))
+        return study.label
+
+    monkeypatch.setattr(strangers, 'fitted', fitted)
+    monkeypatch.setattr(strangers, 'chosen_by', str)
+    monkeypatch.setattr(strangers, 'scored', lambda *_: {'': Score()})
+    monkeypatch.setattr(strangers, 'by_hand', lambda _: {})
+    done: dict = {}
+    for label, prior_of in (('', ''), ('alone', ''), ('prior', 'alone')):
+        strangers.run(
+            'third-node', 1, cases.Study(label, (), {'': ()}, prior_of=prior_of), done, {}
+        )
+    fits = [(label, prior) for label, prior, n_options in priors if not n_options]
+    assert fits == [('', None), ('alone', None), ('prior', 'alone')]
+    assert [prior for *_, prior, n_options in priors if n_options] == [None] * 4
+
+
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
