@@ -419,6 +419,14 @@ def test_units_of_a_row_join_by_their_mean_square() -> None:
     assert (row.worst, row.fit_s) == (1.2, 1.5)
 
 
+@pytest.mark.parametrize('name', ['units', 'cases', 'baselines', 'limits'])
+def test_generators_and_judge_share_no_code_with_the_package(name: str) -> None:
+    source = (ROOT / 'benchmarks' / f'strangers_{name}.py').read_text(encoding='utf-8')
+    imports = [line for line in source.splitlines() if 'import ' in line]
+    assert imports
+    assert not [line for line in imports if 'thermo_comp' in line]
+
+
 def test_each_case_has_a_limit_and_each_limit_a_case() -> None:
     names = (*strangers.RECORDED, *cases.CASES)
     assert all(any(key.startswith(name) for key in LIMITS) for name in names)
