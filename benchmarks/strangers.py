@@ -255,6 +255,7 @@ def run(
         try:
             calibration = fitted(study, prior, **options)
         except (thermo_comp.ThermoCompError, ValueError) as error:
+            print(f'{title}, unit {unit}: {model} refuses: {error}', file=sys.stderr, flush=True)
             refused = str(error) if model == 'fit' else refused
             continue
         if model == 'fit':
