@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what a stranger's bags are judged by: means of a minute, and the curves drawn by hand.
+Owns the means of a minute and the curves by scipy of the benchmark `strangers.py`.
 
 Constants are nine numbers: bias, scale and misalignment; a cubic adds a cubic of the bias per axis
-in board temperature and a line of the scale. Both come of scipy's least squares on ``|f| - g``.
+in board temperature and a line of the scale. Both are scipy's least squares on ``|f| - g``.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def by_norm(
     """Fit constants, with curves of an order above 0, to ``|f| - g``; returns the correction."""
     samples = np.concatenate([bag.samples for bag in bags])
     board = np.concatenate([bag.board for bag in bags])
-    # Counts per g, roughly: what a sphere about nothing says, and then what one about its middle.
+    # Counts per g: the RMS length of the samples, refined by the scale factors below.
     size = np.sqrt(np.mean(np.sum(samples**2, axis=1)))
 
     def missed(p: Floats, order: int) -> Floats:

@@ -3,7 +3,7 @@
 """
 Owns the drawn cases of the benchmark `strangers.py`: which unit, which bags, what is held out.
 
-Each case draws units by number and gives studies: bags for a fit, and bags that it has not seen.
+Each case draws a unit by its number and gives studies: bags for a fit, and held-out bags.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ HELD = (
 )
 FROST = program(5, 10, (12, 0.5, 60), (28, 0.8, 30))
 ROOM = program(21, 20)
-#: 2 K short of where the unit is used.
+#: The range of SHORT ends 2 K before the range of USE, on both sides.
 SHORT = program(20, 20, (33, 1, 50), (7, 1, 60), (20, 1, 12))
 USE = (program(20, 20, (35, 0.7, 45), (15, 1.5, 40)), program(20, 20, (5, 1.2, 50), (24, 0.6, 40)))
-#: Of MEMS: a heating that anybody has.
+#: Programs of MEMS: a simple oven.
 WARM = program(22, 15, (45, 1, 30), (12, 1, 40), (22, 1, 20))
 WARM_HELD = (program(15, 15, (40, 0.8, 40)), program(40, 15, (18, 1.2, 40)))
 
@@ -60,23 +60,23 @@ class Study:
     Parameters
     ----------
     label : str
-        What tells it from the other studies of its case.
+        Name within the case; empty where the case has one study.
     bags : tuple of Bag
-        For the fit.
+        Bags of the fit.
     tests : dict of str to tuple of Bag
-        Held out, by name.
+        Held-out bags by name.
     options : dict
-        Of the fit.
+        Options of the fit.
     gravity : float
-        As it is told [m/s^2].
+        Gravity that the fit is given [m/s^2].
     prior_of : str
-        Label of the study before, whose calibration is the prior; none where empty.
+        Label of an earlier study whose calibration is the prior; empty without a prior.
     is_drift : bool
-        Whether each axis is judged less its mean in a bag: one pose says no more.
+        Whether the error of each axis less its mean over the bag is judged, as for one pose.
     by_hand : tuple of Bag
-        At rest all the time, for the curves drawn by hand; the bags themselves where empty.
+        Bags at rest for the curves by scipy; the bags of the fit where empty.
     bound : Bound or None
-        Where the bias is held against the Cramer-Rao bound, and not the force against the truth.
+        Cramer-Rao bound of the bias, for studies that judge the bias instead of the force.
 
     """
 
@@ -270,7 +270,7 @@ def support(number: int) -> Iterator[Study]:
     rng = rng_of('support', number)
     unit = navigation(rng)
     up = spread(12, rng)
-    # About one level axis of the room, whichever way the unit is turned upon it.
+    # The axis of the tilt is level; its direction in the unit is random in each position.
     level = np.cross(up, rng.standard_normal((12, 3)))
     level *= 1.0e-6 / np.linalg.norm(level, axis=1)[:, None]
     fit = tuple(

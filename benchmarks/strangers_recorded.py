@@ -21,12 +21,12 @@ import thermo_comp
 from thermo_comp.recording.reader import read_recording
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Blocks of the real unit's recording that are held out [s], and the windows of its rests.
+#: Length of the blocks of the real unit's recording, and of the means that find its rests [s].
 BLOCK_S, MINUTE_S = 10800.0, 60
-#: Largest step of the mean of a minute to the next at rest: carried from one room to another, the
-#: real unit's bias went by 0.1 m/s^2 in a minute [m/s^2].
+#: Largest change of the mean from one minute to the next at rest [m/s^2]. Carried from one room to
+#: another, the real unit's bias changed by 0.1 m/s^2 in a minute.
 STEP = 0.15
-#: A shorter stay in one attitude is handling [min].
+#: Shortest rest; a shorter stay in one attitude is handling [min].
 LEAST_MINUTES = 4
 
 

@@ -75,7 +75,7 @@ class Unit:
     reading_sd, reading_step, reading_s : float
         Noise [K], rounding [K] and interval [s] of the thermometers.
     sensors : tuple of str
-        The thermometers that are recorded.
+        Thermometers that are recorded.
 
     """
 
@@ -172,7 +172,7 @@ def spread(n: int, rng: np.random.Generator) -> Floats:
 def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Floats, Floats]:
     """Give A, b and h of ``x' = A x + b air + h``, x of case, board, parts and hidden node."""
     A, b, h = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-    # A tenth of the heat that leaves the board warms the case by so much less, it is heavier.
+    # The case is heavier than the board: heat from the board warms it a tenth as fast.
     A[CASE, CASE] = -environment.film - 0.1
     A[CASE, BOARD] = 0.1
     b[CASE] = environment.film
