@@ -186,10 +186,12 @@ def by_hand(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
 def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     """Correct half an hour at the reference temperature without a force: the rest is the error."""
     assert study.bound is not None
-    unit, time_s = study.bound.unit, np.arange(1.0, 1801.0)
+    unit, cycle_s = study.bound.unit, calibration.unit.cycle_time_s
+    time_s = cycle_s * np.arange(1.0, 1800.0 / cycle_s)
     samples_ = np.broadcast_to(unit.counts * study.bound.bias, (len(time_s), 3))
     rest = {'board': REFERENCE_C, 'case': REFERENCE_C - unit.heat_k}
-    temperatures = {key: (time_s, np.full(len(time_s), celsius)) for key, celsius in rest.items()}
+    read_s = np.arange(0.0, 1800.0, 5.0)
+    temperatures = {key: (read_s, np.full(len(read_s), celsius)) for key, celsius in rest.items()}
     # No force is none of gravity, and such samples stand still: the node would doubt both.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     out = corrected(calibration, Bag('zero', time_s, samples_, temperatures), config)

@@ -20,6 +20,9 @@ from strangers_units import GRAVITY, REFERENCE_C, Bag, Floats
 Ints = npt.NDArray[np.int64]
 
 WINDOW_S = 60.0  # length of the means that are judged [s]
+#: Largest bias [g], error of the scale and misalignment of a plausible unit. Without this bound a
+#: few attitudes are fitted best by a scale that makes one force of all of them.
+LARGEST = 0.2
 SPAN_K = 15.0  # temperatures of a cubic are in this unit, which keeps its powers alike [K]
 
 
@@ -84,10 +87,11 @@ def by_norm(
     def missed(p: Floats, order: int) -> Floats:
         return np.linalg.norm(_curved(p, order, samples / size, board), axis=1) - 1.0
 
-    start = least_squares(missed, np.zeros(9), args=(0,), x_scale=1e-3, method='trf').x
+    bounded = {'x_scale': 1e-3, 'bounds': (-LARGEST, LARGEST)}
+    start = least_squares(missed, np.zeros(9), args=(0,), **bounded).x
     if order:
         start = np.concatenate((start, np.zeros(3 * order + 3)))
-        start = least_squares(missed, start, args=(order,), x_scale=1e-3, method='trf').x
+        start = least_squares(missed, start, args=(order,), **bounded).x
     return lambda bag: gravity * _curved(start, order, bag.samples / size, bag.board)
 
 

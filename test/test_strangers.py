@@ -40,6 +40,8 @@ from strangers_units import (
     spread,
 )
 
+from thermo_comp.unit.calibration import Axes, AxisReference
+
 ZEROS = np.zeros((1, 3))
 LEVEL = np.array([0.0, 0.0, 1.0])
 #: Six faces and the twelve edges of a cube.
@@ -313,6 +315,26 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not() -> None:
     # What is left: products of two small terms that the cubic's form leaves out.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
+
+
+def test_constants_by_hand_keep_the_scale_of_few_attitudes() -> None:
+    # One attitude and much scatter: a scale that makes one force of everything fits best.
+    rng = rng_of('few')
+    samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
+    few = Minutes(samples, np.full(200, 20.0), np.full((200, 3), np.nan))
+    force = by_norm([few])(few)
+    assert force.std(axis=0) == pytest.approx(samples.std(axis=0), rel=0.4)
+
+
+def test_a_bias_at_the_reference_is_held_against_its_bound() -> None:
+    # A calibration in counts that knows the bias but for 1 count, 1 / 300 m/s^2, on x.
+    bias = np.array([0.1, -0.2, 0.3])
+    axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
+    bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
+    study = cases.Study('', (), {}, bound=bound)
+    found = strangers.bias_score(calibration(axes=axes), study)
+    assert found.vector == pytest.approx(1 / 300.0 / UG)
+    assert found.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
 
 
 def test_a_cubic_by_hand_finds_a_pose_s_drift() -> None:
