@@ -33,7 +33,7 @@ from strangers_baselines import WINDOW_S, Minutes, by_drift, by_norm, means, min
 from strangers_cases import CASES, Study
 from strangers_limits import Result, Row, Score, misses, rms, rows_of
 from strangers_recorded import cats, samples
-from strangers_units import GRAVITY, REFERENCE_C, UG, Bag, Floats
+from strangers_units import GRAVITY, REFERENCE_C, UG, Bag, Floats, rng_of
 
 import thermo_comp
 from thermo_comp import CompensatorConfig
@@ -184,18 +184,24 @@ def by_hand(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
 
 
 def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
-    """Correct half an hour at the reference temperature without a force: the rest is the error."""
+    """Correct an hour at the reference temperature without a force: the rest is the error."""
     assert study.bound is not None
     unit, cycle_s = study.bound.unit, calibration.unit.cycle_time_s
-    time_s = cycle_s * np.arange(1.0, 1800.0 / cycle_s)
-    samples_ = np.broadcast_to(unit.counts * study.bound.bias, (len(time_s), 3))
+    time_s = cycle_s * np.arange(1.0, 3600.0 / cycle_s)
+    zero = np.broadcast_to(unit.counts * study.bound.bias, (len(time_s), 3))
+    # Readings without noise would be those of a thermometer that is stuck.
+    rng, read_s = rng_of('rest'), np.arange(0.0, 3600.0, 5.0)
     rest = {'board': REFERENCE_C, 'case': REFERENCE_C - unit.heat_k}
-    read_s = np.arange(0.0, 1800.0, 5.0)
-    temperatures = {key: (read_s, np.full(len(read_s), celsius)) for key, celsius in rest.items()}
+    temperatures = {
+        key: (read_s, celsius + unit.reading_sd * rng.standard_normal(len(read_s)))
+        for key, celsius in rest.items()
+    }
     # No force is none of gravity, and such samples stand still: the node would doubt both.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
-    out = corrected(calibration, Bag('zero', time_s, samples_, temperatures), config)
-    error, sd = out.force[-1], np.sqrt(np.diag(out.claim[-1]))
+    out = corrected(calibration, Bag('zero', time_s, zero, temperatures), config)
+    # The samples have no noise, so that neither has the claim.
+    error = out.force[len(out.force) // 2 :].mean(axis=0)
+    sd = np.sqrt(np.maximum(np.diag(out.claim[-1]) - out.white, 0.0))
     return Score(
         vector=float(np.linalg.norm(error)) / UG,
         ratio=rms(error / sd),

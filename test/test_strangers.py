@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from builders import calibration
+from builders import axis_set, calibration, regime_set
 from conftest import ROOT
 
 sys.path.insert(0, str(ROOT / 'benchmarks'))
@@ -332,7 +332,11 @@ def test_a_bias_at_the_reference_is_held_against_its_bound() -> None:
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
     bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
     study = cases.Study('', (), {}, bound=bound)
-    found = strangers.bias_score(calibration(axes=axes), study)
+    # An sd of 2e-3 m/s^2 that the calibration claims beside its white noise.
+    claimed = axis_set(residual_sd_m_s2=2e-3)
+    known = regime_set(x=claimed, y=claimed, z=claimed)
+    found = strangers.bias_score(calibration(axes=axes, static=known, dynamic=known), study)
+    assert found.ratio == pytest.approx(1 / 0.6 / np.sqrt(3.0))
     assert found.vector == pytest.approx(1 / 300.0 / UG)
     assert found.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
 
