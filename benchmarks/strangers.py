@@ -1,0 +1,407 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the accuracy on bags that strangers bring: the fit beside curves drawn by hand.
+
+Run ``python benchmarks/strangers.py`` for every case (many hours), or a part with fewer units:
+``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A case may
+name one of its studies: ``--cases 'turn-on:9 at 30 ug'``.
+
+Units and recordings come from `strangers_units.py` and `strangers_cases.py`, which share no code
+with the package; the package is used only through its fit and its correction of arrays. Every row
+corrects recordings that the fit has not seen, except a row which says so. Errors are RMS of means
+over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio is the
+RMS of error over claimed sd. Figures are RMS over the units. MISS marks a limit of
+`strangers_limits.py` that a row misses; the exit code is then 1. Most of the time goes into the
+baselines by the package; ``--baselines strangers.json`` takes them from an earlier run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from strangers_baselines import WINDOW_S, Minutes, by_drift, by_norm, means, minutes, slots
+from strangers_cases import CASES, Study
+from strangers_limits import Result, Row, Score, misses, rms, rows_of
+from strangers_recorded import cats, samples
+from strangers_units import GRAVITY, REFERENCE_C, UG, Bag, Floats, rng_of
+
+import thermo_comp
+from thermo_comp import CompensatorConfig
+from thermo_comp.fitting import FitOptions
+
+#: Options of the models by the package: the fit, and two baselines beside constants and cubic.
+PACKAGE: dict[str, dict[str, Any]] = {
+    'fit': {},
+    'golovach': {'model': 'golovach'},
+    'sets': {'groups': ('curve', 'set')},
+}
+BASELINES = ('constants', 'cubic', 'golovach', 'sets')
+#: Smallest share of the minutes that a correction must publish as a whole: the node waits for its
+#: first reading.
+LEAST_PUBLISHED = 0.98
+#: Cases of recordings, which have one unit.
+RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """
+    Corrected means over 60 s of one bag.
+
+    Parameters
+    ----------
+    force : ndarray, shape (w, 3)
+        Specific force [m/s^2].
+    claim : ndarray, shape (w, 3, 3)
+        Published covariance of the means [m^2/s^4].
+    white : ndarray, shape (3,)
+        The part of the variance that is independent from one mean to the next [m^2/s^4].
+
+    """
+
+    force: Floats
+    claim: Floats
+    white: Floats
+
+
+def fitted(
+    study: Study, prior: thermo_comp.Calibration | None = None, **model: Any
+) -> thermo_comp.Calibration:
+    """Fit a study's bags; `model` holds further options."""
+    # The sd of gravity can be given only to a fit that has this option.
+    known = {option.name for option in fields(FitOptions)}
+    options = {name: value for name, value in study.options.items() if name in known}
+    if prior is not None:
+        options['prior'] = prior
+    columns = [
+        thermo_comp.Columns(bag.time_s, bag.samples, dict(bag.temperatures), name=bag.name)
+        for bag in study.bags
+    ]
+    return thermo_comp.fit(columns, gravity=study.gravity, **options, **model)
+
+
+def chosen_by(calibration: thermo_comp.Calibration) -> str:
+    """List the groups of a calibration, each with its number of columns."""
+    columns = Counter(term.group for term in calibration.response)
+    others = {entry.group for entry in calibration.evidence} - set(columns)
+    return ' '.join([*sorted(others), *(f'{group}:{n}' for group, n in columns.items())])
+
+
+def corrected(
+    calibration: thermo_comp.Calibration, bag: Bag, config: CompensatorConfig | None = None
+) -> Corrected:
+    """Correct a bag and average it."""
+    known = ('board', *calibration.sensors)
+    given = {key: value for key, value in bag.temperatures.items() if key in known}
+    out = calibration.correct(bag.time_s, bag.samples, config=config, **given)
+    first, size = slots(bag)
+    force, claim = means(out.specific_force, first, size), means(out.covariance, first, size)
+    # The published covariance is that of one sample. Its white noise and the rounding of the
+    # converter average down over a minute; the rest is common to all samples of a minute.
+    density = np.square(calibration.noise_density_m_s2_sqrt_hz)
+    scale = np.array([axis.scale_factor for axis in calibration.axes])
+    rounding = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0
+    sample = density / calibration.unit.cycle_time_s + rounding / scale**2
+    M = np.array(calibration.misalignment)
+    common = claim - (M * sample) @ M.T
+    diagonal = range(3)
+    common[:, diagonal, diagonal] = np.maximum(common[:, diagonal, diagonal], 0.0)
+    white = (M * density / WINDOW_S) @ M.T
+    return Corrected(force, common + white, np.diag(white))
+
+
+def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool) -> Score:
+    """Compare corrected means of a minute with the truth and with their claim."""
+    published = [np.isfinite(out.force).all(axis=1) for out in outs]
+    if np.mean(np.concatenate(published)) < LEAST_PUBLISHED:
+        return Score(np.inf, np.inf, np.inf, np.inf, np.inf)
+    outs = [
+        replace(out, force=out.force[rows], claim=out.claim[rows])
+        for out, rows in zip(outs, published, strict=True)
+    ]
+    bags = [
+        replace(bag, samples=bag.samples[rows], board=bag.board[rows], force=bag.force[rows])
+        for bag, rows in zip(bags, published, strict=True)
+    ]
+    forces = [out.force for out in outs]
+    plain = error_of(forces, bags, is_drift=is_drift)
+    if is_drift:
+        # The constants of a pose cancel in its drift. Their variance is the smallest of the pose:
+        # that at the middle of the data, where the curve over temperature adds nothing.
+        own = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
+        sd = np.sqrt(np.concatenate(
+            [one - one.min(axis=0) + out.white for one, out in zip(own, outs, strict=True)]
+        ))  # fmt: skip
+        return Score(np.nan, plain.vector, np.nan, rms(_drift(forces, bags) / sd), rms(sd) / UG)
+    force, claim = np.concatenate(forces), np.concatenate([out.claim for out in outs])
+    size = np.linalg.norm(force, axis=1, keepdims=True)
+    along = np.sqrt(np.einsum('wi,wij,wj->w', force / size, claim, force / size))
+    sd = np.sqrt(np.diagonal(claim, axis1=1, axis2=2))
+    vector = force - np.concatenate([bag.force for bag in bags])
+    return Score(
+        plain.norm,
+        plain.vector,
+        rms((size[:, 0] - GRAVITY) / along),
+        rms(vector / sd),
+        rms(np.linalg.norm(sd, axis=1)) / UG,
+    )
+
+
+def error_of(forces: Sequence[Floats], bags: Sequence[Minutes], *, is_drift: bool) -> Score:
+    """Compare forces, which claim nothing, with the truth."""
+    if is_drift:
+        return Score(vector=rms(_drift(forces, bags)) / UG)
+    force, truth = np.concatenate(forces), np.concatenate([bag.force for bag in bags])
+    norm = np.linalg.norm(force, axis=1) - GRAVITY
+    return Score(rms(norm) / UG, rms(np.linalg.norm(force - truth, axis=1)) / UG)
+
+
+def _drift(forces: Sequence[Floats], bags: Sequence[Minutes]) -> Floats:
+    """Give the error of each axis less its mean over the bag, shape (w, 3)."""
+    errors = [force - bag.force for force, bag in zip(forces, bags, strict=True)]
+    return np.concatenate([error - error.mean(axis=0) for error in errors])
+
+
+def by_hand(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
+    """Fit constants and a cubic per axis by scipy."""
+    bags = [minutes(bag) for bag in study.by_hand or study.bags]
+    orders = {'constants': 0, 'cubic': 3}
+    if study.is_drift:
+        # In one pose the scale is that of the norm.
+        scale = rms(np.linalg.norm(bags[0].samples, axis=1)) / GRAVITY
+        return {name: by_drift(bags, scale, order=order) for name, order in orders.items()}
+    return {name: by_norm(bags, study.gravity, order=order) for name, order in orders.items()}
+
+
+def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
+    """Correct an hour at the reference temperature without a force: the rest is the error."""
+    assert study.bound is not None
+    unit, cycle_s = study.bound.unit, calibration.unit.cycle_time_s
+    time_s = cycle_s * np.arange(1.0, 3600.0 / cycle_s)
+    zero = np.broadcast_to(unit.counts * study.bound.bias, (len(time_s), 3))
+    # Readings without noise would be those of a thermometer that is stuck.
+    rng, read_s = rng_of('rest'), np.arange(0.0, 3600.0, 5.0)
+    rest = {'board': REFERENCE_C, 'case': REFERENCE_C - unit.heat_k}
+    temperatures = {
+        key: (read_s, celsius + unit.reading_sd * rng.standard_normal(len(read_s)))
+        for key, celsius in rest.items()
+    }
+    # No force is none of gravity, and such samples stand still: the node would doubt both.
+    config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+    out = corrected(calibration, Bag('zero', time_s, zero, temperatures), config)
+    # The samples have no noise, so that neither has the claim.
+    error = out.force[len(out.force) // 2 :].mean(axis=0)
+    sd = np.sqrt(np.maximum(np.diag(out.claim[-1]) - out.white, 0.0))
+    return Score(
+        vector=float(np.linalg.norm(error)) / UG,
+        ratio=rms(error / sd),
+        claim=float(np.linalg.norm(sd)) / UG,
+        bound_ratio=rms(error / study.bound.sd),
+    )
+
+
+def scored(
+    study: Study, model: thermo_comp.Calibration, tests: dict[str, list[Minutes]]
+) -> dict[str, Score]:
+    """Score a calibration on each set of held-out bags."""
+    if study.bound is not None:
+        return {'': bias_score(model, study)}
+    return {
+        test: score([corrected(model, bag) for bag in study.tests[test]], bags,
+                    is_drift=study.is_drift)
+        for test, bags in tests.items()
+    }  # fmt: skip
+
+
+def run(
+    case: str,
+    unit: int,
+    study: Study,
+    done: dict[str, thermo_comp.Calibration],
+    earlier: Mapping[tuple[str, int], Mapping[str, Score]],
+) -> list[Result]:
+    """
+    Fit all models to a study and score them.
+
+    Parameters
+    ----------
+    case, unit, study : str, int, Study
+        What is fitted.
+    done : dict of str to Calibration
+        Fits of this unit by study, for those that take one as a prior; the fit is added.
+    earlier : mapping of (str, int) to mapping of str to Score
+        Scores of the baselines by title and unit, from an earlier run; others are computed.
+
+    Returns
+    -------
+    list of Result
+        One for each set of held-out bags.
+
+    """
+    title = f'{case} {study.label}'.strip()
+    tests = {test: [minutes(bag) for bag in bags] for test, bags in study.tests.items()}
+    titles = {test: title + (f': {test}' if test else '') for test in tests or ('',)}
+    known = {test: earlier.get((titles[test], unit), {}) for test in titles}
+    scores: dict[str, dict[str, Score]] = {test: {} for test in titles}
+    has_baselines = not (study.prior_of or study.bound)
+    prior = done[study.prior_of] if study.prior_of else None
+    chosen, refused, fit_s = '', '', np.nan
+    for model, options in PACKAGE.items():
+        if model != 'fit' and (not has_baselines or all(known.values())):
+            continue
+        began = time.process_time()
+        try:
+            calibration = fitted(study, prior, **options)
+        except (thermo_comp.ThermoCompError, ValueError) as error:
+            print(f'{title}, unit {unit}: {model} refuses: {error}', file=sys.stderr, flush=True)
+            refused = str(error) if model == 'fit' else refused
+            continue
+        if model == 'fit':
+            fit_s = time.process_time() - began
+            chosen, done[study.label] = chosen_by(calibration), calibration
+        for test, found in scored(study, calibration, tests).items():
+            scores[test][model] = found
+    if has_baselines and not all(known.values()):
+        for model, correct in by_hand(study).items():
+            for test, bags in tests.items():
+                forces = [correct(bag) for bag in bags]
+                scores[test][model] = error_of(forces, bags, is_drift=study.is_drift)
+    return [
+        Result(titles[test], unit, {**found, **known[test]}, chosen, fit_s, refused)
+        for test, found in scores.items()
+    ]
+
+
+def studies_of(case: str, unit: int, path: Path | None) -> Iterator[Study]:
+    """Give the studies of one unit of a case."""
+    if case != 'cats':
+        return samples(case) if case in RECORDED else CASES[case][0](unit)
+    assert path is not None
+    return cats(path)
+
+
+def run_case(
+    case: str,
+    label: str,
+    units: int,
+    path: Path | None,
+    earlier: Mapping[tuple[str, int], Mapping[str, Score]],
+) -> list[Result]:
+    """Run a case, or the studies of it that have the label."""
+    results = []
+    for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
+        done: dict[str, thermo_comp.Calibration] = {}
+        studies = list(studies_of(case, unit, path))
+        needed = {study.prior_of for study in studies if study.label == label}
+        seen = Counter[str]()
+        for study in studies:
+            if not label or study.label == label or study.label in needed:
+                # Recordings that are left out in turn are numbered as units are.
+                number = unit + seen[study.label]
+                seen[study.label] += 1
+                print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)
+                results += run(case, number, study, done, earlier)
+    return results
+
+
+def baselines_in(path: Path) -> dict[tuple[str, int], dict[str, Score]]:
+    """Read the scores of the baselines from the figures of an earlier run."""
+    found: dict[tuple[str, int], dict[str, Score]] = {}
+    for unit in json.loads(path.read_text(encoding='utf-8'))['units']:
+        found[unit['title'], unit['unit']] = {
+            model: Score(**score) for model, score in unit['scores'].items() if model in BASELINES
+        }
+    return found
+
+
+HEAD = (
+    '| row | fit: norm / vector | ratio: norm / axes / worst | claim | '
+    + ' | '.join(BASELINES)
+    + ' | fit CPU s | chosen | |\n'
+    + '|---' * (len(BASELINES) + 7)
+    + '|'
+)
+
+
+def pair(found: Score | None) -> str:
+    """Format the two errors of a model."""
+    if found is None:
+        return '-'
+    return ' / '.join('-' if np.isnan(x) else f'{x:.3g}' for x in (found.norm, found.vector))
+
+
+def line_of(row: Row, missed: Sequence[str]) -> str:
+    """Format a row of the table."""
+    fit = row.scores.get('fit', Score())
+    ratios = ' / '.join(
+        '-' if np.isnan(x) else f'{x:.2f}' for x in (fit.norm_ratio, fit.ratio, row.worst)
+    )
+    cells = [row.title, pair(row.scores.get('fit')), ratios, f'{fit.claim:.3g}']
+    cells += [pair(row.scores.get(model)) for model in BASELINES]
+    bound = '' if np.isnan(fit.bound_ratio) else f'bias / bound {fit.bound_ratio:.2f}; '
+    marks = '; '.join(f'MISS {text}' for text in missed)
+    cells += [f'{row.fit_s:.1f}', row.refused or row.chosen, bound + marks]
+    return '| ' + ' | '.join(cells) + ' |'
+
+
+def main() -> int:
+    """Run the cases that are asked for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    names = (*RECORDED, *CASES)
+    parser.add_argument('--cases', type=lambda text: text.split(','), default=list(names),
+                        help=f'default: all of {", ".join(names)}')  # fmt: skip
+    parser.add_argument('--units', type=int, default=0, help='units; default: 3 to 100, by case')
+    parser.add_argument('--cats', type=Path, help='cats_temperature_calib.nc (needs h5py)')
+    parser.add_argument('--baselines', type=Path, metavar='JSON',
+                        help='scores of the baselines, from an earlier --json')  # fmt: skip
+    parser.add_argument('--json', type=Path, help='file for all figures')
+    options = parser.parse_args()
+    wanted = [name.partition(':')[::2] for name in options.cases]
+    for case, _ in wanted:
+        if case not in names:
+            parser.error(f'--cases: {case!r} is none of {", ".join(names)}')
+    if options.cases == list(names) and options.cats is None:
+        print('The case cats is left out: it needs --cats FILE.', file=sys.stderr)
+        wanted.remove(('cats', ''))
+    if options.cats is None and any(case == 'cats' for case, _ in wanted):
+        parser.error('--cases: cats needs --cats FILE')
+    earlier = baselines_in(options.baselines) if options.baselines else {}
+    results, told = [], []
+    print(HEAD, flush=True)
+    for case, label in wanted:
+        found = run_case(case, label, options.units, options.cats, earlier)
+        if not found:
+            parser.error(f'--cases: {case} has no study {label!r}')
+        rows = rows_of(found)
+        for row in rows:
+            missed = misses(row, rows)
+            print(line_of(row, missed), flush=True)
+            told.append({**asdict(row), 'missed': missed})
+        results += found
+        if options.json:
+            # After each case: a run of all cases takes hours.
+            figures = {
+                'version': thermo_comp.__version__,
+                'rows': told,
+                'units': [asdict(result) for result in results],
+            }
+            options.json.write_text(json.dumps(figures, indent=1), encoding='utf-8')
+    n_missed = sum(bool(row['missed']) for row in told)
+    print(f'\n{n_missed} of {len(told)} rows miss a limit')
+    return int(n_missed > 0)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

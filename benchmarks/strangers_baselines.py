@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the means of a minute and the curves by scipy of the benchmark `strangers.py`.
+
+Constants are nine numbers: bias, scale and misalignment; a cubic adds a cubic of the bias per axis
+in board temperature and a line of the scale. Both are scipy's least squares on ``|f| - g``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+from strangers_units import GRAVITY, REFERENCE_C, Bag, Floats
+
+Ints = npt.NDArray[np.int64]
+
+WINDOW_S = 60.0  # length of the means that are judged [s]
+#: Largest bias [g], error of the scale and misalignment of a plausible unit. Without this bound a
+#: few attitudes are fitted best by a scale that makes one force of all of them.
+LARGEST = 0.2
+SPAN_K = 15.0  # temperatures of a cubic are in this unit, which keeps its powers alike [K]
+
+
+@dataclass(frozen=True)
+class Minutes:
+    """Means of a bag: samples (w, 3), board (w,) [degC], force (w, 3) [m/s^2] or NaN."""
+
+    samples: Floats
+    board: Floats
+    force: Floats
+
+
+def slots(bag: Bag) -> tuple[Ints, Ints]:
+    """Give the first rows of whole windows, and how many rows each has."""
+    number = np.floor((bag.time_s - bag.time_s[0]) / WINDOW_S)
+    first = np.flatnonzero(np.diff(number, prepend=-1.0))
+    size = np.diff(first, append=len(number))
+    is_whole = size >= 0.95 * np.median(size)
+    return first[is_whole], size[is_whole]
+
+
+def means(values: Floats, first: Ints, size: Ints) -> Floats:
+    """Average rows window by window."""
+    edges = np.stack((first, first + size), axis=1).ravel()
+    total = np.add.reduceat(values, edges[edges < len(values)], axis=0)[::2]
+    return np.asarray(total / size.reshape(-1, *[1] * (values.ndim - 1)))
+
+
+def minutes(bag: Bag) -> Minutes:
+    """Average a bag."""
+    first, size = slots(bag)
+    board = np.full(len(first), REFERENCE_C)
+    if 'board' in bag.temperatures:
+        board = means(np.interp(bag.time_s, *bag.temperatures['board']), first, size)
+    force = np.nan if bag.force is None else bag.force
+    force = np.broadcast_to(force, bag.samples.shape)
+    return Minutes(means(bag.samples, first, size), board, means(force, first, size))
+
+
+def _curved(p: Floats, order: int, samples: Floats, board: Floats) -> Floats:
+    """Correct samples in units of g; p: bias, scale, misalignment, then curves of bias, scale."""
+    t = ((board - REFERENCE_C) / SPAN_K)[:, None]
+    bias, scale = p[:3], 1.0 + p[3:6]
+    if order:
+        curve = p[9 : 9 + 3 * order].reshape(order, 3)
+        bias = bias + sum(c * t ** (k + 1) for k, c in enumerate(curve))
+        scale = scale + p[-3:] * t
+    x = (samples - bias) / scale
+    a, b, c = p[6:9]
+    return np.stack((x[:, 0], x[:, 1] + a * x[:, 0], x[:, 2] + b * x[:, 0] + c * x[:, 1]), axis=1)
+
+
+def by_norm(
+    bags: Sequence[Minutes], gravity: float = GRAVITY, *, order: int = 0
+) -> Callable[[Minutes], Floats]:
+    """Fit constants, with curves of an order above 0, to ``|f| - g``; returns the correction."""
+    samples = np.concatenate([bag.samples for bag in bags])
+    board = np.concatenate([bag.board for bag in bags])
+    # Counts per g: the RMS length of the samples, refined by the scale factors below.
+    size = np.sqrt(np.mean(np.sum(samples**2, axis=1)))
+
+    def missed(p: Floats, order: int) -> Floats:
+        return np.linalg.norm(_curved(p, order, samples / size, board), axis=1) - 1.0
+
+    bounded = {'x_scale': 1e-3, 'bounds': (-LARGEST, LARGEST)}
+    start = least_squares(missed, np.zeros(9), args=(0,), **bounded).x
+    if order:
+        start = np.concatenate((start, np.zeros(3 * order + 3)))
+        start = least_squares(missed, start, args=(order,), **bounded).x
+    return lambda bag: gravity * _curved(start, order, bag.samples / size, bag.board)
+
+
+def by_drift(
+    bags: Sequence[Minutes], scale: float, *, order: int = 0
+) -> Callable[[Minutes], Floats]:
+    """Fit a polynomial in board temperature to each axis of one pose; `scale` per m/s^2."""
+    t = np.concatenate([bag.board for bag in bags])
+    y = np.concatenate([bag.samples for bag in bags]) / scale
+    powers = np.vander((t - REFERENCE_C) / SPAN_K, order + 1, increasing=True)
+    found = np.linalg.lstsq(powers, y, rcond=None)[0]
+
+    def corrected(bag: Minutes) -> Floats:
+        own = np.vander((bag.board - REFERENCE_C) / SPAN_K, order + 1, increasing=True)
+        return np.asarray(bag.samples / scale - own[:, 1:] @ found[1:])
+
+    return corrected

@@ -1,0 +1,407 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the drawn cases of the benchmark `strangers.py`: which unit, which bags, what is held out.
+
+Each case draws a unit by its number and gives studies: bags for a fit, and held-out bags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from strangers_units import (
+    CHAMBER,
+    GRAVITY,
+    REFERENCE_C,
+    STILL_AIR,
+    UG,
+    Bag,
+    Environment,
+    Floats,
+    Unit,
+    program,
+    record,
+    rng_of,
+    signed,
+    spread,
+)
+
+#: Programs of the chamber: start [degC], soak [min], then target [degC], rate [K/min], soak [min].
+LONG = program(
+    20, 25, (35, 1, 60), (5, 2, 60), (25, 0.5, 40), (10, 1, 45), (33, 2, 60), (20, 0.5, 60)
+)
+HALF = program(20, 20, (35, 1, 45), (5, 1, 45), (20, 1, 5))
+WHOLE = program(20, 25, (35, 1, 60), (5, 1.5, 60), (20, 0.7, 20), (28, 1, 20))
+POSE = program(20, 40, (35, 1, 90), (5, 1, 100), (28, 0.5, 60), (12, 1.5, 70), (20, 1, 75))
+OTHER = program(12, 25, (31, 0.7, 45), (17, 1.5, 50), (26, 0.6, 40), (7, 1, 45))
+HELD = (
+    program(12, 20, (31, 0.7, 45), (17, 1.5, 40)),
+    program(30, 20, (8, 1.2, 50), (24, 0.6, 40)),
+)
+FROST = program(5, 10, (12, 0.5, 60), (28, 0.8, 30))
+ROOM = program(21, 20)
+#: The range of SHORT ends 2 K before the range of USE, on both sides.
+SHORT = program(20, 20, (33, 1, 50), (7, 1, 60), (20, 1, 12))
+USE = (program(20, 20, (35, 0.7, 45), (15, 1.5, 40)), program(20, 20, (5, 1.2, 50), (24, 0.6, 40)))
+#: Programs of MEMS: a simple oven.
+WARM = program(22, 15, (45, 1, 30), (12, 1, 40), (22, 1, 20))
+WARM_HELD = (program(15, 15, (40, 0.8, 40)), program(40, 15, (18, 1.2, 40)))
+
+
+@dataclass(frozen=True)
+class Study:
+    """
+    Bags for one fit, and bags that it has not seen.
+
+    Parameters
+    ----------
+    label : str
+        Name within the case; empty where the case has one study.
+    bags : tuple of Bag
+        Bags of the fit.
+    tests : dict of str to tuple of Bag
+        Held-out bags by name.
+    options : dict
+        Options of the fit.
+    gravity : float
+        Gravity that the fit is given [m/s^2].
+    prior_of : str
+        Label of an earlier study whose calibration is the prior; empty without a prior.
+    is_drift : bool
+        Whether the error of each axis less its mean over the bag is judged, as for one pose.
+    by_hand : tuple of Bag
+        Bags at rest for the curves by scipy; the bags of the fit where empty.
+    bound : Bound or None
+        Cramer-Rao bound of the bias, for studies that judge the bias instead of the force.
+
+    """
+
+    label: str
+    bags: tuple[Bag, ...]
+    tests: Mapping[str, tuple[Bag, ...]]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    gravity: float = GRAVITY
+    prior_of: str = ''
+    is_drift: bool = False
+    by_hand: tuple[Bag, ...] = ()
+    bound: Bound | None = None
+
+
+@dataclass(frozen=True)
+class Bound:
+    """True bias at the reference, and the smallest sd that an unbiased fit may have [m/s^2]."""
+
+    unit: Unit
+    bias: Floats
+    sd: Floats
+
+
+FULL_SCALE = {'full_scale': 8388607.0}
+
+
+def navigation(rng: np.random.Generator, **given: Any) -> Unit:
+    """Draw a unit of navigation grade whose parts lag the board, each by its own time."""
+    drawn = {
+        'bias': 1500.0 * rng.standard_normal(3),
+        'gain': 0.01 * rng.standard_normal(3),
+        'skew': 1e-3 * rng.standard_normal(3),
+        'bias_curve': np.array([signed(rng, 5, 20), 0.08 * rng.standard_normal(3)]),
+        'scale_curve': np.array([rng.uniform(30, 90, 3), 0.2 * rng.standard_normal(3)]),
+        'case_s': rng.uniform(120, 300),
+        'board_s': rng.uniform(400, 900),
+        'part_s': rng.uniform(500, 1500, 3),
+        'heat_k': rng.uniform(0.5, 2.0),
+    }
+    return Unit(**{**drawn, **given})
+
+
+def cheap(rng: np.random.Generator) -> Unit:
+    """Draw a MEMS unit, whose one thermometer stands on the die."""
+    return Unit(
+        bias=2e4 * rng.standard_normal(3),
+        gain=0.01 * rng.standard_normal(3),
+        skew=5e-3 * rng.standard_normal(3),
+        bias_curve=np.array([signed(rng, 50, 400), 2.0 * rng.standard_normal(3)]),
+        scale_curve=np.array([signed(rng, 30, 120)]),
+        case_s=rng.uniform(100, 200),
+        board_s=rng.uniform(100, 250),
+        part_s=rng.uniform(20, 60, 3),
+        heat_k=rng.uniform(1, 3),
+        counts=2048.0 / GRAVITY,
+        carries=False,
+        density=150.0,
+        reading_sd=0.1,
+        reading_step=1.0 / 16.0,
+        sensors=('board',),
+    )
+
+
+def positions(
+    unit: Unit,
+    corners: Floats | Sequence[Floats],
+    up: Floats,
+    rng: np.random.Generator,
+    shifts: Floats | float = 0.0,
+    **given: Any,
+) -> tuple[Bag, ...]:
+    """Record a bag in each attitude, shape (n, 3); programs of a sequence take turns."""
+    shifts = np.broadcast_to(shifts, (len(up), 3))
+    programs = corners if isinstance(corners, tuple) else (corners,)
+    return tuple(
+        record(unit, programs[k % len(programs)], up[k], rng, name=f'p{k + 1:02d}',
+               shift=shifts[k], **given)
+        for k in range(len(up))
+    )  # fmt: skip
+
+
+def one_test(bags: tuple[Bag, ...]) -> dict[str, tuple[Bag, ...]]:
+    """Name bags that are judged together."""
+    return {'': bags}
+
+
+def plain(number: int) -> Iterator[Study]:
+    """Record a long test in a chamber with two thermometers: nothing is strange."""
+    rng = rng_of('plain', number)
+    unit = navigation(rng)
+    fit = positions(unit, LONG, spread(18, rng), rng)
+    yield Study('', fit, one_test(positions(unit, HELD, spread(2, rng), rng)), FULL_SCALE)
+
+
+def one_pose(number: int) -> Iterator[Study]:
+    """Record one pose for 9.5 h; the parts lag the board by 500 to 1500 s."""
+    rng = rng_of('one-pose', number)
+    unit = navigation(rng)
+    up = spread(1, rng)
+    own = positions(unit, POSE, up, rng)
+    tests = {'own bag': own, 'other program': positions(unit, OTHER, up, rng)}
+    yield Study('', own, tests, FULL_SCALE, is_drift=True)
+
+
+def soaks(number: int) -> Iterator[Study]:
+    """Record the classic test: six faces for 20 min at each of three temperatures."""
+    rng = rng_of('soaks', number)
+    unit = navigation(rng)
+    faces = np.concatenate((np.eye(3), -np.eye(3)))
+    bags: tuple[Bag, ...] = ()
+    for celsius in (20.0, 35.0, 5.0):
+        # A face is level to 2 degrees in the RMS: exact faces would tell nothing of misalignment.
+        up = faces + 0.035 * rng.standard_normal((6, 3))
+        up /= np.linalg.norm(up, axis=1)[:, None]
+        bags += positions(unit, program(celsius, 20), up, rng)
+    bags = tuple(replace(bag, name=f'rest{k + 1:02d}') for k, bag in enumerate(bags))
+    yield Study('', bags, one_test(positions(unit, HELD, spread(2, rng), rng)), FULL_SCALE)
+
+
+def turn_on(number: int) -> Iterator[Study]:
+    """Record few positions with a bias that differs by a random amount in each bag."""
+    for n in (9, 10, 12, 18):
+        for sd in (0, 30, 300):
+            rng = rng_of('turn-on', n, sd, number)
+            unit = navigation(rng)
+            fit = positions(unit, HALF, spread(n, rng), rng, sd * rng.standard_normal((n, 3)))
+            held = positions(unit, HELD, spread(4, rng), rng, sd * rng.standard_normal((4, 3)))
+            yield Study(f'{n} at {sd} ug', fit, one_test(held), FULL_SCALE)
+
+
+def mems(number: int) -> Iterator[Study]:
+    """Record a cheap sensor: coarse words, noise, one thermometer, turn-on of 0.1 to 1 mg."""
+    for n in (9, 12, 18):
+        for sd in (100, 300, 1000):
+            rng = rng_of('mems', n, sd, number)
+            unit = cheap(rng)
+            # At 10 Hz the noise is as large as a count, so that rounding leaves no bias.
+            fit, held = (
+                positions(
+                    unit,
+                    corners,
+                    spread(k, rng),
+                    rng,
+                    sd * rng.standard_normal((k, 3)),
+                    rate_hz=10.0,
+                )
+                for corners, k in ((WARM, n), (WARM_HELD, 4))
+            )
+            yield Study(f'{n} at {sd / 1000:g} mg', fit, one_test(held), {'full_scale': 32767.0})
+
+
+def ageing(number: int) -> Iterator[Study]:
+    """Let the bias walk by 12 ug from bag to bag, beside a turn-on of 15 ug."""
+    rng = rng_of('ageing', number)
+    unit = navigation(rng)
+    shifts = 15.0 * rng.standard_normal((16, 3))
+    shifts += np.cumsum(12.0 * rng.standard_normal((16, 3)), axis=0)
+    fit = positions(unit, HALF, spread(12, rng), rng, shifts[:12])
+    held = positions(unit, HELD, spread(4, rng), rng, shifts[12:])
+    yield Study('', fit, one_test(held), FULL_SCALE)
+
+
+def kink(number: int) -> Iterator[Study]:
+    """Change the slope of the bias by 8 to 20 ug/K at one temperature."""
+    rng = rng_of('kink', number)
+    unit = navigation(rng, kink=signed(rng, 8, 20), kink_c=rng.uniform(12, 30))
+    fit = positions(unit, HALF, spread(12, rng), rng)
+    yield Study('', fit, one_test(positions(unit, HELD, spread(3, rng), rng)), FULL_SCALE)
+
+
+def bump(number: int) -> Iterator[Study]:
+    """Add a bump of 300 to 600 ug to the bias, 2 K wide."""
+    rng = rng_of('bump', number)
+    unit = navigation(rng, bump=signed(rng, 300, 600), bump_c=rng.uniform(12, 28))
+    fit = positions(unit, HALF, spread(12, rng), rng)
+    yield Study('', fit, one_test(positions(unit, HELD, spread(3, rng), rng)), FULL_SCALE)
+
+
+def carry(number: int) -> Iterator[Study]:
+    """Step the bias by 50 to 150 ug half-way through the bags, as if the unit was carried."""
+    rng = rng_of('carry', number)
+    unit = navigation(rng)
+    step = signed(rng, 50, 150)
+    fit = positions(unit, HALF, spread(12, rng), rng, np.repeat([0 * step, step], 6, axis=0))
+    held = positions(unit, HELD, spread(3, rng), rng, step)
+    yield Study('', fit, one_test(held), FULL_SCALE)
+
+
+def support(number: int) -> Iterator[Study]:
+    """Tilt the support with the square of temperature; the held-out bags have a firm one."""
+    rng = rng_of('support', number)
+    unit = navigation(rng)
+    up = spread(12, rng)
+    # The axis of the tilt is level; its direction in the unit is random in each position.
+    level = np.cross(up, rng.standard_normal((12, 3)))
+    level *= 1.0e-6 / np.linalg.norm(level, axis=1)[:, None]
+    fit = tuple(
+        record(unit, HALF, one, rng, name=f'p{k + 1:02d}', tilt=axis)
+        for k, (one, axis) in enumerate(zip(up, level, strict=True))
+    )
+    yield Study('', fit, one_test(positions(unit, HELD, spread(3, rng), rng)), FULL_SCALE)
+
+
+def gravity(number: int) -> Iterator[Study]:
+    """Give the fit a gravity that is wrong by one stated sd, 50 ug."""
+    rng = rng_of('gravity', number)
+    unit = navigation(rng)
+    fit = positions(unit, HALF, spread(12, rng), rng)
+    held = positions(unit, HELD, spread(3, rng), rng)
+    wrong = 50.0 * UG
+    options = {**FULL_SCALE, 'gravity_sd': wrong}
+    yield Study('', fit, one_test(held), options, gravity=GRAVITY + wrong)
+
+
+def cold_start(number: int) -> Iterator[Study]:
+    """Hold out bags that begin at a cold switch-on, as no bag of the fit does."""
+    rng = rng_of('cold-start', number)
+    unit = navigation(rng)
+    fit = positions(unit, HALF, spread(12, rng), rng)
+    held = positions(unit, FROST, spread(3, rng), rng, is_cold=True)
+    yield Study('', fit, one_test(held), FULL_SCALE)
+
+
+def third_node(number: int) -> Iterator[Study]:
+    """Add a node without a thermometer, and one bag in still air: jointly, and by a prior."""
+    rng = rng_of('third-node', number)
+    unit = navigation(rng, hidden_bias=signed(rng, 20, 60), hidden_s=rng.uniform(900, 2500))
+    fit = positions(unit, HALF, spread(12, rng), rng)
+    up = spread(3, rng)
+
+    def still(one: Floats, corners: Any, environment: Environment = STILL_AIR) -> tuple[Bag, ...]:
+        return positions(unit, corners, one, rng, environment=environment)
+
+    more = tuple(replace(bag, name='still') for bag in still(up[:1], WHOLE))
+    tests = {
+        'chamber': still(up[1:], HELD, CHAMBER),
+        'still air': still(up[1:], HELD),
+        'its attitude': still(up[:1], HELD[0]),
+    }
+    yield Study('alone', fit, tests, FULL_SCALE)
+    yield Study('joint', (*fit, *more), tests, FULL_SCALE)
+    yield Study('prior', more, tests, FULL_SCALE, prior_of='alone')
+
+
+def bench3(number: int) -> Iterator[Study]:
+    """Record 18 positions on a bench and 3 in a chamber, 2 K short of the range of use."""
+    rng = rng_of('bench3', number)
+    unit = navigation(rng)
+    bench = positions(unit, ROOM, spread(18, rng), rng)
+    chamber = positions(unit, SHORT, spread(3, rng), rng)
+    bags = (*bench, *(replace(bag, name=f'c{k + 1}') for k, bag in enumerate(chamber)))
+    yield Study('', bags, one_test(positions(unit, USE, spread(2, rng), rng)), FULL_SCALE)
+
+
+def quadratic(number: int) -> Iterator[Study]:
+    """Draw bias and scale as parabolas of the board's temperature, with white noise."""
+    for n in (18, 24):
+        rng = rng_of('quadratic', n, number)
+        unit = navigation(rng, part_s=np.zeros(3))
+        up = spread(n, rng)
+        bags = positions(unit, HALF, up, rng)
+        bound = Bound(unit, UG * unit.bias, bias_bound(unit, up, bags))
+        yield Study(str(n), bags, {}, FULL_SCALE, bound=bound)
+
+
+def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60.0) -> Floats:
+    """
+    Give the Cramer-Rao bound of the bias of a unit of parabolas at the reference, shape (3,).
+
+    The unknowns are the constants, both parabolas, and the direction of each position; data are
+    the three axes in windows that are short against the program.
+    """
+    n = len(up)
+    tangents = np.array([np.linalg.svd(one[None])[2][1:] for one in up])
+    temperatures = []
+    for bag in bags:
+        time_s, board = bag.temperatures['board']
+        rows = (time_s // window_s).astype(int)
+        temperatures.append(np.bincount(rows, board) / np.bincount(rows) - REFERENCE_C)
+    x = np.concatenate(temperatures)[:, None]
+    position = np.repeat(np.arange(n), [len(one) for one in temperatures])
+    p = np.concatenate((
+        1e-6 * unit.bias, unit.gain, unit.skew, 1e-6 * unit.bias_curve.ravel(),
+        1e-6 * unit.scale_curve.ravel(), np.zeros(2 * n),
+    ))  # fmt: skip
+
+    def seen(p: Any) -> Any:
+        """Model of the samples in g, analytic in all unknowns."""
+        a, b, c = p[6:9]
+        u = up + np.einsum('pk,pki->pi', p[21:].reshape(n, 2), tangents)
+        u = u / np.sqrt((u**2).sum(axis=1, keepdims=True))
+        y = u[:, 1] - a * u[:, 0]
+        z = u[:, 2] - b * u[:, 0] - c * y
+        sensed = np.stack((u[:, 0], y, z), axis=1)[position]
+        scale = (1.0 + p[3:6]) * (1.0 + p[15:18] * x + p[18:21] * x**2)
+        return sensed * scale + p[:3] + p[9:12] * x + p[12:15] * x**2
+
+    columns = []
+    for k in range(len(p)):
+        step = p.astype(complex)
+        step[k] += 1e-30j
+        columns.append(seen(step).imag.ravel() / 1e-30)
+    noise = 1e-6 * unit.density / np.sqrt(window_s)
+    J = np.array(columns).T / noise
+    size = np.linalg.norm(J, axis=0)
+    J /= size
+    sd = np.sqrt(np.diag(np.linalg.inv(J.T @ J))) / size
+    return np.asarray(GRAVITY * sd[:3])
+
+
+#: Each case's studies of a unit by its number, and how many units it is asked for.
+CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
+    'plain': (plain, 3),
+    'one-pose': (one_pose, 3),
+    'soaks': (soaks, 6),
+    'turn-on': (turn_on, 8),
+    'mems': (mems, 8),
+    'ageing': (ageing, 3),
+    'kink': (kink, 3),
+    'bump': (bump, 3),
+    'carry': (carry, 3),
+    'support': (support, 3),
+    'gravity': (gravity, 3),
+    'cold-start': (cold_start, 3),
+    'third-node': (third_node, 3),
+    'bench3': (bench3, 3),
+    'quadratic': (quadratic, 100),
+}

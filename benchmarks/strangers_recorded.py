@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the recorded cases of the benchmark `strangers.py`: sample bags with a thermometer less, and a
+real unit's recording that is part of a package of others and never of this one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from strangers_cases import Study
+from strangers_units import GRAVITY, Bag
+
+import thermo_comp
+from thermo_comp.recording.reader import read_recording
+
+ROOT = Path(__file__).resolve().parent.parent
+#: Length of the blocks of the real unit's recording, and of the means that find its rests [s].
+BLOCK_S, MINUTE_S = 10800.0, 60
+#: Largest change of the mean from one minute to the next at rest [m/s^2]. Carried from one room to
+#: another, the real unit's bias changed by 0.1 m/s^2 in a minute.
+STEP = 0.15
+#: Shortest rest; a shorter stay in one attitude is handling [min].
+LEAST_MINUTES = 4
+
+
+def sample_bag(path: Path) -> Bag:
+    """Read one sample bag, whose metadata hold its true attitude."""
+    columns = thermo_comp.read(path)
+    truth = json.loads(read_recording(path, None, require=['accel']).info.metadata['truth'])
+    force = GRAVITY * np.array(truth['up'])
+    return Bag(path.stem, columns.time_s, columns.counts, columns.temperatures, force)
+
+
+def samples(which: str) -> Iterator[Study]:
+    """Give the sample bags with both thermometers, without the case, or with the board on both."""
+    bags = [sample_bag(path) for path in sorted((ROOT / 'bags/fit').glob('*.mcap'))]
+    bags.append(sample_bag(ROOT / 'bags/held_out.mcap'))
+    if which != 'sample-bags':
+        boards = [bag.temperatures['board'] for bag in bags]
+        kept = ['board'] if which == 'no-case' else ['board', 'case']
+        bags = [
+            replace(bag, temperatures=dict.fromkeys(kept, board))
+            for bag, board in zip(bags, boards, strict=True)
+        ]
+    yield Study('', tuple(bags[:-1]), {'': tuple(bags[-1:])})
+
+
+def real_unit(path: Path) -> Bag:
+    """Read the recording of the real unit: 74 h at 1 Hz, m/s^2, one thermometer."""
+    import h5py
+
+    with h5py.File(path) as file:
+        force = file['acceleration'][:]
+        celsius = file['temperature'][:]
+    # Times say whole seconds, and count from the first sample.
+    time_s = np.arange(1.0, len(force) + 1.0)
+    return Bag('cats', time_s, force, {'board': (time_s, celsius)})
+
+
+def rests_of(bag: Bag) -> list[slice]:
+    """Find the rows of each long stay in one attitude, whole minutes."""
+    n = len(bag.time_s) // MINUTE_S
+    mean = bag.samples[: n * MINUTE_S].reshape(n, MINUTE_S, 3).mean(axis=1)
+    is_step = np.abs(np.diff(mean, axis=0)).max(axis=1) > STEP
+    edges = np.concatenate(([0], np.flatnonzero(is_step) + 1, [n]))
+    # The minutes at both ends hold the carrying.
+    return [
+        slice((first + 1) * MINUTE_S, (last - 1) * MINUTE_S)
+        for first, last in pairwise(edges)
+        if last - first >= LEAST_MINUTES + 2
+    ]
+
+
+def part(bag: Bag, rows: slice, name: str) -> Bag:
+    """Cut rows out of a recording whose thermometers are read beside its samples."""
+    temperatures = {key: (t[rows], v[rows]) for key, (t, v) in bag.temperatures.items()}
+    return Bag(name, bag.time_s[rows], bag.samples[rows], temperatures)
+
+
+def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
+    """Cut a recording, or a rest of it, into blocks by the clock."""
+    number = (bag.time_s // BLOCK_S).astype(int)
+    edges = np.flatnonzero(np.diff(number, prepend=-1, append=-1)).tolist()
+    return {
+        int(number[first]): part(bag, slice(first, last), f'{name}-{number[first]}')
+        for first, last in pairwise(edges)
+        if last - first >= LEAST_MINUTES * MINUTE_S
+    }
+
+
+def cats(path: Path) -> Iterator[Study]:
+    """Hold out every other block of the real unit, then each of its rests."""
+    whole = real_unit(path)
+    rests = [part(whole, rows, f'rest{k}') for k, rows in enumerate(rests_of(whole))]
+    still: tuple[list[Bag], list[Bag]] = ([], [])
+    for rest in rests:
+        for number, bag in blocks_of(rest, rest.name).items():
+            still[number % 2].append(bag)
+    blocks = blocks_of(whole, 'block')
+    options = {'input': 'm/s^2'}
+    for own, name in enumerate(('even to odd', 'odd to even')):
+        tests = {'': tuple(still[1 - own])}
+        bags = tuple(bag for number, bag in blocks.items() if number % 2 == own)
+        yield Study(name, bags, tests, options, by_hand=tuple(still[own]))
+    for k, rest in enumerate(rests):
+        others = tuple(rests[:k] + rests[k + 1 :])
+        yield Study('rests left out', others, {'': (rest,)}, options)

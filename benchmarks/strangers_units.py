@@ -1,0 +1,311 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the units and recordings of the benchmark `strangers.py`: physics by numpy and scipy alone.
+
+Case, board, the part of each axis and one hidden node are nodes of a linear thermal network. The
+chamber's air drives the network; between two steps the air is a straight line, so the state of
+each step is exact. Bias and scale are functions of the temperature of an axis's part. This module
+shares no code with the package: whatever the fit assumes, it cannot have been assumed here, too.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import expm
+
+Floats = npt.NDArray[np.float64]
+
+GRAVITY = 9.80665  # standard gravity [m/s^2]
+UG = 1e-6 * GRAVITY  # one micro-g [m/s^2]
+REFERENCE_C = 20.0  # curves of bias and scale are zero here [degC]
+STEP_S = 5.0  # the network's step, through which the air is a straight line [s]
+SOAK_S = 5400.0  # how long a unit has been in the chamber before a recording [s]
+CASE, BOARD, PARTS, HIDDEN = 0, 1, slice(2, 5), 5
+
+
+@dataclass(frozen=True)
+class Environment:
+    """How well heat flows, relative to a chamber with a fan: air to case, case to hidden node."""
+
+    film: float = 1.0
+    path: float = 1.0
+
+
+CHAMBER = Environment()
+STILL_AIR = Environment(film=0.3, path=0.25)
+
+
+def _zeros() -> Floats:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """
+    A unit: constants, curves, thermal network, converter, thermometers.
+
+    Parameters
+    ----------
+    bias, gain, skew : ndarray, shape (3,)
+        Bias [ug] and relative error of the scale at the reference; the lower triangle of M.
+    bias_curve, scale_curve : ndarray, shape (order, 3)
+        Powers 1, 2, ... of the part's temperature less the reference [ug/K^n], [ppm/K^n].
+    kink, kink_c : ndarray, shape (3,), float
+        Change of the slope of the bias [ug/K] above a temperature [degC].
+    bump, bump_c, bump_k : ndarray, shape (3,), float, float
+        Height [ug] of a bell in the bias, its middle [degC] and its full width at half height [K].
+    hidden_bias : ndarray, shape (3,)
+        Bias per temperature of the hidden node above the board [ug/K].
+    case_s, board_s, part_s, hidden_s : float or ndarray, shape (3,)
+        Time constants [s]; a part that lags by 0 s is the board itself.
+    heat_k : float
+        By how much its own heat makes the board warmer than the case at rest [K].
+    counts : float
+        Counts per m/s^2; 0 for samples in m/s^2.
+    carries : bool
+        Whether the converter carries its remainder on to the next sample.
+    density : float
+        White noise [ug/sqrt(Hz)].
+    reading_sd, reading_step, reading_s : float
+        Noise [K], rounding [K] and interval [s] of the thermometers.
+    sensors : tuple of str
+        Thermometers that are recorded.
+
+    """
+
+    bias: Floats
+    gain: Floats
+    skew: Floats
+    bias_curve: Floats
+    scale_curve: Floats
+    kink: Floats = field(default_factory=_zeros)
+    kink_c: float = REFERENCE_C
+    bump: Floats = field(default_factory=_zeros)
+    bump_c: float = REFERENCE_C
+    bump_k: float = 2.0
+    hidden_bias: Floats = field(default_factory=_zeros)
+    case_s: float = 200.0
+    board_s: float = 600.0
+    part_s: Floats = field(default_factory=_zeros)
+    hidden_s: float = 1500.0
+    heat_k: float = 1.0
+    counts: float = 4e5
+    carries: bool = True
+    density: float = 5.0
+    reading_sd: float = 0.005
+    reading_step: float = 0.001
+    reading_s: float = 5.0
+    sensors: tuple[str, ...] = ('board', 'case')
+
+    def bias_at(self, part_c: Floats, hidden_k: Floats | float = 0.0) -> Floats:
+        """Evaluate the bias [ug] of parts [degC], shape (n, 3); `hidden_k` is above the board."""
+        x = part_c - REFERENCE_C
+        bias = self.bias + sum(c * x ** (k + 1) for k, c in enumerate(self.bias_curve))
+        bias = bias + self.kink * np.maximum(part_c - self.kink_c, 0.0)
+        bell = np.exp(-4.0 * np.log(2.0) * ((part_c - self.bump_c) / self.bump_k) ** 2)
+        return np.asarray(bias + self.bump * bell + self.hidden_bias * hidden_k)
+
+    def scale_at(self, part_c: Floats) -> Floats:
+        """Evaluate the relative scale of parts [degC], shape (n, 3)."""
+        x = part_c - REFERENCE_C
+        curve = sum(c * x ** (k + 1) for k, c in enumerate(self.scale_curve))
+        return np.asarray((1.0 + self.gain) * (1.0 + 1e-6 * curve))
+
+    def sensed(self, force: Floats) -> Floats:
+        """Project forces, shape (n, 3), on the sensitivity axes: the inverse of M."""
+        a, b, c = self.skew
+        M = np.array([[1.0, 0.0, 0.0], [a, 1.0, 0.0], [b, c, 1.0]])
+        return np.asarray(force @ np.linalg.inv(M).T)
+
+
+@dataclass(frozen=True)
+class Bag:
+    """
+    A recording in one attitude.
+
+    Parameters
+    ----------
+    name : str
+        What messages call it.
+    time_s, samples : ndarray, shapes (n,), (n, 3)
+        Times of the samples [s], and counts or m/s^2.
+    temperatures : dict of str to (ndarray, ndarray)
+        Times [s] and readings [degC] of each thermometer.
+    force : ndarray, shape (3,) or (n, 3), or None
+        The true specific force [m/s^2], where it is known.
+
+    """
+
+    name: str
+    time_s: Floats
+    samples: Floats
+    temperatures: Mapping[str, tuple[Floats, Floats]]
+    force: Floats | None = None
+
+
+def rng_of(*words: object) -> np.random.Generator:
+    """Seed a generator by words and numbers."""
+    return np.random.default_rng([zlib.crc32(str(word).encode()) for word in words])
+
+
+def signed(rng: np.random.Generator, low: float, high: float) -> Floats:
+    """Draw three magnitudes within limits, each of either sign."""
+    return np.asarray(rng.uniform(low, high, 3) * rng.choice([-1.0, 1.0], 3))
+
+
+def spread(n: int, rng: np.random.Generator) -> Floats:
+    """Choose attitudes, shape (n, 3): each far from those before it, in a frame turned at will."""
+    many = rng.standard_normal((2000, 3))
+    many /= np.linalg.norm(many, axis=1)[:, None]
+    chosen = [many[0], -many[0]][:n]
+    while len(chosen) < n:
+        chosen.append(many[np.argmin((many @ np.array(chosen).T).max(axis=1))])
+    return np.array(chosen)
+
+
+def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Floats, Floats]:
+    """Give A, b and h of ``x' = A x + b air + h``, x of case, board, parts and hidden node."""
+    A, b, h = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    # The case is heavier than the board: heat from the board warms it a tenth as fast.
+    A[CASE, CASE] = -environment.film - 0.1
+    A[CASE, BOARD] = 0.1
+    b[CASE] = environment.film
+    A[CASE] /= unit.case_s
+    b[CASE] /= unit.case_s
+    A[BOARD, CASE], A[BOARD, BOARD] = 1.0 / unit.board_s, -1.0 / unit.board_s
+    h[BOARD] = unit.heat_k / unit.board_s
+    for node, lag_s in zip(range(2, 5), unit.part_s, strict=True):
+        A[node, BOARD], A[node, node] = 1.0 / max(lag_s, 1.0), -1.0 / max(lag_s, 1.0)
+    A[HIDDEN, BOARD] = 1.0 / unit.hidden_s
+    A[HIDDEN, CASE] = environment.path / unit.hidden_s
+    A[HIDDEN, HIDDEN] = -(1.0 + environment.path) / unit.hidden_s
+    return A, b, h
+
+
+def integrate(A: Floats, b: Floats, h: Floats, air: Floats, step_s: float, x: Floats) -> Floats:
+    """Integrate the network from the state `x`, exactly for air that is straight between steps."""
+    n = len(b)
+    # States, the air, its slope, and 1 for the heat.
+    whole = np.zeros((n + 3, n + 3))
+    whole[:n, :n], whole[:n, n], whole[:n, n + 2] = A, b, h
+    whole[n, n + 1] = 1.0
+    step = expm(whole * step_s)[:n]
+    slope = np.diff(air) / step_s
+    drive = np.outer(air[:-1], step[:, n]) + np.outer(slope, step[:, n + 1]) + step[:, n + 2]
+    states = np.empty((len(air), n))
+    states[0] = x
+    turn = step[:, :n]
+    for k, push in enumerate(drive):
+        x = turn @ x + push
+        states[k + 1] = x
+    return states
+
+
+def program(start_c: float, soak_min: float, *ramps: tuple[float, float, float]) -> Floats:
+    """Give the corners of a program, shape (n, 2) [s, degC]: target, rate [K/min], soak [min]."""
+    corners = [(0.0, start_c), (60.0 * soak_min, start_c)]
+    for target_c, rate, rest_min in ramps:
+        at, before = corners[-1]
+        corners.append((at + 60.0 * abs(target_c - before) / rate, target_c))
+        if rest_min:
+            corners.append((corners[-1][0] + 60.0 * rest_min, target_c))
+    return np.array(corners)
+
+
+def record(
+    unit: Unit,
+    corners: Floats,
+    up: Floats,
+    rng: np.random.Generator,
+    *,
+    name: str = 'bag',
+    rate_hz: float = 0.5,
+    environment: Environment = CHAMBER,
+    shift: Floats | float = 0.0,
+    tilt: Floats | None = None,
+    is_cold: bool = False,
+) -> Bag:
+    """
+    Record a program of the chamber in one attitude.
+
+    Parameters
+    ----------
+    unit : Unit
+        What is recorded.
+    corners : ndarray, shape (n, 2)
+        The chamber's program [s, degC].
+    up : ndarray, shape (3,)
+        Direction of the specific force in the unit's frame.
+    rng : Generator
+        Of the chamber and of the noise.
+    name : str
+        The bag's.
+    rate_hz : float
+        Samples per second.
+    environment : Environment
+        How heat flows.
+    shift : ndarray, shape (3,)
+        Bias of this bag alone [ug].
+    tilt : ndarray, shape (3,) or None
+        Rotation of the support per square of the case's temperature about the reference [rad/K^2].
+    is_cold : bool
+        Whether the unit is switched on as the recording begins, as cold as the air.
+
+    Returns
+    -------
+    Bag
+        With the true force.
+
+    """
+    lasts_s = float(corners[-1, 0])
+    grid = np.arange(-SOAK_S, lasts_s + STEP_S, STEP_S)
+    A, b, h = network(unit, environment)
+    # The chamber comes from a temperature nearby, is never where it is told, and hunts.
+    first_c = corners[0, 1]
+    air = np.interp(grid, *corners.T) + 0.2 * rng.standard_normal()
+    air += 0.03 * np.sin(2.0 * np.pi * grid / rng.uniform(200, 300) + rng.uniform(0, 2 * np.pi))
+    came = rng.uniform(-5.0, 5.0)
+    air += np.sign(came) * np.maximum(abs(came) - (grid + SOAK_S) / 30.0, 0.0)
+    if is_cold:
+        grid = np.arange(0.0, lasts_s + STEP_S, STEP_S)
+        air, x = air[-len(grid) :], np.full(6, first_c)
+    else:
+        x = np.linalg.solve(A, -b * air[0] - h)
+    states = integrate(A, b, h, air, STEP_S, x)
+    n = int(lasts_s * rate_hz)
+    stamps = (np.arange(n) + 1.0) / rate_hz
+    # A sample is the mean of its cycle, and stamped at the cycle's end.
+    middle = stamps - 0.5 / rate_hz
+    seen = np.array([np.interp(middle, grid, one) for one in states.T]).T
+    parts = np.where(unit.part_s > 0.0, seen[:, PARTS], seen[:, [BOARD]])
+    force = GRAVITY * np.asarray(up)
+    if tilt is not None:
+        angle = np.outer((seen[:, CASE] - REFERENCE_C) ** 2, tilt)
+        force = force + np.cross(angle, force)
+        force *= GRAVITY / np.linalg.norm(force, axis=1, keepdims=True)
+    ideal = unit.sensed(np.atleast_2d(force)) * unit.scale_at(parts)
+    bias = unit.bias_at(parts, (seen[:, HIDDEN] - seen[:, BOARD])[:, None])
+    noise = unit.density * np.sqrt(rate_hz) * rng.standard_normal((n, 3))
+    samples = ideal + UG * (bias + shift + noise)
+    if unit.counts:
+        samples = quantised(unit.counts * samples, unit.carries)
+    read = np.arange(0.3, lasts_s, unit.reading_s)
+    temperatures = {}
+    for sensor in unit.sensors:
+        node = states[:, CASE if sensor == 'case' else BOARD]
+        value = np.interp(read, grid, node) + unit.reading_sd * rng.standard_normal(len(read))
+        temperatures[sensor] = read, np.round(value / unit.reading_step) * unit.reading_step
+    return Bag(name, stamps, samples, temperatures, force)
+
+
+def quantised(words: Floats, carries: bool) -> Floats:
+    """Round to whole counts; a converter that carries its remainder loses no part of a sum."""
+    if not carries:
+        return np.asarray(np.rint(words))
+    return np.diff(np.rint(np.cumsum(words, axis=0)), axis=0, prepend=0.0)
