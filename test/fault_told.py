@@ -25,7 +25,7 @@ _BAD_FILE = (
     'the calibration that was read runs on; setting it again is refused with path and reason'
 )
 _CALIBRATION_FILES = f'{_PROCESS}::test_calibration_files_that_go_bad'
-_DEFENCE = 'test_node_defence.py'
+_DEFENCE, _RELOAD = 'test_node_defence.py', 'test_node_reload.py'
 
 TOLD = [
     Told(
@@ -151,6 +151,20 @@ TOLD = [
         'not used once the next one of its sensor has come',
         'WARN "temperatures are stamped" until then',
         f'{_DEFENCE}::test_a_reading_far_ahead_is_forgotten',
+    ),
+    Told(
+        'a change of calibration and parameters fails at any line',
+        'an exception at each of some 200 lines between the request and its end',
+        'what ran goes on to the bit: calibration, parameters, thermometers, period of reports',
+        'refusal: the reason',
+        f'{_RELOAD}::test_whatever_line_fails_a_refused_change_is_not_applied',
+    ),
+    Told(
+        'a calibration that cannot be applied',
+        'a lag of 1e-300 s, and another bias, while samples flow',
+        'nothing of it is applied, and the parameter keeps its value',
+        'refusal: the key and its bounds',
+        f'{_RELOAD}::test_a_calibration_that_cannot_be_applied_changes_nothing',
     ),
     Told(
         'a storm of reloads',

@@ -67,9 +67,8 @@ Finding = tuple[int, str]  # level and text
 class Reporter:
     """Publishes the diagnostics of a node; logs when their level changes."""
 
-    def __init__(self, loop: WaitLoop, relay: Relay, compensator: Compensator) -> None:
-        self._loop, self._node = loop, loop.node
-        self._relay, self._compensator = relay, compensator
+    def __init__(self, loop: WaitLoop, relay: Relay) -> None:
+        self._loop, self._node, self._relay = loop, loop.node, relay
         self._publisher = loop.publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
         self._level = DiagnosticStatus.STALE
         self._n_publishers = 0
@@ -78,8 +77,13 @@ class Reporter:
         self._before = self._count()
         self._before_ns: int | None = None
 
-    def report(self, loaded: LoadedCalibration) -> None:
+    @property
+    def _compensator(self) -> Compensator:
+        return self._relay.running.compensator
+
+    def report(self) -> None:
         """Say how the compensation is doing now, and what has happened since the last time."""
+        loaded = self._relay.running.loaded
         self._count_lost()
         if self._compensator.counters.n_in != self._before['n_in']:
             self._last_samples = time.monotonic()
@@ -179,7 +183,7 @@ class Reporter:
             }
         densities, gyroscope = calibration.noise_density_m_s2_sqrt_hz, calibration.gyroscope
         values |= _of_axes('noise density {} [m/s^2/sqrt(Hz)]', densities)
-        last, thermal = self._relay.converter.last_result, self._compensator.thermal
+        last, thermal = self._relay.running.converter.last_result, self._compensator.thermal
         if last is not None:
             variances = last[3], last[6], last[8]
             bias_sd = thermal.bias_sd(thermal.correction, variances)

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from ..errors import CalibrationError
 from ..files import read_bounded
+from ..online.trial import tried
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
 
@@ -37,7 +38,7 @@ class LoadedCalibration:
 
 
 def read(name: str, directory: str = '') -> LoadedCalibration:
-    """Read a unit's calibration; CalibrationError, which quotes nothing of what is none."""
+    """Read and try a calibration; CalibrationError, which quotes nothing of what is none."""
     if not name:
         raise CalibrationError(
             'parameter `calibration_file` is not set; start with '
@@ -53,6 +54,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
                 raise CalibrationError(rule, name)
         content = read_bounded(path, SIZE_LIMIT)
         calibration = parse_calibration(content, name)
+        tried(calibration, name)
     except CalibrationError as error:
         if error.rule is None:
             raise
