@@ -125,16 +125,39 @@ TOLD = [
         f'{_DEFENCE}::test_a_reader_that_ends_is_begun_anew',
     ),
     Told(
+        'a driver is killed and begun anew',
+        'kill -9, another process a second later; the middleware knows the dead one for 20 s yet',
+        'the output goes on within 2 s of its first sample; no sample of the other comes between',
+        'WARN "2 publishers on /accel/counts, of which one sends"',
+        f'{_DEFENCE}::test_a_driver_that_was_killed_blinds_for_less_than_two_seconds',
+    ),
+    Told(
+        'a calibration file of any magnitudes',
+        '10 000 files, one to three values of each key changed by up to 1e+-308',
+        'refused, or every sample over and beyond its range is finite with a covariance that is '
+        'positive definite',
+        'refusal: the key and its bounds',
+        'test_properties.py::'
+        'test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range',
+    ),
+    Told(
+        'the correction of a second is not finite',
+        'NaN, infinity or 1e200 in it, whatever led there',
+        'its samples are dropped and counted, live and offline alike',
+        'ERROR "samples of which nothing finite can be made"',
+        'test_compensator.py::test_what_is_not_finite_is_never_published_whatever_led_to_it',
+    ),
+    Told(
         'a second publisher of the samples',
         'another attitude under stamps in between',
-        'nothing is published until one is left, nor what came just after it',
+        'nothing is published until one is left or sends alone, nor what came just after it',
         'ERROR "2 publishers on /accel/counts"',
         f'{_DEFENCE}::test_samples_of_a_second_publisher_never_go_out',
     ),
     Told(
         'a second publisher of a temperature',
         'half a degree more',
-        'its topic is not used until one is left: held, then after the time-out lost',
+        'its topic is not used until one is left or sends alone: held, then lost',
         'ERROR "2 publishers on /temperature/board"',
         f'{_DEFENCE}::test_readings_of_a_second_publisher_are_not_used',
     ),

@@ -21,7 +21,7 @@ from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from ..typing import Floats
 from ..unit.calibration import Calibration
-from ..unit.correction import Excess
+from ..unit.correction import Excess, is_sound
 from .checks import GravityCheck, StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
@@ -178,10 +178,18 @@ class Compensator:
         start_ns, is_new, is_too_fast, excess, start, end, slow = segment
         self.event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
         correction = thermal.correction
-        line = correction.line(start, end, slow[:9], excess).tolist()
+        line = correction.line(start, end, slow[:9], excess)
+        is_good = is_sound(line)
         if thermal.rate_correction is not None:
-            self.rate_line = thermal.rate_correction.line(start, end, slow[9:], excess).tolist()
-        self._segment = (start_ns, line, correction.misalignment)
+            rate_line = thermal.rate_correction.line(start, end, slow[9:], excess)
+            is_good &= is_sound(rate_line)
+            self.rate_line = rate_line.tolist()
+        if not is_good:
+            # Nothing that is not finite goes out, whatever led to it. Each sample comes back here.
+            counters.n_unsound += 1
+            self.event_ns, self.last_ns = EVER_NS, stamp_ns
+            return None
+        self._segment = (start_ns, line.tolist(), correction.misalignment)
         if not is_new:
             return self.process(stamp_ns, x, y, z)
         self.is_refusing = is_too_fast

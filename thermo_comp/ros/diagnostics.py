@@ -46,6 +46,7 @@ _RISEN = {
     'n_failures': (_ERROR, 'callbacks failed, see the log of the node'),
     'n_stuck': (_ERROR, 'samples stuck or all zero, dropped'),
     'n_too_fast': (_ERROR, 'samples too fast for their conversion cycle, dropped'),
+    'n_unsound': (_ERROR, 'samples of which nothing finite can be made, dropped'),
     'n_saturated': (_ERROR, 'samples saturated (+-{full_scale:g}), dropped'),
     'n_not_finite': (_WARN, 'samples not finite, dropped'),
     'n_out_of_order': (_WARN, 'samples out of order, dropped'),
@@ -139,9 +140,12 @@ class Reporter:
         """Say what is wrong with those who send."""
         for k, one in enumerate(self._relay.inputs.values()):
             n_publishers, topic = one.count_publishers(), one.subscription.topic_name
-            if n_publishers > 1:
+            if n_publishers > 1 and one.is_contested:
                 text = f'{n_publishers} publishers on {topic}'
-                yield _ERROR, f'{text}, it is not used until one is left'
+                yield _ERROR, f'{text}, it is not used until one of them sends alone'
+            elif n_publishers > 1:
+                # One that was killed is known for some time yet.
+                yield _WARN, f'{n_publishers} publishers on {topic}, of which one sends'
             elif not n_publishers and (mismatch := _mismatch(self._node, one.subscription)):
                 level = _ERROR if k < 2 else _WARN
                 yield level, f'no messages of a publisher on {topic}: {mismatch}'
