@@ -6,7 +6,11 @@ What strangers on the network may ask of the node and send to it: it answers, an
 
 from __future__ import annotations
 
+import contextlib
 import re
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -37,6 +41,7 @@ from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
 from thermo_comp.ros.parameters import PARAMETERS_LIMIT, NodeConfig
 from thermo_comp.ros.reader import Reader
+from thermo_comp.ros.waitloop import Sources
 from thermo_comp.text import one_line
 from thermo_comp.unit.calibration_file import save_calibration
 
@@ -320,6 +325,113 @@ def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> N
         peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
         assert all(abs(imu.linear_acceleration.x) < 1.0 for imu in samples.heard)
         assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
+
+
+#: A driver as a process of its own: 100 Hz, in real time, each sample with its name.
+DRIVER = """
+import sys, time, rclpy
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Temperature
+rclpy.init()
+node = rclpy.create_node('driver_' + sys.argv[1])
+samples = node.create_publisher(Vector3Stamped, 'accel/counts', QoSProfile(depth=5000))
+kinds = {n: node.create_publisher(Temperature, 'temperature/' + n, 10) for n in ('board', 'case')}
+while not samples.get_subscription_count():
+    time.sleep(0.01)
+k = 0
+while True:
+    now = time.time_ns()
+    message = Vector3Stamped()
+    message.header.frame_id = sys.argv[1]
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
+    message.vector.x, message.vector.y, message.vector.z = 30.0 + k % 3, -20.0 + k % 2, 2941.0
+    for one in kinds.values() if k % 10 == 0 else ():
+        reading = Temperature(header=message.header, temperature=20.0 + 1e-3 * (k % 7))
+        one.publish(reading)
+    samples.publish(message)
+    if not k:
+        print(now, flush=True)
+    k += 1
+    time.sleep(0.01)
+"""
+
+
+@contextlib.contextmanager
+def driver_process(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """Run a driver; give the time of its first sample [ns]. It is killed at the end."""
+    command = [sys.executable, '-c', DRIVER, name]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        yield process, int(process.stdout.readline())
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer: Peer, unit: Path) -> None:
+    # WHY: for the 20 s of the dead one's lease nothing was published.
+    with node_in_thread(*arguments(unit)) as node:
+        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
+        heard = peer.listen(Imu, 'imu/data_raw')
+
+        def of(name: str) -> list[Imu]:
+            return [imu for imu in list(heard) if imu.header.frame_id == name]
+
+        with driver_process('first'):
+            peer.wait_for(lambda: len(of('first')) > 100, 'samples of the first driver')
+        killed = time.monotonic()
+        # It is the clock that is waited for: the respawn comes a second later.
+        peer.poll(lambda: time.monotonic() - killed > 1.0, 'a second')
+        with driver_process('second') as (_, began_ns):
+            peer.wait_for(lambda: of('second'), 'samples of the second driver')
+            assert node._relay.samples.count_publishers() == 2
+            assert (stamp_of(of('second')[0]) - began_ns) * 1e-9 < 2.0
+            text = '2 publishers on /accel/counts, of which one sends'
+            peer.wait_for(
+                lambda: any(
+                    text in one.status[0].message and one.status[0].level == DiagnosticStatus.WARN
+                    for one in diagnostics[-5:]
+                ),
+                'the warning alone',
+            )
+            peer.wait_for(lambda: len(of('second')) > 100, 'more of the second driver')
+        names = [imu.header.frame_id for imu in heard]
+        assert names == sorted(names)
+
+
+def numbered(begin: int, period_s: float, until_s: float, start_s: float = 0.0) -> Any:
+    """List a publisher's messages: when, its number."""
+    n = int((until_s - start_s) / period_s)
+    return [(start_s + k * period_s, begin + k) for k in range(n)]
+
+
+@pytest.mark.parametrize('offset', [-7, -1, 0, 1, 2, 1000])
+@pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
+def test_two_that_send_are_never_mixed(offset: int, period_s: float) -> None:
+    own = [(*one, 'own') for one in numbered(500, 0.01, 12.0)]
+    begins = 500 + 200 + offset  # as many as the other has sent by then, or nearly
+    other = [(*one, 'other') for one in numbered(begins, period_s, 8.0, start_s=2.003)]
+    sources, used = Sources(), []
+    for at_s, number, name in sorted(own + other):
+        n_known = 2 if at_s > 2.0 else 1
+        if not sources.of_one(n_known, [number], [round(at_s * 1e9)]):
+            used.append((at_s, name))
+    assert {name for _, name in used} == {'own'}
+    # The other one known, but not sending: this one alone, from a second after it was silent on.
+    assert sum(at_s < 2.0 for at_s, _ in used) >= 199
+    assert sum(at_s > 10.0 for at_s, _ in used) >= 199
+
+
+def test_without_numbers_two_publishers_are_two() -> None:
+    sources = Sources()
+    assert sources.of_one(1, [None] * 3, [0, 1, 2]) == 0
+    for k in range(5):
+        assert sources.of_one(2, [None] * 3, [k * SECOND_NS] * 3) == 3
+    assert sources.of_one(1, [None] * 3, [9 * SECOND_NS] * 3) == 3
+    assert sources.of_one(1, [None] * 3, [9 * SECOND_NS] * 3) == 0
 
 
 def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> None:

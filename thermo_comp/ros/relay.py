@@ -4,7 +4,7 @@
 Owns the way of the samples through the node: in the order of arrival, however the wake-ups fell.
 
 A message does not tell whose it is, so while an input has two sources nothing of it is used, nor
-the first messages after it, which may still be of the one that left.
+what comes just after it, which may still be of the one that left (`waitloop.Sources`).
 
 A sample is read and an Imu is written at fixed places of their plain form, little-endian CDR:
 4 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with
@@ -80,7 +80,7 @@ class Traffic:
     n_malformed: int = 0  # messages that could not be read
     n_flags: int = 0  # regime flags published, one for each reading that decides
     n_fallback: int = 0  # samples that rclpy had to bring into the plain form
-    n_contested: int = 0  # messages not used because their input had more than one publisher
+    n_contested: int = 0  # messages not used because more than one publisher may have sent them
 
 
 class SampleConverter:
@@ -223,25 +223,18 @@ class Relay:
 
     def on_data(self) -> None:
         """Work through everything that has arrived."""
-        messages, received_ns = self.samples.drain()
+        messages, received_ns, n_others = self.samples.drain_of_one()
         for name, subscription in self.thermometers.items():
-            readings, read_ns = subscription.drain()
-            if readings and self._is_of_one(subscription, len(readings)):
+            readings, read_ns, n_more = subscription.drain_of_one()
+            n_others += n_more
+            if readings:
                 self._take_readings(name, readings, read_ns)
-        if not messages or not self._is_of_one(self.samples, len(messages)):
+        self.traffic.n_contested += n_others
+        if not messages:
             return
         if self._readings:
             messages = self._relay_with_readings(messages, received_ns)
         self._relay(messages)
-
-    def _is_of_one(self, subscription: RawSubscription, n: int) -> bool:
-        """Tell whether messages are of an input's only publisher; count them if not."""
-        was_contested = subscription.is_contested
-        subscription.is_contested = subscription.count_publishers() > 1
-        if was_contested or subscription.is_contested:
-            self.traffic.n_contested += n
-            return False
-        return True
 
     def advance_without_samples(self, silence_ns: int) -> None:
         """Let readings take effect without samples, so that the flag stays alive."""
