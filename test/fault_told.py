@@ -125,6 +125,20 @@ TOLD = [
         f'{_DEFENCE}::test_a_reader_that_ends_is_begun_anew',
     ),
     Told(
+        'the calibration file hangs',
+        'its reader is stopped while samples flow, as by a network drive that is gone',
+        'other parameters are set, samples go on; the request is answered after 10 s',
+        'refusal: cannot be read: no answer within 10 s',
+        f'{_DEFENCE}::test_while_a_file_hangs_the_other_parameters_go_on',
+    ),
+    Told(
+        'the node is to end while a file hangs',
+        'SIGTERM, and kill -9, while it runs; SIGTERM while it starts',
+        'ends within 2 s of the first signal with exit code 0; no process stays behind',
+        '',
+        f'{_DEFENCE}::test_while_a_file_hangs_the_node_ends_and_nothing_stays',
+    ),
+    Told(
         'a driver is killed and begun anew',
         'kill -9, another process a second later; the middleware knows the dead one for 20 s yet',
         'the output goes on within 2 s of its first sample; no sample of the other comes between',

@@ -7,9 +7,12 @@ What strangers on the network may ask of the node and send to it: it answers, an
 from __future__ import annotations
 
 import contextlib
+import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,13 +37,24 @@ from rcl_interfaces.srv import (
 )
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
+from ros_helpers import (
+    DEEP,
+    SECOND_NS,
+    TIMEOUT,
+    Peer,
+    drive,
+    node_in_thread,
+    stamp_of,
+    stamped,
+    standing,
+)
 from sensor_msgs.msg import Imu, Temperature
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
 from thermo_comp.ros.parameters import PARAMETERS_LIMIT, NodeConfig
-from thermo_comp.ros.reader import Reader
+from thermo_comp.ros.reader import Reader, read_within
+from thermo_comp.ros.round_trip import NodeProcess
 from thermo_comp.ros.waitloop import Sources
 from thermo_comp.text import one_line
 from thermo_comp.unit.calibration_file import save_calibration
@@ -286,6 +300,103 @@ def test_a_reader_that_ends_is_begun_anew(unit: Path) -> None:
     with pytest.raises(CalibrationError, match=r'^none\.yaml: cannot be read: No such file'):
         reader.read('none.yaml', '')
     reader.close()
+
+
+def test_a_reader_that_hangs_is_given_up(unit: Path) -> None:
+    # WHY: a network drive that was gone held every request, and the end of the node, too.
+    reader = Reader()
+    assert reader.read(str(unit), '').calibration == calibration()
+    process, reader._limit_s = reader._process, 0.3
+    assert process is not None
+    process.send_signal(signal.SIGSTOP)
+    with pytest.raises(CalibrationError, match=r'cannot be read: no answer within 0\.3 s'):
+        reader.read(str(unit), '')
+    assert process.returncode == -signal.SIGKILL
+    reader._limit_s = TIMEOUT
+    assert reader.read(str(unit), '').calibration == calibration()
+    reader.close()
+    with pytest.raises(CalibrationError, match='the process that reads it ended'):
+        reader.read(str(unit), '')
+
+
+def test_at_the_start_a_file_that_hangs_is_given_up(monkeypatch: Any) -> None:
+    forever = threading.Event()
+    monkeypatch.setattr('thermo_comp.ros.reader.read', lambda *_: forever.wait())
+    with pytest.raises(CalibrationError, match=r'^a\.yaml: cannot be read: no answer within 0\.2'):
+        read_within('a.yaml', '', 0.2)
+    forever.set()
+
+
+def test_while_a_file_hangs_the_other_parameters_go_on(peer: Peer, unit: Path) -> None:
+    with node_in_thread(*arguments(unit)) as node:
+        samples = Samples(peer, node)
+        assert peer.set_parameters(calibration_file=str(unit))[0].successful
+        node._reader._limit_s = 3.0
+        node._reader._process.send_signal(signal.SIGSTOP)
+        name = 'thermo_comp/set_parameters'
+        message = Parameter('calibration_file', value=str(unit)).to_parameter_msg()
+        request = SetParameters.Request(parameters=[message])
+        hanging = peer._clients[name].call_async(request)
+        (result,) = peer.set_parameters(frame_id='body')
+        assert result.successful
+        samples.go_on()
+        assert not hanging.done()
+        peer.poll(hanging.done, 'the answer')
+        (refused,) = hanging.result().results
+        assert refused.reason == f'{unit}: cannot be read: no answer within 3 s'
+        node._reader._limit_s = TIMEOUT
+        assert peer.set_parameters(calibration_file=str(unit))[0].successful
+        samples.go_on()
+
+
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
+def test_while_a_file_hangs_the_node_ends_and_nothing_stays(
+    peer: Peer, unit: Path, number: int
+) -> None:
+    with NodeProcess('-p', f'calibration_file:={unit}') as node:
+        assert peer.set_parameters(calibration_file=str(unit))[0].successful
+        children = Path(f'/proc/{node.process.pid}/task').glob('*/children')
+        (reader,) = ' '.join(one.read_text() for one in children).split()
+        os.kill(int(reader), signal.SIGSTOP)
+        message = Parameter('calibration_file', value=str(unit)).to_parameter_msg()
+        client = peer._clients['thermo_comp/set_parameters']
+        client.call_async(SetParameters.Request(parameters=[message]))
+        assert peer.set_parameters(frame_id='body')[0].successful
+        began = time.monotonic()
+        code = node.stop(number)
+        assert time.monotonic() - began < 2.0
+        assert code == (0 if number == signal.SIGTERM else -number)
+        peer.poll(lambda: not alive(int(reader)), 'the end of the reader')
+        assert 'Traceback' not in node.said
+
+
+def alive(pid: int) -> bool:
+    """Tell whether a process is there, and more than a number that waits for its parent."""
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except FileNotFoundError:
+        return False
+
+
+HANGING = """
+import threading
+from thermo_comp.ros import node, reader
+reader.read = lambda *_: (print('reads', flush=True), threading.Event().wait())
+raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.yaml']))
+"""
+
+
+def test_a_start_that_hangs_ends_with_one_signal() -> None:
+    # WHY: SIGTERM was noted and nobody came to look; it took a second one.
+    with subprocess.Popen(
+        [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == 'reads\n'
+        began = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(TIMEOUT) == 0
+        assert time.monotonic() - began < 2.0
 
 
 def test_what_param_dump_writes_param_load_sets(peer: Peer, unit: Path) -> None:

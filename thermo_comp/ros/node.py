@@ -27,7 +27,7 @@ from ..text import hold_standard_streams, one_line
 from . import parameters
 from .diagnostics import Reporter
 from .process import SignalWatch, use_profile
-from .reader import LoadedCalibration, Reader, read
+from .reader import LoadedCalibration, Reader, read_within
 from .relay import INPUTS, Relay, Running
 from .waitloop import WaitLoop, overrides
 
@@ -37,6 +37,9 @@ NODE_NAME = 'thermo_comp'
 #: after the last ones [s]: it saves a third of the CPU time at 10 kHz. At 5 kHz it would make each
 #: wait for longer than it takes to relay it.
 REST_S = 0.2e-3
+
+#: After a signal the process ends within this time, whatever hangs [s].
+ENDING_S = 1.8
 
 USAGE = """\
 usage: thermo_comp_node --ros-args -p calibration_file:=PATH [-p NAME:=VALUE ...]
@@ -70,7 +73,7 @@ class CompensationNode:
 
     def _build(self) -> None:
         self._log, config = self.node.get_logger(), parameters.declare(self.node)
-        loaded = read(config.calibration_file, config.calibration_directory)
+        loaded = read_within(config.calibration_file, config.calibration_directory)
         compensator = Compensator(loaded.calibration, config.compensator_config())
         self._check(loaded, config, compensator.thermal.inputs)
         self._loop = WaitLoop(self.node, REST_S)
@@ -96,8 +99,9 @@ class CompensationNode:
 
     def close(self) -> None:
         """Destroy the node."""
-        self._requests.close()
+        # What is being read ends with its process.
         self._reader.close()
+        self._requests.close()
         self.node.destroy_node()
 
     @property
@@ -199,7 +203,7 @@ def main(args: list[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0 if isinstance(error, BrokenPipeError) else _fail(error, 1)
         return 0 if is_help else 2
-    with SignalWatch() as signals:
+    with SignalWatch(ENDING_S) as signals:
         try:
             use_profile()
             rclpy.init(args=args, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
