@@ -125,6 +125,22 @@ TOLD = [
         f'{_DEFENCE}::test_a_reader_that_ends_is_begun_anew',
     ),
     Told(
+        'a recording is killed',
+        'kill -9 of `record` in a position',
+        'what was written lies in a hidden file; the next `record` tells of it, `--finish` makes '
+        'a bag of it',
+        'the file, and what to do',
+        'test_record.py::test_what_a_crash_has_left_is_told_and_finished',
+    ),
+    Told(
+        'the samples step away at rest',
+        '|f| off by more than `gravity_tolerance` from one sample to the next, and steady there',
+        'nothing is published from less than 1 s later on; a lift and a car that shakes are '
+        'motion',
+        'ERROR "|f| at rest misses gravity by", with what it misses now',
+        'test_gravity_check.py::test_what_steps_away_at_rest_is_refuted_within_a_second',
+    ),
+    Told(
         'the calibration file hangs',
         'its reader is stopped while samples flow, as by a network drive that is gone',
         'other parameters are set, samples go on; the request is answered after 10 s',
