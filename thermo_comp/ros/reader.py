@@ -10,6 +10,7 @@ a file makes of its reader, the node only hears that it has ended, or nothing, f
 from __future__ import annotations
 
 import ctypes
+import errno
 import hashlib
 import os
 import signal
@@ -54,13 +55,17 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
         )
     try:
         path = Path(name).expanduser()
-        if directory:
-            # Links included.
-            path, root = path.resolve(), Path(directory).expanduser().resolve()
-            if not path.is_relative_to(root):
-                rule = 'must be in the folder that the parameter `calibration_directory` names'
-                raise CalibrationError(rule, name)
-        content = read_bounded(path, SIZE_LIMIT)
+        root = Path(directory).expanduser().resolve() if directory else None
+        try:
+            # Links included; a folder that may not be looked into is not told from one outside.
+            if root is not None and not path.resolve().is_relative_to(root):
+                raise PermissionError
+            content = read_bounded(path, SIZE_LIMIT, root)
+        except PermissionError as error:
+            if root is None or error.errno == errno.EACCES:
+                raise
+            rule = 'must be in the folder that the parameter `calibration_directory` names'
+            raise CalibrationError(rule, name) from error
         calibration = parse_calibration(content, name)
         tried(calibration, name)
     except CalibrationError as error:
