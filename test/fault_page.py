@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fault_rig import BOARD_LAG_S, RAMP_K_S, bag, seconds_of, unit
 from fault_rows import ERROR, ROWS, WARN, Row
-from fault_told import TOLD
+from fault_told import ATTACKS, TOLD
 
 PAGE = Path(__file__).resolve().parent.parent / 'docs' / 'faults.md'
 _LEVELS = {0: 'OK', WARN: 'WARN', ERROR: 'ERROR'}
@@ -59,23 +59,16 @@ OTHERS = """
 |---|---|---|---|---|
 """
 
-TAIL = """
+ATTACKS_HEAD = """
 ## Attacks beyond the rows
 
-What was tried beside the faults above, how often, and what came of it (`test_attacks.py`, unless another test is named):
+What was tried beside the faults above, how often, and what came of it (`test_attacks.py`):
 
 | attack | how often | what came of it |
 |---|---|---|
-| `use_sim_time` set while it runs; `/clock` on, back by an hour, still, forward by a year, set back | 9 steps, 20 samples in each | every sample comes out; only the header of the diagnostics follows the clock |
-| 100 Hz, 2000 Hz and back | 6 times, 1000 samples in each | every sample comes out, in order |
-| 20 clients set parameters at once, good and bad ones, calibrations among them | 300 requests of up to 3 | all answered; parameters and what runs agree |
-| folders and links exchanged below `calibration_directory` while files are read | 400 readings | none came from outside: the file that was opened is asked where it lies |
-| a full disk under `convert` and `fleet fit` | once each (`record`, `fit`, `report`, `replay`: above) | exit code 1, the reason in a line, no draft stays |
-| a calibration killed (kill -9) at each line of its writing, as by `fit --force` | each of more than 30 lines | the old file or the new one |
-| crafted ULog and DataFlash logs: bytes cut, exchanged and put in | 150 each | read, or refused in a line; formats that contradict their messages ended in a traceback before |
-| paths that climb: `..` in the folder of a fleet, names like `..two`, requests of `view` | 3 folders, 5 requests | nothing is written outside of the output, nothing is served |
-| Python 3.13, and Python 3.10 with the oldest versions that `setup.py` allows | each push (`make oldest`) | the same suite |
+"""
 
+TAIL = """
 ## Beyond the table
 
 - Any bytes as a calibration file, any sequence of messages: [properties and
@@ -157,6 +150,8 @@ def page() -> str:
     for told in TOLD:
         cells = (told.fault, told.injection, told.does, told.says or 'nothing')
         parts.append(f'| {" | ".join(map(_cell, cells))} | `{told.test}` |\n')
+    parts.append(ATTACKS_HEAD)
+    parts += [f'| {" | ".join(map(_cell, cells))} |\n' for cells in ATTACKS]
     parts.append(TAIL)
     return ''.join(parts)
 

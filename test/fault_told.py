@@ -392,3 +392,54 @@ TOLD = [
         'test_degenerate.py::test_it_ends_with_a_sentence_in_bounded_memory',
     ),
 ]
+
+#: What was tried beside all rows: how, how often, what came of it.
+ATTACKS: list[tuple[str, str, str]] = [
+    (
+        '`use_sim_time` set while it runs; `/clock` on, back by an hour, still, '
+        'forward by a year, set back',
+        '9 steps, 20 samples in each',
+        'every sample comes out; only the header of the diagnostics follows the clock',
+    ),
+    (
+        '100 Hz, 2000 Hz and back',
+        '6 times, 1000 samples in each',
+        'every sample comes out, in order',
+    ),
+    (
+        '20 clients set parameters at once, good and bad ones, calibrations among them',
+        '300 requests of up to 3',
+        'all answered; parameters and what runs agree',
+    ),
+    (
+        'folders and links exchanged below `calibration_directory` while files are read',
+        '400 readings',
+        'none came from outside: the file that was opened is asked where it lies',
+    ),
+    (
+        'a full disk under `convert` and `fleet fit`',
+        'once each (`record`, `fit`, `report`, `replay`: above)',
+        'exit code 1, the reason in a line, no draft stays',
+    ),
+    (
+        'a calibration killed (kill -9) at each line of its writing, as by `fit --force`',
+        'each of more than 30 lines',
+        'the old file or the new one',
+    ),
+    (
+        'crafted ULog and DataFlash logs: bytes cut, exchanged and put in',
+        '150 each',
+        'read, or refused in a line; formats that contradict their messages '
+        'ended in a traceback before',
+    ),
+    (
+        'paths that climb: `..` in the folder of a fleet, names like `..two`, requests of `view`',
+        '3 folders, 5 requests',
+        'nothing is written outside of the output, nothing is served',
+    ),
+    (
+        'Python 3.13, and Python 3.10 with the oldest versions that `setup.py` allows',
+        'each push (`make oldest`)',
+        'the same suite',
+    ),
+]

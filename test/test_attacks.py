@@ -216,14 +216,12 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk_under_convert_and_fleet(small_disk: Path, tmp_path: Path, cli: Cli) -> None:
     table = tmp_path / 'log.csv'
     rng = np.random.default_rng(3)
-    rows = [
-        f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(rng.normal(size=(9000, 3)))
-    ]
+    rows = [f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(samples)]
     table.write_text('\n'.join(['time_s,x,y,z,board', *rows]))
     columns = tmp_path / 'columns.yaml'
     columns.write_text(
-        'time: {name: time_s, unit: s}\naccel: {names: [x, y, z], unit: m/s^2}\n'
-        'temperatures: {board: {name: board, unit: degC}}\n'
+        'stamp: {rate_hz: 100.0, start_s: 1.0}\n'
+        'accel: {columns: [x, y, z], unit: m/s^2, output: imu}\nboard: {column: board, unit: degC}\n'
     )
     finished = cli('convert', table, '--columns', columns, '-o', small_disk / 'log', code=None)
     assert finished.returncode == 1, finished.stderr
