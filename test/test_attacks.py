@@ -215,13 +215,14 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_full_disk_under_convert_and_fleet(small_disk: Path, tmp_path: Path, cli: Cli) -> None:
     table = tmp_path / 'log.csv'
-    rng = np.random.default_rng(3)
+    samples = np.random.default_rng(3).normal((0.0, 0.0, 9.8), 0.1, (9000, 3))
     rows = [f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(samples)]
     table.write_text('\n'.join(['time_s,x,y,z,board', *rows]))
     columns = tmp_path / 'columns.yaml'
     columns.write_text(
         'stamp: {rate_hz: 100.0, start_s: 1.0}\n'
-        'accel: {columns: [x, y, z], unit: m/s^2, output: imu}\nboard: {column: board, unit: degC}\n'
+        'accel: {columns: [x, y, z], unit: m/s^2, output: imu}\n'
+        'board: {column: board, unit: degC}\n'
     )
     finished = cli('convert', table, '--columns', columns, '-o', small_disk / 'log', code=None)
     assert finished.returncode == 1, finished.stderr
