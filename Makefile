@@ -5,10 +5,11 @@
 # make test   sets up .venv, runs the whole test suite
 # make lint   ruff, mypy --strict and the layering test
 # make nightly  the properties, ten thousand examples each
+# make oldest  the suite under the oldest versions of what setup.py asks for, in .venv-oldest
 # make fuzz   the fuzz targets, FUZZ_SECONDS (60) each
 # make bench  installs the package beside it, in .venv-bench, and measures its speed (half an hour)
 # make docs   builds the documentation as a site, in site/
-# make clean  removes .venv, .venv-bench and everything made
+# make clean  removes .venv, .venv-bench, .venv-oldest and everything made
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -29,7 +30,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # What is compiled is kept: without it each of the tests' many processes compiles it anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint nightly fuzz bench docs clean help
+.PHONY: demo test lint nightly oldest fuzz bench docs clean help
 .DEFAULT_GOAL := help
 
 help:
@@ -50,6 +51,12 @@ lint: $(VENV)/.installed-dev
 nightly: $(VENV)/.installed-test
 	$(BIN)/python -m pytest --hypothesis-profile=nightly -n $(JOBS) test/test_properties.py
 
+# Of each library the first release of the series that setup.py begins with.
+oldest:
+	grep -oE "'[A-Za-z0-9-]+(\[[a-z]+\])?>=[0-9.]+" setup.py \
+	  | sed -E "s/'([A-Za-z0-9-]+)(\[[a-z]+\])?>=([0-9.]+)/\1==\3.*/" | sort -u > oldest.txt
+	PIP_CONSTRAINT=$(CURDIR)/oldest.txt $(MAKE) test VENV=.venv-oldest
+
 fuzz: $(VENV)/.installed-fuzz
 	$(BIN)/python fuzz/run.py all --seconds $(FUZZ_SECONDS)
 
@@ -66,7 +73,7 @@ docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir site
 
 clean:
-	rm -rf $(VENV) $(VENV)-bench build install log out site *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(VENV)-bench .venv-oldest oldest.txt build install log out site *.egg-info .mypy_cache .ruff_cache .pytest_cache
 
 $(BIN)/python:
 	@found=; \

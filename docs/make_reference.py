@@ -16,9 +16,10 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
+from thermo_comp.quantities import QUANTITIES, Bounds
 from thermo_comp.ros.parameters import NodeConfig
 from thermo_comp.unit.calibration import Calibration
-from thermo_comp.unit.schema import Bounds, fields_of, plain
+from thermo_comp.unit.schema import fields_of, plain
 
 ROOT = Path(__file__).resolve().parent.parent
 TYPES = {str: 'string', int: 'integer', float: 'number', bool: 'boolean', type(None): 'null'}
@@ -26,9 +27,11 @@ KEYWORDS = {
     'above': 'exclusiveMinimum',
     'at_least': 'minimum',
     'below': 'exclusiveMaximum',
+    'at_most': 'maximum',
     'shortest': 'minLength',
     'longest': 'maxLength',
 }
+LIST_KEYWORDS = {'shortest': 'minItems', 'longest': 'maxItems'}
 AXES = ('x', 'y', 'z')
 
 CALIBRATION_HEAD = """\
@@ -51,6 +54,16 @@ coefficients of its Fs, level of the dynamic set, free coefficients of its Fs, w
 in the order of the file), in input units; then the scale in the same order, relative; at the end
 `M[1][0]`, `M[2][0]`, `M[2][1]`. `covariance = factor @ factor.T + diag(rest)`. That of a `gyroscope` holds the bias alone,
 in rad/s, in the same order; ranges, reference temperature and thermometers are the unit's.
+"""
+
+BOUNDS = """\
+## Bounds
+
+Every number of a calibration is of one of these quantities. The bounds lie beyond any instrument, so that whatever
+keeps them gives finite numbers and a covariance that is positive definite. What belongs to a unit hangs on its own
+full scale: a bias, with its curve anywhere in its range, stays within twice the full scale, a column at its worst and
+what one parameter leaves open within a million times that, and a relative scale, with all its columns at their worst,
+between 0.1 and 10.
 """
 
 INTERFACE = """\
@@ -123,7 +136,8 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | counts the same to the bit for `stuck_timeout`, or all zero | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude at rest that misses gravity by `gravity_tolerance` | nothing is published, ERROR |
-| a second publisher of a topic | nothing of that topic is used until one is left, ERROR |
+| a second publisher of a topic | nothing of that topic is used until one is left, or until one alone has sent for a second (the other was killed: the middleware knows it for 20 s yet, WARN); ERROR |
+| a sample of which a calibration makes nothing finite | dropped, counted, ERROR |
 | a message of more than 1 kB (a `frame_id` without end) | dropped, counted |
 | a temperature stamped more than 5 s after the next one of its sensor | not used |
 | a stamp that repeats or goes back a little | dropped, counted |
@@ -157,8 +171,7 @@ def _schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
         result = _schema(arguments[0], definitions)
         for note in arguments[1:]:
             if isinstance(note, Bounds):
-                limits = vars(note).items()
-                result |= {KEYWORDS[name]: limit for name, limit in limits if limit is not None}
+                result |= _limits(note, result['type'] == 'array')
             else:
                 result['description'] = note
         return result
@@ -171,6 +184,14 @@ def _schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
         return {'type': 'array', 'items': _schema(arguments[0], definitions)}
     items = [_schema(one, definitions) for one in arguments]
     return {'type': 'array', 'prefixItems': items, 'minItems': len(items), 'maxItems': len(items)}
+
+
+def _limits(bounds: Bounds, is_list: bool) -> dict[str, Any]:
+    given = {name: limit for name, limit in vars(bounds).items() if limit is not None}
+    if 'at_least' in given:
+        given.pop('above', None)
+    words = {**KEYWORDS, **(LIST_KEYWORDS if is_list else {})}
+    return {words[name]: limit for name, limit in given.items() if name in words}
 
 
 def _define(cls: Any, definitions: dict[str, Any]) -> None:
@@ -223,7 +244,23 @@ def calibration_page() -> str:
         'ResidualSummary',
     ):
         parts += _section(name, definitions[name], definitions, heading=3)
-    return '\n'.join(parts)
+    return '\n'.join([*parts, *_bounds_table()])
+
+
+def _bounds_table() -> list[str]:
+    rows = []
+    for name, bounds in QUANTITIES.items():
+        if bounds.longest:
+            lower, upper = f'{bounds.shortest or 0}', f'{bounds.longest}'
+            unit = 'entries'
+        else:
+            lower = f'{bounds.above if bounds.at_least is None else bounds.at_least:g}'
+            lower += f', or {bounds.nil_or:g}' if bounds.nil_or else ''
+            upper = f'{bounds.below if bounds.at_most is None else bounds.at_most:g}'
+            unit = bounds.unit
+        rows.append(f'| {name} | {lower} | {upper} | {unit} | {bounds.why} |')
+    table = ['| quantity | from | to | unit | why so far |', '|---|---|---|---|---|', *rows]
+    return [BOUNDS, *table, '']
 
 
 def _section(

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fault_rig import BOARD_LAG_S, RAMP_K_S, bag, seconds_of, unit
 from fault_rows import ERROR, ROWS, WARN, Row
-from fault_told import TOLD
+from fault_told import ATTACKS, TOLD
 
 PAGE = Path(__file__).resolve().parent.parent / 'docs' / 'faults.md'
 _LEVELS = {0: 'OK', WARN: 'WARN', ERROR: 'ERROR'}
@@ -57,6 +57,15 @@ OTHERS = """
 
 | fault | how it is injected | what happens | what is said | test |
 |---|---|---|---|---|
+"""
+
+ATTACKS_HEAD = """
+## Attacks beyond the rows
+
+What was tried beside the faults above, how often, and what came of it (`test_attacks.py`):
+
+| attack | how often | what came of it |
+|---|---|---|
 """
 
 TAIL = """
@@ -141,6 +150,8 @@ def page() -> str:
     for told in TOLD:
         cells = (told.fault, told.injection, told.does, told.says or 'nothing')
         parts.append(f'| {" | ".join(map(_cell, cells))} | `{told.test}` |\n')
+    parts.append(ATTACKS_HEAD)
+    parts += [f'| {" | ".join(map(_cell, cells))} |\n' for cells in ATTACKS]
     parts.append(TAIL)
     return ''.join(parts)
 

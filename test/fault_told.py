@@ -25,7 +25,7 @@ _BAD_FILE = (
     'the calibration that was read runs on; setting it again is refused with path and reason'
 )
 _CALIBRATION_FILES = f'{_PROCESS}::test_calibration_files_that_go_bad'
-_DEFENCE = 'test_node_defence.py'
+_DEFENCE, _RELOAD = 'test_node_defence.py', 'test_node_reload.py'
 
 TOLD = [
     Told(
@@ -125,16 +125,69 @@ TOLD = [
         f'{_DEFENCE}::test_a_reader_that_ends_is_begun_anew',
     ),
     Told(
+        'a recording is killed',
+        'kill -9 of `record` in a position',
+        'what was written lies in a hidden file; the next `record` tells of it, `--finish` makes '
+        'a bag of it',
+        'the file, and what to do',
+        'test_record.py::test_what_a_crash_has_left_is_told_and_finished',
+    ),
+    Told(
+        'the samples step away at rest',
+        '|f| off by more than `gravity_tolerance` from one sample to the next, and steady there',
+        'nothing is published from less than 1 s later on; a lift and a car that shakes are '
+        'motion',
+        'ERROR "|f| at rest misses gravity by", with what it misses now',
+        'test_gravity_check.py::test_what_steps_away_at_rest_is_refuted_within_a_second',
+    ),
+    Told(
+        'the calibration file hangs',
+        'its reader is stopped while samples flow, as by a network drive that is gone',
+        'other parameters are set, samples go on; the request is answered after 10 s',
+        'refusal: cannot be read: no answer within 10 s',
+        f'{_DEFENCE}::test_while_a_file_hangs_the_other_parameters_go_on',
+    ),
+    Told(
+        'the node is to end while a file hangs',
+        'SIGTERM, and kill -9, while it runs; SIGTERM while it starts',
+        'ends within 2 s of the first signal with exit code 0; no process stays behind',
+        '',
+        f'{_DEFENCE}::test_while_a_file_hangs_the_node_ends_and_nothing_stays',
+    ),
+    Told(
+        'a driver is killed and begun anew',
+        'kill -9, another process a second later; the middleware knows the dead one for 20 s yet',
+        'the output goes on within 2 s of its first sample; no sample of the other comes between',
+        'WARN "2 publishers on /accel/counts, of which one sends"',
+        f'{_DEFENCE}::test_a_driver_that_was_killed_blinds_for_less_than_two_seconds',
+    ),
+    Told(
+        'a calibration file of any magnitudes',
+        '10 000 files, one to three values of each key changed by up to 1e+-308',
+        'refused, or every sample over and beyond its range is finite with a covariance that is '
+        'positive definite',
+        'refusal: the key and its bounds',
+        'test_properties.py::'
+        'test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range',
+    ),
+    Told(
+        'the correction of a second is not finite',
+        'NaN, infinity or 1e200 in it, whatever led there',
+        'its samples are dropped and counted, live and offline alike',
+        'ERROR "samples of which nothing finite can be made"',
+        'test_compensator.py::test_what_is_not_finite_is_never_published_whatever_led_to_it',
+    ),
+    Told(
         'a second publisher of the samples',
         'another attitude under stamps in between',
-        'nothing is published until one is left, nor what came just after it',
+        'nothing is published until one is left or sends alone, nor what came just after it',
         'ERROR "2 publishers on /accel/counts"',
         f'{_DEFENCE}::test_samples_of_a_second_publisher_never_go_out',
     ),
     Told(
         'a second publisher of a temperature',
         'half a degree more',
-        'its topic is not used until one is left: held, then after the time-out lost',
+        'its topic is not used until one is left or sends alone: held, then lost',
         'ERROR "2 publishers on /temperature/board"',
         f'{_DEFENCE}::test_readings_of_a_second_publisher_are_not_used',
     ),
@@ -151,6 +204,20 @@ TOLD = [
         'not used once the next one of its sensor has come',
         'WARN "temperatures are stamped" until then',
         f'{_DEFENCE}::test_a_reading_far_ahead_is_forgotten',
+    ),
+    Told(
+        'a change of calibration and parameters fails at any line',
+        'an exception at each of some 200 lines between the request and its end',
+        'what ran goes on to the bit: calibration, parameters, thermometers, period of reports',
+        'refusal: the reason',
+        f'{_RELOAD}::test_whatever_line_fails_a_refused_change_is_not_applied',
+    ),
+    Told(
+        'a calibration that cannot be applied',
+        'a lag of 1e-300 s, and another bias, while samples flow',
+        'nothing of it is applied, and the parameter keeps its value',
+        'refusal: the key and its bounds',
+        f'{_RELOAD}::test_a_calibration_that_cannot_be_applied_changes_nothing',
     ),
     Told(
         'a storm of reloads',
@@ -323,5 +390,56 @@ TOLD = [
         'every command ends within a minute, below 300 MB, without a traceback',
         'one line, or the result',
         'test_degenerate.py::test_it_ends_with_a_sentence_in_bounded_memory',
+    ),
+]
+
+#: What was tried beside all rows: how, how often, what came of it.
+ATTACKS: list[tuple[str, str, str]] = [
+    (
+        '`use_sim_time` set while it runs; `/clock` on, back by an hour, still, '
+        'forward by a year, set back',
+        '9 steps, 20 samples in each',
+        'every sample comes out; only the header of the diagnostics follows the clock',
+    ),
+    (
+        '100 Hz, 2000 Hz and back',
+        '6 times, 1000 samples in each',
+        'every sample comes out, in order',
+    ),
+    (
+        '20 clients set parameters at once, good and bad ones, calibrations among them',
+        '300 requests of up to 3',
+        'all answered; parameters and what runs agree',
+    ),
+    (
+        'folders and links exchanged below `calibration_directory` while files are read',
+        '400 readings',
+        'none came from outside: the file that was opened is asked where it lies',
+    ),
+    (
+        'a full disk under `convert` and `fleet fit`',
+        'once each (`record`, `fit`, `report`, `replay`: above)',
+        'exit code 1, the reason in a line, no draft stays',
+    ),
+    (
+        'a calibration killed (kill -9) at each line of its writing, as by `fit --force`',
+        'each of more than 30 lines',
+        'the old file or the new one',
+    ),
+    (
+        'crafted ULog and DataFlash logs: bytes cut, exchanged and put in',
+        '150 each',
+        'read, or refused in a line; formats that contradict their messages '
+        'ended in a traceback before',
+    ),
+    (
+        'paths that climb: `..` in the folder of a fleet, names like `..two`, requests of `view`',
+        '3 folders, 5 requests',
+        'nothing is written outside of the output, nothing is served',
+    ),
+    (
+        'Python 3.13, and Python 3.10 with the oldest versions that `setup.py` allows',
+        'each push (`make oldest`)',
+        'the same suite',
     ),
 ]

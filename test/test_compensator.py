@@ -28,6 +28,7 @@ from hypothesis import strategies as st
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
 from thermo_comp.unit.calibration import Axes, AxisReference
+from thermo_comp.unit.correction import Correction
 
 UNIQUE = [0, 1, 2, 4, 5, 8]
 #: One message of the plain unit: density^2 / cycle, and a converter that carries its remainder on.
@@ -463,3 +464,32 @@ def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
     compensator.reconfigure(replace(compensator.config, transition_time_s=50.0))
     after = compensator.process(stamp + 2, 0.0, 0.0, 1.0)[0]
     assert after == pytest.approx(before, abs=1e-9)
+
+
+@pytest.mark.parametrize('bad', [math.nan, math.inf, 1e200])
+def test_what_is_not_finite_is_never_published_whatever_led_to_it(monkeypatch, bad):
+    # WHY: the last line of defence, behind the bounds of a calibration and its trial.
+    line = Correction.line
+
+    def broken(self, start, end, slow, excess):
+        found = line(self, start, end, slow, excess)
+        # The second and the third second of the stamps' whole run.
+        at = np.asarray(start)[0]
+        found[0] = np.where((at > 21.0) & (at < 23.0), bad, found[0])
+        return found
+
+    monkeypatch.setattr(Correction, 'line', broken)
+    events = []
+    for k in range(40):
+        stamp_ns = k * SECOND_NS // 8
+        if k % 4 == 0:
+            events += [(name, stamp_ns, 20.0 + 0.125 * k) for name in ('board', 'case')]
+        events.append(('accel', stamp_ns, (30.0 + k % 3, -20.0, 2941.0 + k % 5)))
+    one_by_one, block = (Compensator(thermal_calibration()) for _ in range(2))
+    rows, _ = stream(one_by_one, events)
+    n_sent = sum(name == 'accel' for name, *_ in events)
+    assert 0 < one_by_one.counters.n_unsound == n_sent - len(rows)
+    assert np.isfinite(rows).all()
+    found = process_block(block, columns_from_events(events))
+    np.testing.assert_array_equal(found.specific_force, np.array(rows)[:, :3])
+    assert block.counters == one_by_one.counters

@@ -54,3 +54,44 @@ def test_time_that_jumps_starts_a_new_window(rng):
     watch(rng, seconds=10, monitor=monitor)
     result = watch(rng, seconds=10, monitor=monitor)
     assert result.n_windows == 19
+
+
+def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
+    """Watch a platform that stands, and from a time on reads more; give when it was refuted."""
+    monitor = GravityCheck(GRAVITY, tolerance=0.1)
+    up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
+    for k in range(round((at_s + 10.0) * rate_hz)):
+        seconds = k / rate_hz
+        grown = min(max((seconds - at_s) / ramp_s, 0.0), 1.0) if ramp_s else seconds >= at_s
+        sd = math.hypot(NOISE_SD, scatter * (seconds >= at_s))
+        force = (GRAVITY + offset * grown) * up + sd * rng.standard_normal(3)
+        monitor.add(round(seconds * 1e9), tuple(force), COVARIANCE, 3 * NOISE_SD**2)
+        if monitor.is_refuted:
+            return seconds - at_s, monitor.result
+    return math.inf, monitor.result
+
+
+@pytest.mark.parametrize('rate_hz', [2.5, 5.0, 10.0])
+@pytest.mark.parametrize('offset', [0.3, -3.0, 15.0])
+def test_what_steps_away_at_rest_is_refuted_within_a_second(rng, rate_hz, offset):
+    # WHY: it took five seconds, and the message gave the mean over what had been before.
+    after_s, result = steps(rng, offset=offset, rate_hz=rate_hz)
+    assert after_s < 1.0
+    # Two samples at least.
+    assert result.residual == pytest.approx(offset, abs=5 * NOISE_SD)
+
+
+def test_what_moves_away_is_not_refuted_at_once(rng):
+    # A lift: the acceleration grows over 0.8 s. And a car that pulls away, which shakes.
+    assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
+    assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
+
+
+def test_the_message_gives_the_deviation_now(rng):
+    monitor = GravityCheck(GRAVITY, tolerance=0.1)
+    watch(rng, seconds=40, bias=0.001, monitor=monitor)
+    assert not monitor.is_refuted
+    # Another beginning of time, so that no step is seen, but windows.
+    result = watch(rng, seconds=8, bias=0.5, monitor=monitor)
+    assert monitor.is_refuted
+    assert result.residual == pytest.approx(0.5, abs=1e-3)

@@ -22,6 +22,7 @@ LAYERS = {
     'typing': 0,
     'files': 0,
     'plain_yaml': 0,
+    'quantities': 0,
     'thermal': 1,
     'unit': 1,
     'online': 2,

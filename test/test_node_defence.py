@@ -6,7 +6,14 @@ What strangers on the network may ask of the node and send to it: it answers, an
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
+import signal
+import subprocess
+import sys
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -30,13 +37,25 @@ from rcl_interfaces.srv import (
 )
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
+from ros_helpers import (
+    DEEP,
+    SECOND_NS,
+    TIMEOUT,
+    Peer,
+    drive,
+    node_in_thread,
+    stamp_of,
+    stamped,
+    standing,
+)
 from sensor_msgs.msg import Imu, Temperature
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
 from thermo_comp.ros.parameters import PARAMETERS_LIMIT, NodeConfig
-from thermo_comp.ros.reader import Reader
+from thermo_comp.ros.reader import Reader, read_within
+from thermo_comp.ros.round_trip import NodeProcess
+from thermo_comp.ros.waitloop import Sources
 from thermo_comp.text import one_line
 from thermo_comp.unit.calibration_file import save_calibration
 
@@ -283,6 +302,103 @@ def test_a_reader_that_ends_is_begun_anew(unit: Path) -> None:
     reader.close()
 
 
+def test_a_reader_that_hangs_is_given_up(unit: Path) -> None:
+    # WHY: a network drive that was gone held every request, and the end of the node, too.
+    reader = Reader()
+    assert reader.read(str(unit), '').calibration == calibration()
+    process, reader._limit_s = reader._process, 0.3
+    assert process is not None
+    process.send_signal(signal.SIGSTOP)
+    with pytest.raises(CalibrationError, match=r'cannot be read: no answer within 0\.3 s'):
+        reader.read(str(unit), '')
+    assert process.returncode == -signal.SIGKILL
+    reader._limit_s = TIMEOUT
+    assert reader.read(str(unit), '').calibration == calibration()
+    reader.close()
+    with pytest.raises(CalibrationError, match='the process that reads it ended'):
+        reader.read(str(unit), '')
+
+
+def test_at_the_start_a_file_that_hangs_is_given_up(monkeypatch: Any) -> None:
+    forever = threading.Event()
+    monkeypatch.setattr('thermo_comp.ros.reader.read', lambda *_: forever.wait())
+    with pytest.raises(CalibrationError, match=r'^a\.yaml: cannot be read: no answer within 0\.2'):
+        read_within('a.yaml', '', 0.2)
+    forever.set()
+
+
+def test_while_a_file_hangs_the_other_parameters_go_on(peer: Peer, unit: Path) -> None:
+    with node_in_thread(*arguments(unit)) as node:
+        samples = Samples(peer, node)
+        assert peer.set_parameters(calibration_file=str(unit))[0].successful
+        node._reader._limit_s = 3.0
+        node._reader._process.send_signal(signal.SIGSTOP)
+        name = 'thermo_comp/set_parameters'
+        message = Parameter('calibration_file', value=str(unit)).to_parameter_msg()
+        request = SetParameters.Request(parameters=[message])
+        hanging = peer._clients[name].call_async(request)
+        (result,) = peer.set_parameters(frame_id='body')
+        assert result.successful
+        samples.go_on()
+        assert not hanging.done()
+        peer.poll(hanging.done, 'the answer')
+        (refused,) = hanging.result().results
+        assert refused.reason == f'{unit}: cannot be read: no answer within 3 s'
+        node._reader._limit_s = TIMEOUT
+        assert peer.set_parameters(calibration_file=str(unit))[0].successful
+        samples.go_on()
+
+
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
+def test_while_a_file_hangs_the_node_ends_and_nothing_stays(
+    peer: Peer, unit: Path, number: int
+) -> None:
+    with NodeProcess('-p', f'calibration_file:={unit}') as node:
+        assert peer.set_parameters(calibration_file=str(unit))[0].successful
+        children = Path(f'/proc/{node.process.pid}/task').glob('*/children')
+        (reader,) = ' '.join(one.read_text() for one in children).split()
+        os.kill(int(reader), signal.SIGSTOP)
+        message = Parameter('calibration_file', value=str(unit)).to_parameter_msg()
+        client = peer._clients['thermo_comp/set_parameters']
+        client.call_async(SetParameters.Request(parameters=[message]))
+        assert peer.set_parameters(frame_id='body')[0].successful
+        began = time.monotonic()
+        code = node.stop(number)
+        assert time.monotonic() - began < 2.0
+        assert code == (0 if number == signal.SIGTERM else -number)
+        peer.poll(lambda: not alive(int(reader)), 'the end of the reader')
+        assert 'Traceback' not in node.said
+
+
+def alive(pid: int) -> bool:
+    """Tell whether a process is there, and more than a number that waits for its parent."""
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except FileNotFoundError:
+        return False
+
+
+HANGING = """
+import threading
+from thermo_comp.ros import node, reader
+reader.read = lambda *_: (print('reads', flush=True), threading.Event().wait())
+raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.yaml']))
+"""
+
+
+def test_a_start_that_hangs_ends_with_one_signal() -> None:
+    # WHY: SIGTERM was noted and nobody came to look; it took a second one.
+    with subprocess.Popen(
+        [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == 'reads\n'
+        began = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(TIMEOUT) == 0
+        assert time.monotonic() - began < 2.0
+
+
 def test_what_param_dump_writes_param_load_sets(peer: Peer, unit: Path) -> None:
     with node_in_thread(*arguments(unit)) as node:
         names = [one for one in node.node._parameters]  # noqa: C416
@@ -320,6 +436,113 @@ def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> N
         peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
         assert all(abs(imu.linear_acceleration.x) < 1.0 for imu in samples.heard)
         assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
+
+
+#: A driver as a process of its own: 100 Hz, in real time, each sample with its name.
+DRIVER = """
+import sys, time, rclpy
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Temperature
+rclpy.init()
+node = rclpy.create_node('driver_' + sys.argv[1])
+samples = node.create_publisher(Vector3Stamped, 'accel/counts', QoSProfile(depth=5000))
+kinds = {n: node.create_publisher(Temperature, 'temperature/' + n, 10) for n in ('board', 'case')}
+while not samples.get_subscription_count():
+    time.sleep(0.01)
+k = 0
+while True:
+    now = time.time_ns()
+    message = Vector3Stamped()
+    message.header.frame_id = sys.argv[1]
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
+    message.vector.x, message.vector.y, message.vector.z = 30.0 + k % 3, -20.0 + k % 2, 2941.0
+    for one in kinds.values() if k % 10 == 0 else ():
+        reading = Temperature(header=message.header, temperature=20.0 + 1e-3 * (k % 7))
+        one.publish(reading)
+    samples.publish(message)
+    if not k:
+        print(now, flush=True)
+    k += 1
+    time.sleep(0.01)
+"""
+
+
+@contextlib.contextmanager
+def driver_process(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """Run a driver; give the time of its first sample [ns]. It is killed at the end."""
+    command = [sys.executable, '-c', DRIVER, name]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        yield process, int(process.stdout.readline())
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer: Peer, unit: Path) -> None:
+    # WHY: for the 20 s of the dead one's lease nothing was published.
+    with node_in_thread(*arguments(unit)) as node:
+        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
+        heard = peer.listen(Imu, 'imu/data_raw')
+
+        def of(name: str) -> list[Imu]:
+            return [imu for imu in list(heard) if imu.header.frame_id == name]
+
+        with driver_process('first'):
+            peer.wait_for(lambda: len(of('first')) > 100, 'samples of the first driver')
+        killed = time.monotonic()
+        # It is the clock that is waited for: the respawn comes a second later.
+        peer.poll(lambda: time.monotonic() - killed > 1.0, 'a second')
+        with driver_process('second') as (_, began_ns):
+            peer.wait_for(lambda: of('second'), 'samples of the second driver')
+            assert node._relay.samples.count_publishers() == 2
+            assert (stamp_of(of('second')[0]) - began_ns) * 1e-9 < 2.0
+            text = '2 publishers on /accel/counts, of which one sends'
+            peer.wait_for(
+                lambda: any(
+                    text in one.status[0].message and one.status[0].level == DiagnosticStatus.WARN
+                    for one in diagnostics[-5:]
+                ),
+                'the warning alone',
+            )
+            peer.wait_for(lambda: len(of('second')) > 100, 'more of the second driver')
+        names = [imu.header.frame_id for imu in heard]
+        assert names == sorted(names)
+
+
+def numbered(begin: int, period_s: float, until_s: float, start_s: float = 0.0) -> Any:
+    """List a publisher's messages: when, its number."""
+    n = int((until_s - start_s) / period_s)
+    return [(start_s + k * period_s, begin + k) for k in range(n)]
+
+
+@pytest.mark.parametrize('offset', [-7, -1, 0, 1, 2, 1000])
+@pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
+def test_two_that_send_are_never_mixed(offset: int, period_s: float) -> None:
+    own = [(*one, 'own') for one in numbered(500, 0.01, 12.0)]
+    begins = 500 + 200 + offset  # as many as the other has sent by then, or nearly
+    other = [(*one, 'other') for one in numbered(begins, period_s, 8.0, start_s=2.003)]
+    sources, used = Sources(), []
+    for at_s, number, name in sorted(own + other):
+        n_known = 2 if at_s > 2.0 else 1
+        if not sources.of_one(n_known, [number], [round(at_s * 1e9)]):
+            used.append((at_s, name))
+    assert {name for _, name in used} == {'own'}
+    # The other one known, but not sending: this one alone, from a second after it was silent on.
+    assert sum(at_s < 2.0 for at_s, _ in used) >= 199
+    assert sum(at_s > 10.0 for at_s, _ in used) >= 199
+
+
+def test_without_numbers_two_publishers_are_two() -> None:
+    sources = Sources()
+    assert sources.of_one(1, [None] * 3, [0, 1, 2]) == 0
+    for k in range(5):
+        assert sources.of_one(2, [None] * 3, [k * SECOND_NS] * 3) == 3
+    assert sources.of_one(1, [None] * 3, [9 * SECOND_NS] * 3) == 3
+    assert sources.of_one(1, [None] * 3, [9 * SECOND_NS] * 3) == 0
 
 
 def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> None:

@@ -4,22 +4,30 @@
 
 from __future__ import annotations
 
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
+import rclpy
 from builders import axis_set, calibration, regime_set
 from rcl_interfaces.srv import GetParameters
+from rclpy.context import Context
+from rclpy.parameter import Parameter
 from ros_helpers import SECOND_NS, TIMEOUT, Driver, Peer, node_in_thread, stamp_of, standing
 from sensor_msgs.msg import Imu
 
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.ros.node import CompensationNode
 from thermo_comp.ros.round_trip import NodeProcess, lossless
+from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 
@@ -174,3 +182,107 @@ def test_a_reload_keeps_the_thermal_state(peer: Peer, tmp_path: Path) -> None:
     assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
     # At 20 degC, the reference, the bias function is 0 whatever its slope.
     assert {flow.bias(index) for index in range(len(stamps))} == {1.0}
+
+
+class _Stop(BaseException):
+    """What is raised at a line."""
+
+
+def raising_at(number: int, call: Callable[[], Any]) -> bool:
+    """Call, and raise at the so-manieth line of this package; tell whether there was one."""
+    n_lines = 0
+
+    def trace(frame: FrameType, event: str, _: Any) -> Any:
+        nonlocal n_lines
+        if event == 'line':
+            n_lines += 1
+            if n_lines == number:
+                raise _Stop
+        return trace if '/thermo_comp/' in frame.f_code.co_filename else None
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        call()
+    except _Stop:
+        return True
+    finally:
+        sys.settrace(before)
+    return False
+
+
+def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path: Path) -> None:
+    # WHY: a calibration was refused, the answer said so, and its bias was published all the same.
+    first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
+    save_calibration(of_bias(1.0), first)
+    # Another detector, so that everything is built anew.
+    save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
+    context = Context()
+    rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)
+    node = CompensationNode(context)
+    undisturbed = Compensator(of_bias(1.0))
+    changes = [
+        Parameter('calibration_file', value=str(second)),
+        Parameter('frame_id', value='body'),
+        Parameter('transition_time', value=5.0),
+        Parameter('stuck_timeout', value=3.0),
+        Parameter('diagnostics_period', value=2.0),
+    ]
+    try:
+        new = node._prepare(changes)
+        values = {one.name: node.node.get_parameter(one.name).value for one in changes}
+        running = node._relay.running
+        number, k = 0, 0
+        while True:
+            number += 1
+            was_raised = raising_at(number, lambda: node._set(changes, new))
+            if not was_raised:
+                break
+            assert node._relay.running is running
+            assert {name: node.node.get_parameter(name).value for name in values} == values
+            assert node._loop._period_ns == SECOND_NS
+            for _ in range(3):
+                for one in (undisturbed, running.compensator):
+                    if k % 10 == 0:
+                        one.push('board', START_NS + k * CYCLE_NS, 20.0 + 1e-3 * k)
+                        one.push('case', START_NS + k * CYCLE_NS, 20.0 + 2e-3 * k)
+                sample = START_NS + k * CYCLE_NS, *standing(k)
+                assert running.compensator.process(*sample) == undisturbed.process(*sample)
+                k += 1
+        # Each line of what is built, exchanged and set.
+        assert number > 150
+        assert {name: node.node.get_parameter(name).value for name in values} == {
+            one.name: one.value for one in changes
+        }
+        sample = START_NS + k * CYCLE_NS, *standing(k)
+        force = node._compensator.process(*sample)
+        assert force is not None
+        assert force[0] == pytest.approx((standing(k)[0] - 2.0) / K, abs=1e-12)
+        assert node._relay.running.config.frame_id == 'body'
+        assert node._loop._period_ns == 2 * SECOND_NS
+    finally:
+        node.close()
+        context.try_shutdown()
+
+
+def test_a_calibration_that_cannot_be_applied_changes_nothing(peer: Peer, tmp_path: Path) -> None:
+    # WHY: a lag of 1e-300 s was refused after the new bias had been taken into use.
+    first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
+    save_calibration(of_bias(1.0), first)
+    text = dump_calibration(of_bias(77.0))
+    second.write_text(text.replace('lag_s: 600.0', 'lag_s: 1.0e-300', 1))
+    with node_in_thread(*lossless(), '-p', f'calibration_file:={first}'):
+        flow = Flow(peer)
+        flow.more(50)
+        (result,) = peer.set_parameters(calibration_file=str(second))
+        assert not result.successful
+        assert result.reason.startswith(f'{second}: ')
+        flow.more(50)
+        (parameter,) = peer.call(
+            GetParameters,
+            'thermo_comp/get_parameters',
+            GetParameters.Request(names=['calibration_file']),
+        ).values
+        assert parameter.string_value == str(first)
+        flow.stop()
+    assert {flow.bias(index) for index in range(len(flow.heard))} == {1.0}

@@ -8,11 +8,13 @@ The suite tries each a few times; `make nightly` ten thousand times.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,8 @@ from hypothesis import strategies as st
 from thermo_comp.errors import CalibrationError
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
+from thermo_comp.online.trial import is_sound_sample, tried
+from thermo_comp.quantities import QUANTITIES
 from thermo_comp.unit.calibration import Calibration, RegimeSet
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.functions import Polynomial
@@ -83,6 +87,131 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place: Any, value: Any
         assert refusal.key or 'not valid YAML' in text or 'nested deeper' in text, text
         if refusal.key:
             assert refusal.key.split('.')[0].split('[')[0] in TREE, text
+
+
+EXAMPLE = Path(__file__).parents[1] / 'config' / 'calibration.example.yaml'
+TREES = (TREE, yaml.safe_load(dump_calibration(unit())), yaml.safe_load(EXAMPLE.read_text()))
+#: Every number and text of them, and every list of numbers.
+EDITS = [(k, place) for k, tree in enumerate(TREES) for place in leaves(tree)]
+magnitudes = st.builds(
+    lambda sign, digits, power: sign * digits * 10.0**power,
+    st.sampled_from([1.0, -1.0]),
+    st.floats(1.0, 9.99),
+    st.integers(-308, 307),
+)
+#: The bounds themselves, and what is next to them.
+edges = st.sampled_from(
+    [
+        near
+        for one in QUANTITIES.values()
+        for bound in (one.above, one.at_least, one.nil_or, one.below, one.at_most)
+        if bound is not None
+        for near in (bound, -bound, bound * (1 - 1e-12), bound * (1 + 1e-12))
+    ]
+)
+factors = st.integers(-60, 60).map(lambda power: 2.0**power)
+
+
+class Edited(dict[str, Any]):
+    """A calibration file with some values changed, of which only these are shown."""
+
+    edits: tuple[Any, ...] = ()
+
+    def __repr__(self) -> str:
+        return f'{self.get("unit")!r:.40} with {self.edits}'
+
+
+@st.composite
+def edited(draw: st.DrawFn) -> Edited:
+    """Change one to three values of a calibration file, by any magnitude."""
+    which = draw(st.sampled_from(range(len(TREES))))
+    tree = Edited(json.loads(json.dumps(TREES[which])))
+    own = [place for k, place in EDITS if k == which]
+    places = draw(st.lists(st.sampled_from(own), min_size=1, max_size=3))
+    for *way, last in places:
+        branch = tree
+        try:
+            for key in way:
+                branch = branch[key]
+            value = branch[last]
+        except (KeyError, IndexError, TypeError):
+            continue  # the edit before has taken its place away
+        if isinstance(value, str) and last in ('factor', 'rest'):
+            shape = np.frombuffer(base64.b64decode(value), '<f4')
+            factor = draw(factors)
+            with np.errstate(over='ignore'):
+                scaled = (shape * np.float32(factor)).astype('<f4')
+            branch[last] = base64.b64encode(scaled.tobytes()).decode()
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            branch[last] = draw(magnitudes | edges | factors.map(lambda f, v=value: f * v))
+        elif isinstance(value, list) and value and isinstance(value[0], float):
+            branch[last] = draw(
+                st.permutations(value)
+                | st.lists(magnitudes | edges, max_size=20)
+                | factors.map(lambda f, v=value: [f * one for one in v])
+            )
+        else:
+            branch[last] = draw(anything | edges)
+        tree.edits += ((*way, last), branch[last])
+    return tree
+
+
+def whole_range(of: Calibration) -> list[tuple[str, int, Any]]:
+    """List messages that lead through and beyond all temperatures of a calibration."""
+    edges_c = [edge for one in of.regime_sets() for edge in one.temperature_range_c]
+    middle = of.reference_temperature_c
+    temperatures = [middle, middle + 0.5, *edges_c, middle, -273.0, 999.0, middle, middle]
+    steps_s = [1.0, 5.0, 20.0, 60.0, 1.0, 400.0, 60.0, 5.0, 90_000.0, 2.0, 0.5]
+    largest = of.unit.full_scale * (1.0 - 1e-9)
+    sent: list[tuple[str, int, Any]] = []
+    now_ns = START_NS
+    for k, (celsius, step_s) in enumerate(zip(temperatures, steps_s, strict=True)):
+        for m in range(6):
+            # Six readings on the way, so that none is taken for a jump.
+            now_ns += round(step_s / 6.0 * 1e9)
+            sent.append(('board', now_ns, celsius))
+            sent += [(name, now_ns, celsius + 0.1 * m) for name in of.sensors]
+            sign = (-1.0) ** m
+            for size in (1e-3 * largest, largest):
+                now_ns += 1_000_000
+                row = [sign * size, size * (-1.0) ** k, (0.5 + 0.07 * m) * size]
+                sent.append(('counts', now_ns, tuple(row)))
+    return sent
+
+
+@settings(deadline=None, max_examples=max(300, settings.default.max_examples))
+@given(edited())
+def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree: Edited) -> None:
+    # WHY: a delta of 1e300, a lag of 1e-300 s, a weight of 1e160 were accepted; what came of them
+    # was not finite, or no covariance.
+    content = yaml.dump(dict(tree), Dumper=yaml.CSafeDumper, allow_unicode=True).encode()
+    try:
+        of = parse_calibration(content, 'unit.yaml')
+    except CalibrationError:
+        return
+    tried(of)
+    config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+    compensator = Compensator(of, config)
+    n_sound = 0
+    for topic, stamp_ns, value in whole_range(of):
+        if topic != 'counts':
+            compensator.push(topic, stamp_ns, value)
+            continue
+        row = compensator.process(stamp_ns, *value)
+        if row is None:
+            continue
+        n_sound += 1
+        assert is_sound_sample(row)
+        if compensator.corrects_rate:
+            rate = compensator.correct_rate(stamp_ns, 1.0, -2.0, 30.0)
+            assert all(map(math.isfinite, rate))
+            assert min(rate[3:]) > 0.0
+    counters = compensator.counters
+    assert counters.n_unsound == 0
+    # Faster than conversions can be is the only reason that is left, and stale temperatures.
+    assert n_sound or counters.n_too_fast or counters.n_stale or counters.n_no_temperature
+    status = compensator.status()
+    assert all(map(math.isfinite, status.state))
 
 
 numbers = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from(

@@ -18,7 +18,7 @@ import pytest
 from conftest import ROOT, Cli
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording.growing import growing_blocks, numbered_bags
+from thermo_comp.recording.growing import growing_blocks, leftovers, numbered_bags
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
@@ -116,6 +116,20 @@ def check_fit(result: dict[str, Any], cli: Cli, folder: Path) -> None:
     )
 
 
+CRASH = """
+import os, signal, sys
+from pathlib import Path
+from thermo_comp.recording.growing import PositionBags
+from thermo_comp.recording.reader import open_recording
+bags = PositionBags(Path(sys.argv[2]), 'lab-7')
+with open_recording(Path(sys.argv[1])) as reader:
+    for block in reader.blocks(raw=True):
+        bags.add(block, reader.info)
+bags.release(int(sys.argv[3]))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
 class TestGrowing:
     def test_every_message_comes_once_however_the_file_grows(
         self, session: Path, tmp_path: Path
@@ -188,6 +202,39 @@ class TestGrowing:
         assert (
             'cannot be written' in cli('record', session, '-o', tmp_path / 'file', code=1).stderr
         )
+
+
+def test_what_a_crash_has_left_is_told_and_finished(
+    session: Path, cli: Cli, tmp_path: Path
+) -> None:
+    # WHY: the hours of a run that was killed lay in a hidden file that nobody knew of.
+    bags = tmp_path / 'bags'
+    killed = subprocess.run(
+        [sys.executable, '-c', CRASH, session, bags, str(START_NS + 200 * 10**9)], check=False
+    )
+    assert killed.returncode == -signal.SIGKILL
+    (left,) = leftovers(bags)
+    assert leftovers(bags) == {left: 1}
+    arguments = ('record', session, '--positions', '1', '--soak', '80s', '-o', bags)
+    told = cli(*arguments, code=None).stderr
+    assert f'{left} was left by a run that did not end in order, as bag 1; --finish' in told
+    assert left.exists()
+    for one in numbered_bags(bags):
+        one.unlink()
+    before = contents([left])
+    cli(*arguments, '--finish', code=None)
+    assert leftovers(bags) == {}
+    first = bags / '01.mcap'
+    assert contents([first]) == before
+    with open_recording(first, require=()) as reader:
+        assert reader.info.truncated is None
+        assert reader.info.metadata['serial'] == 'lab-7'
+    # What none can read stays where it is.
+    broken = bags / '.07.999999999-abcdef.partial.mcap'
+    broken.write_bytes(b'no bag')
+    said = cli(*arguments, '--finish', code=None).stderr
+    assert 'no bag can be made of it' in said
+    assert broken.exists()
 
 
 class Recording:

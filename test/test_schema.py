@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermo_comp.unit.schema import Bounds, SchemaError, build, plain
+from thermo_comp.quantities import Bounds
+from thermo_comp.unit.schema import SchemaError, build, plain
 
 
 @dataclass(frozen=True)

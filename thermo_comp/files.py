@@ -96,9 +96,15 @@ def open_regular(path: str | Path) -> BinaryIO:
         raise
 
 
-def read_bounded(path: str | Path, limit: int) -> bytes:
-    """Read a regular file; ValueError if it is larger than `limit` bytes, OSError as above."""
+def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> bytes:
+    """
+    Read a regular file; ValueError if it is larger than `limit` bytes, PermissionError if what was
+    opened lies outside of the folder `within`, OSError as above.
+    """
     with open_regular(path) as file:
+        # Asked of the file itself: links may be exchanged between a look and the opening.
+        if within is not None and not _opened(file).is_relative_to(within):
+            raise PermissionError(errno.EPERM, 'outside of its folder', str(path))
         size = os.fstat(file.fileno()).st_size
         if size > limit:
             raise ValueError(f'{size} bytes, at most {limit} are accepted')
@@ -106,6 +112,10 @@ def read_bounded(path: str | Path, limit: int) -> bytes:
     if len(content) > limit:
         raise ValueError(f'more than {limit} bytes')
     return content
+
+
+def _opened(file: BinaryIO) -> Path:
+    return Path(f'/proc/self/fd/{file.fileno()}').readlink()
 
 
 def check_output(

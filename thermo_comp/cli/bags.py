@@ -78,9 +78,11 @@ def info(
 
 
 def _calibration(out: Output, path: Path) -> None:
+    from ..online.trial import tried
     from ..unit.calibration_file import load_calibration
 
     calibration = load_calibration(path)
+    tried(calibration, path)
     unit, provenance = calibration.unit, calibration.provenance
     out.line(f'{path}: unit {unit.serial}, {unit.input} up to {unit.full_scale:g}')
     out.line(

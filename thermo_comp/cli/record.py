@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from ..errors import ThermoCompError
+from ..errors import RecordingError, ThermoCompError
 from ..text import counted
 from ..unit.gravity import STANDARD_GRAVITY, spoken
 from . import options
@@ -41,6 +41,7 @@ def record(
     serial: str | None = option(
         'Serial of the unit, for the bags.', callback=options.check_serial
     ),
+    finish: bool = option('Make bags of what a run that crashed has left, first.', False),
     offset: float | None = options.OFFSET,
     topics: Any = options.reading,
     out: Output = options.out,
@@ -63,6 +64,7 @@ def record(
     from ..ros.process import SignalWatch
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)
+    _tell_leftovers(out, output, finish)
     known = numbered_bags(output)
     # Each bag that is there is a position, and says whose it is.
     with out.progress('reading what is there', total=len(known)) as done:
@@ -139,6 +141,25 @@ def record(
         misalignment_sd_rad=skew,
         **picked(account, 'n_good is_complete worst_sd_g thermometers next_up findings'),
     )
+
+
+def _tell_leftovers(out: Output, folder: Path, is_finishing: bool) -> None:
+    """Say what crashes have left in a folder, or make bags of it."""
+    from ..recording import growing
+
+    for path, number in growing.leftovers(folder).items():
+        if not is_finishing:
+            out.note(
+                f'{path} was left by a run that did not end in order, as bag {number}; '
+                '--finish makes a bag of it'
+            )
+            continue
+        try:
+            made = growing.finish(path, number)
+        except RecordingError as error:
+            out.note(f'{error}: no bag can be made of it')
+        else:
+            out.note(f'{made or "nothing"} is what was in {path.name}')
 
 
 def _duration(text: str) -> float:

@@ -62,7 +62,13 @@ def read_autopilot(
     instance by default; ArduPilot's are counted from 0: the old type ``IMU2`` is 1.
     """
     read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
-    imus, baros, compensated = read(path)
+    try:
+        # What no integer can hold is found later, among the stamps.
+        with np.errstate(invalid='ignore', over='ignore'):
+            imus, baros, compensated = read(path)
+    except (ArithmeticError, LookupError, TypeError, ValueError) as failure:
+        # Formats that contradict their messages, in whichever way.
+        raise RecordingError(f'damaged: {failure}', path=path) from failure
     why = compensated.get(min(imus, default=0) if imu is None else imu)
     if why and not allow_compensated:
         raise RecordingError(why, path=path)

@@ -18,10 +18,11 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..plain_yaml import read_plain_yaml
+from ..quantities import Bounds
 from ..recording.columns import Readings
 from ..recording.topics import is_thermometer
 from ..typing import Floats
-from ..unit.schema import Bounds, Positive, SchemaError, build
+from ..unit.schema import Positive, SchemaError, build
 from .log import NO_STAMP, ForeignLog, Unit, believed_unit, find_stillness, thin
 from .table import STAMP_EXPONENTS, Column, Format, Stamp, read_parquet, read_text
 

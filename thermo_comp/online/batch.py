@@ -18,7 +18,7 @@ import numpy as np
 from ..recording.columns import Block
 from ..thermal.reading_queue import DISORDER_NS, NEVER_NS, PENDING_LIMIT
 from ..typing import Bools, Floats, Ints, Stamps
-from ..unit.correction import Correction
+from ..unit.correction import Correction, is_sound
 from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
@@ -162,33 +162,55 @@ def _apply(
 ) -> CompensatedBlock:
     """Correct the samples of segments, and keep those that are published."""
     correction, of_rate = compensator.thermal.correction, compensator.thermal.rate_correction
+    line = rate_line = np.empty((21, 0))
+    if segments:
+        line = _line(correction, segments, slice(9))
+        is_good = is_sound(line)
+        if of_rate is not None:
+            rate_line = _line(of_rate, segments, slice(9, None))
+            is_good &= is_sound(rate_line)
+        if not is_good.all():
+            counts = [count for _, count in segments]
+            compensator.counters.n_unsound += int(np.sum(counts, where=~is_good))
+            index = index[np.repeat(is_good, counts)]
+            segments = [one for one, good in zip(segments, is_good, strict=True) if good]
+            line, rate_line = line[:, is_good], rate_line[:, is_good[: rate_line.shape[1]]]
     if len(index) < len(stamps):
         stamps, samples = stamps[index], samples[index]
         angular_rate = None if angular_rate is None else angular_rate[index]
     force = rate = np.empty((12, 0))
     has_rate = angular_rate is not None and of_rate is not None
     if segments:
-        force = _corrected(correction, segments, stamps, samples, False)
+        force = _corrected(line, segments, stamps, samples, correction.misalignment)
         is_kept = _judge(compensator, segments, stamps, samples, force)
         if angular_rate is not None and of_rate is not None:
-            rate = _corrected(of_rate, segments, stamps, angular_rate, True)[:, is_kept]
+            rate = _corrected(rate_line, segments, stamps, angular_rate)[:, is_kept]
         if not is_kept.all():
             index, stamps, force = index[is_kept], stamps[is_kept], force[:, is_kept]
     rates = (rate[:3].T, rate[3:6].T) if has_rate else ()
     return CompensatedBlock(index, stamps, force[:3].T, force[3:].T, *rates)
 
 
+def _line(correction: Correction, segments: Segments, part: slice) -> Floats:
+    """Evaluate the lines of segments, with their part of what changes slowly, (21, n)."""
+    each = [segment for segment, _ in segments]
+    start, end, slow = (np.array([one[at] for one in each]).T for at in (4, 5, 6))
+    excess = np.array([one.noise_excess for one in each])
+    return correction.line(start, end, slow[part], excess)
+
+
 def _corrected(
-    correction: Correction, segments: Segments, stamps: Stamps, samples: Floats, is_rate: bool
+    table: Floats,
+    segments: Segments,
+    stamps: Stamps,
+    samples: Floats,
+    misalignment: tuple[float, ...] | None = None,
 ) -> Floats:
     """Give force and row-major covariance (12, n) of segments; or rates and variances (6, n)."""
     each = [segment for segment, _ in segments]
-    start, end, slow = (np.array([one[part] for one in each]).T for part in (4, 5, 6))
-    excess = np.array([one.noise_excess for one in each])
-    table = correction.line(start, end, slow[9:] if is_rate else slow[:9], excess)
     start_ns = np.array([one.start_ns for one in each], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
-    order = range(6) if is_rate else _COLUMNS
+    order = range(6) if misalignment is None else _COLUMNS
     n = len(stamps)
     result = np.empty((len(order), n))
     # What is not finite is corrected like the rest; whoever asked leaves it out.
@@ -203,8 +225,8 @@ def _corrected(
             x, y, z = samples[begin:stop].T
             values = (
                 corrected_rate(line, dt, x, y, z)
-                if is_rate
-                else corrected(line, correction.misalignment, dt, x, y, z)
+                if misalignment is None
+                else corrected(line, misalignment, dt, x, y, z)
             )
             for column, place in zip(result, order, strict=True):
                 column[begin:stop] = values[place]

@@ -7,7 +7,8 @@ conversions can, and |f| while the platform stands, which must be gravity.
 A converter with noise does not give three numbers to the bit for seconds; three exact zeros are a
 dead wire. A count is charge per cycle, so at another rate it is of another scale. A calibration
 that has aged, or of another unit, misses gravity by more than its own uncertainty in windows of a
-second, or longer, which are still: scatter as the sensor's, mean as in the window before.
+second, or longer, which are still: scatter as the sensor's, mean as in the window before. What
+steps away at rest, and rests there, is no motion: it is judged within a second.
 """
 
 from __future__ import annotations
@@ -46,6 +47,8 @@ MEMORY_WINDOWS: Final = 30.0
 #: So many still windows running refute a calibration; so many restore the trust in it.
 REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
+#: Samples that lie off, as long as this, after one at rest from which they stepped [ns].
+STEP_NS: Final = 300_000_000
 #: Beyond the tolerance, and beyond so many of its own standard deviations.
 REFUTING_SIGMAS: Final = 5.0
 
@@ -149,6 +152,10 @@ class GravityCheck:
         self._n_alike = 0
         self._is_against = False
         self._forces: list[Sequence[float]] = []
+        #: What came since |f| stepped away at rest: samples, and the stamp of the first.
+        self._off: list[Sequence[float]] = []
+        self._off_ns = 0
+        self._is_resting = False  # the last sample was as the still window before it
         self._begin_ns = self._last_ns = 0
         self._last_mean: list[float] | None = None
         self._weight = 0.0
@@ -162,6 +169,7 @@ class GravityCheck:
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
         """Take a sample, its covariance xx .. zz, and the noise of one in the trace [m^2/s^4]."""
+        self._watch_step(stamp_ns, force, covariance, noise)
         if (
             not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS
             or not 0 <= stamp_ns - self._last_ns < 3 * WINDOW_NS
@@ -175,6 +183,39 @@ class GravityCheck:
         if is_long and len(self._forces) >= SMALLEST_WINDOW:
             self._close(covariance, noise)
             self._forces = []
+
+    def _watch_step(
+        self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
+    ) -> None:
+        """Refute, before windows can, what has stepped away at rest and rests there."""
+        rests = self.result and self.result.is_still and self._last_mean
+        if self.is_refuted or not (self._off or rests):
+            self._off, self._is_resting = [], False
+            return
+        # Of two samples, as of means.
+        near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
+        was_resting, reference = (
+            self._is_resting,
+            self._off[0] if self._off else self._last_mean or (),
+        )
+        is_near = max(abs(a - b) for a, b in zip(force, reference, strict=True)) <= near
+        variance = max(variance_along(force, covariance), noise / 3.0)
+        miss = math.hypot(*force) - self.gravity
+        is_off = abs(miss) > self._tolerance + REFUTING_SIGMAS * math.sqrt(variance)
+        self._is_resting = is_near and not self._off
+        if not is_off or not (is_near if self._off else was_resting):
+            self._off = []
+            return
+        if not self._off:
+            self._off_ns = stamp_ns
+        self._off.append(force)
+        if stamp_ns - self._off_ns >= STEP_NS:
+            self._is_against, self._n_alike, self.is_refuted = True, REFUTING_WINDOWS, True
+            mean = [math.fsum(values) / len(self._off) for values in zip(*self._off, strict=True)]
+            miss, n = math.hypot(*mean) - self.gravity, self.result.n_windows if self.result else 0
+            self._weight, self._last_mean, self._forces = 0.0, mean, []
+            self.result = GravityResidual(miss, math.sqrt(variance), n, True)
+            self._off = []
 
     def _close(self, covariance: Sequence[float], noise_variance: float) -> None:
         n = len(self._forces)
@@ -197,7 +238,9 @@ class GravityCheck:
         # The calibration's error is common to the samples of a window, their noise averages out.
         noise = noise_variance / 3.0
         variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n
-        self._judge(abs(size - self.gravity), math.sqrt(variance))
+        if self._judge(abs(size - self.gravity), math.sqrt(variance)):
+            # What was before says nothing of what is.
+            self._weight = 0.0
         decay = 1.0 - 1.0 / MEMORY_WINDOWS
         self._weight = self._weight * decay + 1.0
         gain = 1.0 / self._weight
@@ -206,9 +249,12 @@ class GravityCheck:
         sd = math.sqrt(sd**2 + gain * (variance - sd**2))
         self.result = GravityResidual(residual, sd, n + 1, is_still)
 
-    def _judge(self, miss: float, sd: float) -> None:
+    def _judge(self, miss: float, sd: float) -> bool:
+        """Count windows that agree on a miss; tell whether this one does not with the last."""
+        was_against = self._is_against
         is_against = miss > self._tolerance + REFUTING_SIGMAS * sd
         self._n_alike = self._n_alike + 1 if is_against == self._is_against else 1
         self._is_against = is_against
         if self._n_alike >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
             self.is_refuted = is_against
+        return is_against != was_against

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from copy import copy
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
@@ -20,9 +21,9 @@ from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from ..typing import Floats
 from ..unit.calibration import Calibration
-from ..unit.correction import Excess
+from ..unit.correction import Excess, is_sound
 from .checks import GravityCheck, StuckCheck
-from .segments import EVER_NS, SEGMENT_NS, ThermalSide
+from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
 
 #: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
@@ -75,12 +76,15 @@ class CompensatorStatus:
 class Compensator:
     """Corrects one unit's samples, one by one."""
 
-    def __init__(self, calibration: Calibration, config: CompensatorConfig | None = None) -> None:
+    def __init__(
+        self, calibration: Calibration | Model, config: CompensatorConfig | None = None
+    ) -> None:
         self.config = config or CompensatorConfig()
         self.counters = Counters()
         self.stuck = StuckCheck(self.config.stuck_timeout_s)
-        self.thermal = ThermalSide(calibration, self.config, self.counters)
-        self._use(calibration)
+        model = calibration if isinstance(calibration, Model) else Model(calibration)
+        self.thermal = ThermalSide(model, self.config, self.counters)
+        self._use(model.calibration)
         self.last_ns = self.event_ns = EVER_NS
         #: Of the present segment, as `Correction.line` gives it; empty where no rate is corrected.
         self.rate_line: list[float] = []
@@ -174,10 +178,18 @@ class Compensator:
         start_ns, is_new, is_too_fast, excess, start, end, slow = segment
         self.event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
         correction = thermal.correction
-        line = correction.line(start, end, slow[:9], excess).tolist()
+        line = correction.line(start, end, slow[:9], excess)
+        is_good = is_sound(line)
         if thermal.rate_correction is not None:
-            self.rate_line = thermal.rate_correction.line(start, end, slow[9:], excess).tolist()
-        self._segment = (start_ns, line, correction.misalignment)
+            rate_line = thermal.rate_correction.line(start, end, slow[9:], excess)
+            is_good &= is_sound(rate_line)
+            self.rate_line = rate_line.tolist()
+        if not is_good:
+            # Nothing that is not finite goes out, whatever led to it. Each sample comes back here.
+            counters.n_unsound += 1
+            self.event_ns, self.last_ns = EVER_NS, stamp_ns
+            return None
+        self._segment = (start_ns, line.tolist(), correction.misalignment)
         if not is_new:
             return self.process(stamp_ns, x, y, z)
         self.is_refusing = is_too_fast
@@ -223,18 +235,31 @@ class Compensator:
 
     def swap(self, calibration: Calibration) -> None:
         """Take over another calibration between two samples."""
-        # Thermometers, regime and memory go on where the new one reads and remembers the same.
-        self.thermal.swap(calibration, self.now_ns)
-        self._use(calibration)
-        self.event_ns = EVER_NS
+        vars(self).update(vars(self.successor(Model(calibration), self.config)))
 
     def reconfigure(self, config: CompensatorConfig) -> None:
         """Take over other settings between two samples."""
+        vars(self).update(vars(self.successor(self.thermal.model, config)))
+
+    def successor(self, model: Model, config: CompensatorConfig) -> Compensator:
+        """
+        Make one that goes on from the last sample with another model or other settings.
+
+        Thermometers, regime and memory go on where the new one reads and remembers the same.
+        Nothing here changes, so that whatever fails meanwhile has not happened; of the two only
+        one may go on.
+        """
+        new = copy(self)
+        new.take_over(model, config)
+        return new
+
+    def take_over(self, model: Model, config: CompensatorConfig) -> None:
+        """Go on as a successor does; whose copy this is stays as it was."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckCheck(config.stuck_timeout_s)
-        self.config = config
-        self.gravity = self._gravity_check()
-        self.thermal.reconfigure(config, self.now_ns)
+        self.config, self.thermal = config, copy(self.thermal)
+        self.thermal.take_over(model, config, self.now_ns)
+        self._use(model.calibration)
         self.event_ns = EVER_NS
 
     @property

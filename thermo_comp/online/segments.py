@@ -12,6 +12,7 @@ slowly is evaluated at the first segment in each ten seconds of the stamps.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from math import sqrt
 from typing import Final, NamedTuple
@@ -50,32 +51,39 @@ class Segment(NamedTuple):
     slow: list[float]
 
 
-class ThermalSide:
-    """What stream and batch share: readings, thermal state, the gate they open for samples."""
+class Model:
+    """What a calibration says, ready to be evaluated; nothing of it changes any more."""
 
-    def __init__(
-        self, calibration: Calibration, config: CompensatorConfig, counters: Counters
-    ) -> None:
-        self.counters = counters
-        self.queue = ReadingQueue()
-        self.flags: list[tuple[int, bool]] = []
-        self._n_applied = 0
-        self._use(calibration, config)
-        self.tracker = self._new_tracker()
-
-    def _use(self, calibration: Calibration, config: CompensatorConfig) -> None:
-        self.config = config
+    def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
-        self._needs_temperature = calibration.needs_temperature
+        self.needs_temperature = calibration.needs_temperature
         self.correction = Correction(calibration)
-        self._uncertainty = [SlowUncertainty(calibration, self.correction)]
+        self.uncertainty = [SlowUncertainty(calibration, self.correction)]
         #: That of the angular rate, over the same thermal state; None where it passes as it is.
         self.rate_correction: Correction | None = None
         if calibration.gyroscope is not None:
             triad = rate_triad(calibration)
             self.rate_correction = Correction(triad, self.correction.memory)
-            self._uncertainty.append(SlowUncertainty(triad, self.rate_correction))
+            self.uncertainty.append(SlowUncertainty(triad, self.rate_correction))
         self.inputs = (BOARD_INPUT, *calibration.sensors)
+
+
+class ThermalSide:
+    """What stream and batch share: readings, thermal state, the gate they open for samples."""
+
+    def __init__(self, model: Model, config: CompensatorConfig, counters: Counters) -> None:
+        self.counters = counters
+        self.queue = ReadingQueue()
+        self.flags: list[tuple[int, bool]] = []
+        self._n_applied = 0
+        self._use(model, config)
+        self.tracker = self._new_tracker()
+
+    def _use(self, model: Model, config: CompensatorConfig) -> None:
+        self.config = config
+        self.model, self.calibration = model, model.calibration
+        self.correction, self.rate_correction = model.correction, model.rate_correction
+        self.inputs = model.inputs
         self._forget_rate()
 
     def _forget_rate(self) -> None:
@@ -97,26 +105,25 @@ class ThermalSide:
         gentle_s = self.correction.gentle_transition(self.config.transition_time_s)
         return replace(self.config, transition_time_s=gentle_s), self.calibration.board_lag_s
 
-    def swap(self, calibration: Calibration, now_ns: int | None) -> None:
-        """Take over another calibration, as `Compensator.swap`."""
-        old = self.tracker
-        detector = self.calibration.detector
-        self._use(calibration, self.config)
-        self.queue.keep(lambda entry: entry[2] in self.inputs)
-        if calibration.detector == detector and self.correction.memory == old.spec:
-            old.reconfigure(*self._tracker_config(), now_ns)
+    def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
+        """Go on with another model or configuration; whose copy this is stays as it was."""
+        before, old, self.config = self.model, self.tracker, config
+        if model is before:
+            self._forget_segment()
+        else:
+            self._use(model, config)
+            self.queue = copy(self.queue)
+            self.queue.keep(lambda entry: entry[2] in self.inputs)
+        is_same = self.calibration.detector == before.calibration.detector
+        if is_same and self.correction.memory == old.spec:
+            self.tracker = copy(old)
+            self.tracker.reconfigure(*self._tracker_config(), now_ns)
             return
         self.tracker = self._new_tracker()
         # It starts from the temperatures just seen, so that no sample is lost.
         for name, sensor in old.thermometers.items():
             if name in self.inputs and sensor.stamp_ns is not None:
                 self.tracker.read(name, sensor.stamp_ns, sensor.temperature)
-
-    def reconfigure(self, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Take over other settings."""
-        self.config = config
-        self._forget_segment()
-        self.tracker.reconfigure(*self._tracker_config(), now_ns)
 
     def reset(self) -> None:
         """Forget temperatures, regime and rate; what waits, and counters, stay."""
@@ -155,7 +162,7 @@ class ThermalSide:
     @property
     def is_unmeasured(self) -> bool:
         """Whether constants are applied to a unit whose temperature nobody has measured."""
-        return not self._needs_temperature and self.tracker.board.stamp_ns is None
+        return not self.model.needs_temperature and self.tracker.board.stamp_ns is None
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
         """Thermal state at a stamp, as `ThermalTracker.sample` gives it."""
@@ -168,7 +175,7 @@ class ThermalSide:
     @property
     def fresh_until_ns(self) -> int:
         """The last stamp at which the board temperature is not too old; before any without one."""
-        if not self._needs_temperature:
+        if not self.model.needs_temperature:
             return NEVER_NS
         board_ns = self.tracker.board.stamp_ns
         timeout_ns = int(self.config.temperature_timeout_s * 1e9)
@@ -208,5 +215,5 @@ class ThermalSide:
             if self.is_unmeasured:
                 # What the weights leave open counts as at the usual distance.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
-            self._slow = [v for one in self._uncertainty for v in one.at(end_state, shares)]
+            self._slow = [v for one in self.model.uncertainty for v in one.at(end_state, shares)]
         return self._slow

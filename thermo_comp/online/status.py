@@ -50,6 +50,7 @@ class Dropped:
     n_stuck: int = 0
     n_too_fast: int = 0
     n_refuted: int = 0
+    n_unsound: int = 0  # nothing finite can be made of them
 
 
 DROPPED = tuple(one.name for one in fields(Dropped))

@@ -10,6 +10,7 @@ a little late, so the newest messages are held back.
 
 from __future__ import annotations
 
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -28,6 +29,8 @@ _USUAL = Topics()
 _CHUNK_BYTES = 1 << 17  # little is lost with a process that is killed: half a minute at 100 Hz
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
+#: The hidden name of a bag that is being written: its number, the process.
+_LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
 _SHARE = 0.2  # a look may take this part of the time
 
 #: What has come: a block with its serialized messages, and from which bag.
@@ -83,12 +86,42 @@ def numbered_bags(folder: Path) -> list[Path]:
     return [found[number] for number in sorted(found)]
 
 
+def leftovers(folder: Path) -> dict[Path, int]:
+    """List the bags that runs which ended in a crash have left, with the numbers they had."""
+    found: dict[Path, int] = {}
+    for path in sorted(folder.glob('.*.partial.mcap')):
+        named = _LEFT.fullmatch(path.name)
+        if named and not Path(f'/proc/{named["process"]}').exists():
+            found[path] = int(named['number'])
+    return found
+
+
+def finish(path: Path, number: int) -> Path | None:
+    """
+    Make a bag, numbered so or by the next free number, of what a crash has left, which then goes;
+    None where no message was in it. RecordingError where nothing can be read of it.
+    """
+    with open_recording(path, require=()) as reader:
+        numbers = {int(one.stem) for one in numbered_bags(path.parent)}
+        number = max(numbers) + 1 if number in numbers else number
+        bags = PositionBags(path.parent, None, number)
+        try:
+            for block in reader.blocks(raw=True):
+                bags.add(block, reader.info)
+                bags.release(_NEVER_NS)
+        finally:
+            bags.close()
+    path.unlink()
+    return bags.written[0] if bags.written else None
+
+
 class PositionBags:
     """Writes the bags; the next number is taken when its first message is written."""
 
-    def __init__(self, folder: Path, serial: str | None) -> None:
+    def __init__(self, folder: Path, serial: str | None, number: int | None = None) -> None:
         self._folder, self._serial = folder, serial
-        self._number = max((int(one.stem) for one in numbered_bags(folder)), default=0) + 1
+        last = max((int(one.stem) for one in numbered_bags(folder)), default=0)
+        self._number = number or last + 1
         check_output(folder / f'{self._number:02d}.mcap', MCAP)
         self._writer: BagWriter | None = None
         self._held: list[Block] = []

@@ -14,11 +14,12 @@ import numpy as np
 from ..errors import ThermoCompError
 from ..judging.verdicts import Verdict
 from ..plain_yaml import read_plain_yaml
+from ..quantities import Bounds
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
 from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states
-from ..unit.schema import Bounds, NotNegative, SchemaError, build
+from ..unit.schema import NotNegative, SchemaError, build
 from .evidence import Evidence
 from .html import number, rounded
 

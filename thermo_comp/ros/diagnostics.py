@@ -46,6 +46,7 @@ _RISEN = {
     'n_failures': (_ERROR, 'callbacks failed, see the log of the node'),
     'n_stuck': (_ERROR, 'samples stuck or all zero, dropped'),
     'n_too_fast': (_ERROR, 'samples too fast for their conversion cycle, dropped'),
+    'n_unsound': (_ERROR, 'samples of which nothing finite can be made, dropped'),
     'n_saturated': (_ERROR, 'samples saturated (+-{full_scale:g}), dropped'),
     'n_not_finite': (_WARN, 'samples not finite, dropped'),
     'n_out_of_order': (_WARN, 'samples out of order, dropped'),
@@ -67,9 +68,8 @@ Finding = tuple[int, str]  # level and text
 class Reporter:
     """Publishes the diagnostics of a node; logs when their level changes."""
 
-    def __init__(self, loop: WaitLoop, relay: Relay, compensator: Compensator) -> None:
-        self._loop, self._node = loop, loop.node
-        self._relay, self._compensator = relay, compensator
+    def __init__(self, loop: WaitLoop, relay: Relay) -> None:
+        self._loop, self._node, self._relay = loop, loop.node, relay
         self._publisher = loop.publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
         self._level = DiagnosticStatus.STALE
         self._n_publishers = 0
@@ -78,8 +78,13 @@ class Reporter:
         self._before = self._count()
         self._before_ns: int | None = None
 
-    def report(self, loaded: LoadedCalibration) -> None:
+    @property
+    def _compensator(self) -> Compensator:
+        return self._relay.running.compensator
+
+    def report(self) -> None:
         """Say how the compensation is doing now, and what has happened since the last time."""
+        loaded = self._relay.running.loaded
         self._count_lost()
         if self._compensator.counters.n_in != self._before['n_in']:
             self._last_samples = time.monotonic()
@@ -135,9 +140,12 @@ class Reporter:
         """Say what is wrong with those who send."""
         for k, one in enumerate(self._relay.inputs.values()):
             n_publishers, topic = one.count_publishers(), one.subscription.topic_name
-            if n_publishers > 1:
+            if n_publishers > 1 and one.is_contested:
                 text = f'{n_publishers} publishers on {topic}'
-                yield _ERROR, f'{text}, it is not used until one is left'
+                yield _ERROR, f'{text}, it is not used until one of them sends alone'
+            elif n_publishers > 1:
+                # One that was killed is known for some time yet.
+                yield _WARN, f'{n_publishers} publishers on {topic}, of which one sends'
             elif not n_publishers and (mismatch := _mismatch(self._node, one.subscription)):
                 level = _ERROR if k < 2 else _WARN
                 yield level, f'no messages of a publisher on {topic}: {mismatch}'
@@ -179,7 +187,7 @@ class Reporter:
             }
         densities, gyroscope = calibration.noise_density_m_s2_sqrt_hz, calibration.gyroscope
         values |= _of_axes('noise density {} [m/s^2/sqrt(Hz)]', densities)
-        last, thermal = self._relay.converter.last_result, self._compensator.thermal
+        last, thermal = self._relay.running.converter.last_result, self._compensator.thermal
         if last is not None:
             variances = last[3], last[6], last[8]
             bias_sd = thermal.bias_sd(thermal.correction, variances)

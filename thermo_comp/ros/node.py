@@ -13,6 +13,7 @@ import gc
 import os
 import sys
 from contextlib import suppress
+from functools import partial
 
 import rclpy
 from rcl_interfaces.msg import SetParametersResult
@@ -21,12 +22,13 @@ from rclpy.parameter import Parameter
 
 from ..errors import CalibrationError, ThermoCompError
 from ..online.compensator import Compensator
+from ..online.segments import Model
 from ..text import hold_standard_streams, one_line
 from . import parameters
 from .diagnostics import Reporter
 from .process import SignalWatch, use_profile
-from .reader import LoadedCalibration, Reader, read
-from .relay import INPUTS, Relay
+from .reader import LoadedCalibration, Reader, read_within
+from .relay import INPUTS, Relay, Running
 from .waitloop import WaitLoop, overrides
 
 NODE_NAME = 'thermo_comp'
@@ -35,6 +37,9 @@ NODE_NAME = 'thermo_comp'
 #: after the last ones [s]: it saves a third of the CPU time at 10 kHz. At 5 kHz it would make each
 #: wait for longer than it takes to relay it.
 REST_S = 0.2e-3
+
+#: After a signal the process ends within this time, whatever hangs [s].
+ENDING_S = 1.8
 
 USAGE = """\
 usage: thermo_comp_node --ros-args -p calibration_file:=PATH [-p NAME:=VALUE ...]
@@ -67,17 +72,16 @@ class CompensationNode:
         self._say_calibration()
 
     def _build(self) -> None:
-        self._log, self._config = self.node.get_logger(), parameters.declare(self.node)
-        config = self._config
-        self._loaded = read(config.calibration_file, config.calibration_directory)
-        self._compensator = Compensator(self._loaded.calibration, config.compensator_config())
-        self._check(self._loaded, config)
+        self._log, config = self.node.get_logger(), parameters.declare(self.node)
+        loaded = read_within(config.calibration_file, config.calibration_directory)
+        compensator = Compensator(loaded.calibration, config.compensator_config())
+        self._check(loaded, config, compensator.thermal.inputs)
         self._loop = WaitLoop(self.node, REST_S)
-        self._relay = Relay(self._loop, self._compensator, config)
-        self._reporter = Reporter(self._loop, self._relay, self._compensator)
+        self._relay = Relay(self._loop, loaded, compensator, config)
+        self._reporter = Reporter(self._loop, self._relay)
         self._reader = Reader()
         self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
-        self._report_every(config.diagnostics_period)
+        self._loop.call_every(config.diagnostics_period, self._reporter.report)
         topics = [self.node.resolve_topic_name(topic) for _, topic in INPUTS.values()]
         # The input that is not open may be opened later, with these.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
@@ -95,52 +99,68 @@ class CompensationNode:
 
     def close(self) -> None:
         """Destroy the node."""
-        self._requests.close()
+        # What is being read ends with its process.
         self._reader.close()
+        self._requests.close()
         self.node.destroy_node()
 
-    def _report_every(self, period_s: float) -> None:
-        self._loop.call_every(period_s, lambda: self._reporter.report(self._loaded))
+    @property
+    def _config(self) -> parameters.NodeConfig:
+        return self._relay.running.config
 
-    def _prepare(self, changes: list[Parameter]) -> LoadedCalibration | None:
-        """Read the calibration that a change asks for, beside the samples."""
+    @property
+    def _compensator(self) -> Compensator:
+        return self._relay.running.compensator
+
+    def _prepare(self, changes: list[Parameter]) -> tuple[LoadedCalibration, Model] | None:
+        """Read, try and build the calibration that a change asks for, beside the samples."""
         names = [one.value for one in changes if one.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
-        return self._reader.read(names[-1], self._config.calibration_directory)
+        loaded = self._reader.read(names[-1], self._config.calibration_directory)
+        return loaded, Model(loaded.calibration)
 
-    def _set(self, changes: list[Parameter], new: LoadedCalibration | None) -> SetParametersResult:
-        """Check a change as a whole, set and apply it, between two samples."""
-        loaded = new or self._loaded
-        before, samples, result = self._config, self._relay.samples, SetParametersResult()
-        config = parameters.updated(before, changes)
-        self._check(loaded, config)
-        if config.input != before.input:
-            samples = self._relay.open_samples(config)
+    def _set(
+        self, changes: list[Parameter], new: tuple[LoadedCalibration, Model] | None
+    ) -> SetParametersResult:
+        """Apply a change as a whole between two samples, or leave everything as it was."""
+        before = after = self._relay.running
+        loaded, model = new or (before.loaded, before.compensator.thermal.model)
+        config = parameters.updated(before.config, changes)
+        self._check(loaded, config, before.compensator.thermal.inputs)
+        known = [one.name for one in changes if self.node.has_parameter(one.name)]
+        values = self.node.get_parameters(known)
         try:
+            after = self._relay.successor(loaded, model, config)
+            self._run_with(after)
             # rclpy has the last word: unknown and fixed parameters.
             result = self.node.set_parameters_atomically(changes)
-        finally:
-            if not result.successful and samples is not self._relay.samples:
-                self._loop.unsubscribe(samples)
-        if not result.successful:
-            return result
-        self._config = config
-        if new:
-            self._loaded = new
-            self._compensator.swap(new.calibration)
-            self._say_calibration()
-        if config.compensator_config() != before.compensator_config():
-            self._compensator.reconfigure(config.compensator_config())
-        if (config.input, config.frame_id) != (before.input, before.frame_id):
-            self._relay.configure(config, samples)
-        if config.diagnostics_period != before.diagnostics_period:
-            self._report_every(config.diagnostics_period)
-        return result
+            if not result.successful:
+                raise parameters.ParameterError(result.reason)
+            if new:
+                self._say_calibration()
+            self._loop.call_soon(partial(self._relay.release, before.samples))
+            # Whatever fails up to here has not happened.
+            return result  # noqa: TRY300
+        except BaseException:
+            self._run_with(before)
+            self._relay.release(after.samples)
+            changed = [
+                one for one in values if self.node.get_parameter(one.name).value != one.value
+            ]
+            self.node.set_parameters_atomically(changed)
+            raise
 
-    def _check(self, loaded: LoadedCalibration, config: parameters.NodeConfig) -> None:
+    def _run_with(self, running: Running) -> None:
+        period_s, self._relay.running = self._config.diagnostics_period, running
+        if running.config.diagnostics_period != period_s:
+            self._loop.call_every(running.config.diagnostics_period, self._reporter.report)
+
+    def _check(
+        self, loaded: LoadedCalibration, config: parameters.NodeConfig, inputs: tuple[str, ...]
+    ) -> None:
         """Refuse a calibration that is for another unit, input or set of thermometers."""
-        unit, heard = loaded.calibration.unit, self._compensator.thermal.inputs[1:]
+        unit, heard = loaded.calibration.unit, inputs[1:]
         message = key = ''
         taken = {'counts': 'counts', 'imu': 'm/s^2'}[config.input]
         if config.serial and unit.serial != config.serial:
@@ -159,7 +179,8 @@ class CompensationNode:
             raise CalibrationError(message, loaded.path, key)
 
     def _say_calibration(self) -> None:
-        loaded, serial = self._loaded, self._loaded.calibration.unit.serial
+        loaded = self._relay.running.loaded
+        serial = loaded.calibration.unit.serial
         self._log.info(f'unit {serial}: {loaded.path} ({loaded.sha256[:12]})')
 
 
@@ -182,7 +203,7 @@ def main(args: list[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0 if isinstance(error, BrokenPipeError) else _fail(error, 1)
         return 0 if is_help else 2
-    with SignalWatch() as signals:
+    with SignalWatch(ENDING_S) as signals:
         try:
             use_profile()
             rclpy.init(args=args, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)

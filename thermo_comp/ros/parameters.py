@@ -5,7 +5,8 @@ Owns the node's parameters: the table of what they are, and the services that se
 
 The table is `NodeConfig`: what the node runs with is one such object, and a change makes another
 or is refused as a whole. A thread of its own waits for what takes time, the reading of a file; the
-loop exchanges one reference. Requests are answered in the order in which they came.
+loop exchanges one reference. Requests are answered in the order in which they came, but what names
+no file waits for none.
 """
 
 from __future__ import annotations
@@ -218,6 +219,7 @@ class ParameterRequests:
     def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
         is_each, n, reason = kind is srv.SetParameters, len(request.parameters), ''
         groups = [[one] for one in request.parameters] if is_each else [request.parameters]
+        waits = any(one.name == 'calibration_file' for one in request.parameters)
         results: list[SetParametersResult] = []
 
         def respond() -> None:
@@ -229,17 +231,18 @@ class ParameterRequests:
                 self._set(prepared, results)
             finally:
                 if len(results) == len(groups):
-                    self._n_waiting -= 1
+                    self._n_waiting -= waits
                     respond()
 
         if n > PARAMETERS_LIMIT:
             reason = f'{n} parameters at once, at most {PARAMETERS_LIMIT}'
-        elif self._n_waiting >= WAITING_LIMIT:
+        elif waits and self._n_waiting >= WAITING_LIMIT:
             reason = 'too many requests wait already, try again'
         elif groups:
-            self._n_waiting += 1
+            self._n_waiting += waits
             for group in groups:
-                future = self._beside.submit(self._read, group)
+                read = partial(self._read, group)
+                future = self._beside.submit(read) if waits else _done(read)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
         # Not one for each: to write so many would take as long as to read them.
@@ -273,6 +276,16 @@ class ParameterRequests:
             and node.describe_parameter(change.name).read_only
             and node.get_parameter(change.name).value == change.value
         )
+
+
+def _done(call: Callable[[], Any]) -> Future[Any]:
+    """Call at once, and keep what comes of it."""
+    future: Future[Any] = Future()
+    try:
+        future.set_result(call())
+    except Exception as error:  # noqa: BLE001 - it is kept
+        future.set_exception(error)
+    return future
 
 
 def _reply(service: Service, request: Any, answer: Callable[[Any], None]) -> None:

@@ -10,6 +10,7 @@ in a segmentation fault. Here a thread asks the loop to stop, which takes everyt
 from __future__ import annotations
 
 import os
+import select
 import signal
 import threading
 from collections.abc import Callable
@@ -30,12 +31,17 @@ def use_profile() -> None:
 
 
 class SignalWatch:
-    """Turn the first signal into a call, entered in the main thread; the second ends at once."""
+    """
+    Turn the first signal into a call, entered in the main thread; the second ends at once.
+
+    Where that call has not led to the end within `ending_s` [s], the process ends all the same.
+    """
 
     # The call comes from another thread, so that it also comes while the main one waits in the
     # middleware, where the interpreter runs no handlers.
 
-    def __init__(self) -> None:
+    def __init__(self, ending_s: float | None = None) -> None:
+        self._ending_s = ending_s
         self._is_over = False
         self._stop: Callable[[], None] = lambda: None
         self._thread = threading.Thread(target=self._watch, name='signals', daemon=True)
@@ -68,6 +74,9 @@ class SignalWatch:
         if os.read(self._reader, 1):
             self._is_over = True
             self._stop()
+            if not select.select([self._reader], [], [], self._ending_s)[0]:
+                # Nothing is left to be kept: who asked for the end has it.
+                os._exit(0)
             number = os.read(self._reader, 1)
             if number:
                 # Whoever asks twice does not want to wait for the order.

@@ -4,26 +4,36 @@
 Owns the reading of calibrations beside the samples, in a process of its own.
 
 A parser holds the interpreter for milliseconds at a time, which no thread can help; and whatever
-a file makes of its reader, the node only hears that it has ended.
+a file makes of its reader, the node only hears that it has ended, or nothing, for a time.
 """
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import hashlib
 import os
+import signal
 import subprocess
 import sys
+import threading
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
+from queue import Empty, SimpleQueue
 
 from ..errors import CalibrationError
 from ..files import read_bounded
+from ..online.trial import tried
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
 
+#: A file that has not been read within this time hangs: a network drive that is gone [s].
+LIMIT_S = 10.0
+_ENDING_S = 0.5  # how long a process that was killed is waited for [s]
+_PR_SET_PDEATHSIG = 1  # of Linux: the signal that comes when the parent's thread has ended
 NICENESS = 5  # added to the niceness of the process: the samples go first
 
 
@@ -37,7 +47,7 @@ class LoadedCalibration:
 
 
 def read(name: str, directory: str = '') -> LoadedCalibration:
-    """Read a unit's calibration; CalibrationError, which quotes nothing of what is none."""
+    """Read and try a calibration; CalibrationError, which quotes nothing of what is none."""
     if not name:
         raise CalibrationError(
             'parameter `calibration_file` is not set; start with '
@@ -45,14 +55,19 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
         )
     try:
         path = Path(name).expanduser()
-        if directory:
-            # Links included.
-            path, root = path.resolve(), Path(directory).expanduser().resolve()
-            if not path.is_relative_to(root):
-                rule = 'must be in the folder that the parameter `calibration_directory` names'
-                raise CalibrationError(rule, name)
-        content = read_bounded(path, SIZE_LIMIT)
+        root = Path(directory).expanduser().resolve() if directory else None
+        try:
+            # Links included; a folder that may not be looked into is not told from one outside.
+            if root is not None and not path.resolve().is_relative_to(root):
+                raise PermissionError
+            content = read_bounded(path, SIZE_LIMIT, root)
+        except PermissionError as error:
+            if root is None or error.errno == errno.EACCES:
+                raise
+            rule = 'must be in the folder that the parameter `calibration_directory` names'
+            raise CalibrationError(rule, name) from error
         calibration = parse_calibration(content, name)
+        tried(calibration, name)
     except CalibrationError as error:
         if error.rule is None:
             raise
@@ -68,29 +83,51 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
     return LoadedCalibration(calibration, name, hashlib.sha256(content).hexdigest())
 
 
-class Reader:
-    """A process that reads calibrations, begun when the first is asked for."""
+def read_within(name: str, directory: str, limit_s: float = LIMIT_S) -> LoadedCalibration:
+    """Do what `read` does, beside; CalibrationError where a file hangs."""
+    answers: SimpleQueue[LoadedCalibration | Exception] = SimpleQueue()
 
-    def __init__(self) -> None:
+    def answer() -> None:
+        try:
+            answers.put(read(name, directory))
+        except Exception as error:  # noqa: BLE001 - it is the answer
+            answers.put(error)
+
+    # Where a file hangs, nobody waits for it at the end either.
+    threading.Thread(target=answer, name='first reading', daemon=True).start()
+    try:
+        found = answers.get(timeout=limit_s)
+    except Empty:
+        raise _hanging(name, limit_s) from None
+    if isinstance(found, Exception):
+        raise found
+    return found
+
+
+def _hanging(name: str, limit_s: float) -> CalibrationError:
+    return CalibrationError(f'cannot be read: no answer within {limit_s:g} s', name)
+
+
+class Reader:
+    """A process that reads calibrations, begun when the first is asked for, and when one hangs."""
+
+    def __init__(self, limit_s: float = LIMIT_S) -> None:
+        self._limit_s = limit_s
+        self._is_closed = False
         self._process: subprocess.Popen[bytes] | None = None
 
     def read(self, name: str, directory: str) -> LoadedCalibration:
-        """Do what the function `read` does, there."""
+        """Do what the function `read` does, there, within the time limit."""
         try:
             if self._process is None:
-                self._pipe, theirs = Pipe()
-                # The very package that runs here; a Ctrl-C is for the node, with whom this ends.
-                code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve'
-                with theirs:
-                    self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and words
-                        [sys.executable, '-c', f'{code}; serve({theirs.fileno()})'],
-                        pass_fds=[theirs.fileno()],
-                        start_new_session=True,
-                    )
+                self._begin()
             self._pipe.send((name, directory))
+            if not self._pipe.poll(self._limit_s):
+                self._end()
+                raise _hanging(name, self._limit_s)
             answer: LoadedCalibration | CalibrationError = self._pipe.recv()
         except (OSError, EOFError) as error:
-            self.close()
+            self._end()
             ended = 'cannot be read: the process that reads it ended'
             raise CalibrationError(ended, name) from error
         if isinstance(answer, CalibrationError):
@@ -98,18 +135,42 @@ class Reader:
         return answer
 
     def close(self) -> None:
-        """End the process."""
+        """End the process, and whatever is read there; from any thread, once and for all."""
+        self._is_closed = True
+        self._end()
+
+    def _begin(self) -> None:
+        if self._is_closed:
+            raise EOFError
+        self._pipe, theirs = Pipe()
+        # The very package that runs here; a Ctrl-C is for the node, with whom this ends.
+        code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve'
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and words
+                [sys.executable, '-c', f'{code}; serve({theirs.fileno()}, {os.getpid()})'],
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+
+    def _end(self) -> None:
         process, self._process = self._process, None
         if process is not None:
             process.kill()
-            process.wait()
+            # One that a dead file system holds ends when that lets it go.
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(_ENDING_S)
             self._pipe.close()
 
 
-def serve(handle: int) -> None:
+def serve(handle: int, parent: int) -> None:
     """Read what the process is asked for, until nobody can ask any more."""
     os.nice(NICENESS)
     pipe = Connection(handle)
+    with suppress(AttributeError, OSError):
+        # Killed with the node, even while a file hangs.
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        return
     with suppress(EOFError, OSError):
         while True:
             try:

@@ -4,7 +4,7 @@
 Owns the way of the samples through the node: in the order of arrival, however the wake-ups fell.
 
 A message does not tell whose it is, so while an input has two sources nothing of it is used, nor
-the first messages after it, which may still be of the one that left.
+what comes just after it, which may still be of the one that left (`waitloop.Sources`).
 
 A sample is read and an Imu is written at fixed places of their plain form, little-endian CDR:
 4 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with
@@ -31,8 +31,10 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
 from ..online.compensator import Compensator
+from ..online.segments import Model
 from ..online.status import STAMPED_TOPIC, stamped_flag
 from .parameters import NodeConfig
+from .reader import LoadedCalibration
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
 INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
@@ -78,7 +80,7 @@ class Traffic:
     n_malformed: int = 0  # messages that could not be read
     n_flags: int = 0  # regime flags published, one for each reading that decides
     n_fallback: int = 0  # samples that rclpy had to bring into the plain form
-    n_contested: int = 0  # messages not used because their input had more than one publisher
+    n_contested: int = 0  # messages not used because more than one publisher may have sent them
 
 
 class SampleConverter:
@@ -149,14 +151,31 @@ class SampleConverter:
         return data
 
 
+@dataclass(frozen=True, slots=True)
+class Running:
+    """What the node runs with: one reference, exchanged as a whole between two samples."""
+
+    loaded: LoadedCalibration
+    config: NodeConfig
+    compensator: Compensator
+    samples: RawSubscription
+    converter: SampleConverter
+
+
 class Relay:
     """What stands between the inputs of a node and its outputs."""
 
-    def __init__(self, loop: WaitLoop, compensator: Compensator, config: NodeConfig) -> None:
-        self._loop, self._compensator = loop, compensator
+    def __init__(
+        self,
+        loop: WaitLoop,
+        loaded: LoadedCalibration,
+        compensator: Compensator,
+        config: NodeConfig,
+    ) -> None:
+        self._loop = loop
         self.traffic = Traffic()
-        self.samples = self.open_samples(config)
-        self.configure(config, self.samples)
+        samples = self._open_samples(config)
+        self.running = Running(loaded, config, compensator, samples, self._converter(config))
         #: By their names.
         self.thermometers = {
             name: loop.subscribe(Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False)
@@ -170,59 +189,70 @@ class Relay:
         self._newest_reading_ns: int | None = None
 
     @property
+    def samples(self) -> RawSubscription:
+        """The subscription to the samples."""
+        return self.running.samples
+
+    @property
     def inputs(self) -> dict[str, RawSubscription]:
         """The samples, then the readings, by their names in the diagnostics."""
         return {'sample': self.samples, **self.thermometers}
 
-    def open_samples(self, config: NodeConfig) -> RawSubscription:
-        """Subscribe to the samples of a configuration."""
+    def _open_samples(self, config: NodeConfig) -> RawSubscription:
         return self._loop.subscribe(*INPUTS[config.input], SAMPLE_QOS)
 
-    def configure(self, config: NodeConfig, samples: RawSubscription) -> None:
-        """Go over to a configuration and the samples that were opened for it."""
+    def _converter(self, config: NodeConfig) -> SampleConverter:
+        return SampleConverter(INPUTS[config.input][0], config.frame_id, self.traffic)
+
+    def successor(self, loaded: LoadedCalibration, model: Model, config: NodeConfig) -> Running:
+        """Make what is to run next; what runs stays as it is."""
+        now, settings = self.running, config.compensator_config()
+        compensator, converter, samples = now.compensator, now.converter, now.samples
+        if model is not compensator.thermal.model or settings != compensator.config:
+            compensator = compensator.successor(model, settings)
+        if (config.input, config.frame_id) != (now.config.input, now.config.frame_id):
+            converter = self._converter(config)
+        if config.input != now.config.input:
+            samples = self._open_samples(config)
+        return Running(loaded, config, compensator, samples, converter)
+
+    def release(self, samples: RawSubscription) -> None:
+        """Destroy a subscription to samples that is not in use any more, or was never."""
         if samples is not self.samples:
-            self._loop.unsubscribe(self.samples)
-        self.samples = samples
-        self.converter = SampleConverter(INPUTS[config.input][0], config.frame_id, self.traffic)
+            self._loop.unsubscribe(samples)
 
     def on_data(self) -> None:
         """Work through everything that has arrived."""
-        messages, received_ns = self.samples.drain()
+        messages, received_ns, n_others = self.samples.drain_of_one()
         for name, subscription in self.thermometers.items():
-            readings, read_ns = subscription.drain()
-            if readings and self._is_of_one(subscription, len(readings)):
+            readings, read_ns, n_more = subscription.drain_of_one()
+            n_others += n_more
+            if readings:
                 self._take_readings(name, readings, read_ns)
-        if not messages or not self._is_of_one(self.samples, len(messages)):
+        self.traffic.n_contested += n_others
+        if not messages:
             return
         if self._readings:
             messages = self._relay_with_readings(messages, received_ns)
         self._relay(messages)
-
-    def _is_of_one(self, subscription: RawSubscription, n: int) -> bool:
-        """Tell whether messages are of an input's only publisher; count them if not."""
-        was_contested = subscription.is_contested
-        subscription.is_contested = subscription.count_publishers() > 1
-        if was_contested or subscription.is_contested:
-            self.traffic.n_contested += n
-            return False
-        return True
 
     def advance_without_samples(self, silence_ns: int) -> None:
         """Let readings take effect without samples, so that the flag stays alive."""
         if self._newest_reading_ns is None:
             return
         horizon_ns = self._newest_reading_ns - IDLE_NS
-        last_ns = self._compensator.now_ns
+        compensator = self.running.compensator
+        last_ns = compensator.now_ns
         if last_ns is not None:
             # None is newer than the last sample by much more, whatever its stamp says.
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:
             if reading[1] <= horizon_ns:
-                self._compensator.push(*reading)
+                compensator.push(*reading)
             else:
                 self._readings.append((received, reading))
-        self._compensator.flush(horizon_ns)
+        compensator.flush(horizon_ns)
         self._publish_flags()
 
     def _take_readings(self, name: str, messages: list[bytes], received_ns: list[int]) -> None:
@@ -236,20 +266,20 @@ class Relay:
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
         """Relay up to the last reading that came before the last sample; return the rest."""
-        start = 0
+        start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))
         readings, self._readings = self._readings[:n], self._readings[n:]
         for received, reading in readings:
             end = bisect_left(received_ns, received, start)
             self._relay(messages[start:end])
-            self._compensator.push(*reading)
+            push(*reading)
             start = end
         return messages[start:]
 
     def _relay(self, messages: list[bytes]) -> None:
-        compensator = self._compensator
-        convert, process = self.converter.convert, compensator.process
+        compensator = self.running.compensator
+        convert, process = self.running.converter.convert, compensator.process
         correct_rate = compensator.correct_rate if compensator.corrects_rate else None
         for data in messages:
             frame = convert(data, process, correct_rate)
@@ -261,8 +291,9 @@ class Relay:
         self._publish_flags()
 
     def _publish_flags(self) -> None:
-        for stamp_ns, is_dynamic in self._compensator.take_flags():
-            serial = self._compensator.calibration.unit.serial
+        compensator = self.running.compensator
+        for stamp_ns, is_dynamic in compensator.take_flags():
+            serial = compensator.calibration.unit.serial
             try:
                 self._flag.publish(Bool(data=is_dynamic))
                 self._stamped.publish(stamped_flag(stamp_ns, is_dynamic, serial))

@@ -46,6 +46,10 @@ _NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
 #: A failure is logged with all its lines, but not more often than this [ns].
 _LOG_PERIOD_NS = 10 * 10**9
 
+#: Messages that are numbered one after the other for so long, and so many of them, are of one
+#: publisher that sends alone [ns].
+ALONE_NS, ALONE_MESSAGES = 10**9, 5
+
 _KINDS = {Subscription: 'subscription', Service: 'service', GuardCondition: 'guard_condition'}
 
 RCLError = rclpy_implementation.RCLError
@@ -54,14 +58,60 @@ RCLError = rclpy_implementation.RCLError
 Serve = Callable[[Any, Callable[[Any], None]], None]
 
 
+class Sources:
+    """
+    Tells whether the messages of a topic are of one publisher, while more than one is known.
+
+    One that was killed stays known to the middleware for the time of its lease, 20 s. Messages do
+    not say whose they are, but each publisher numbers its own: what is numbered one after the
+    other, for long enough, is of one.
+    """
+
+    def __init__(self) -> None:
+        self._n_known = 0
+        self._number: int | None = None
+        self._n_in_row, self._since_ns = 0, 0
+        #: Whether more than one sends, or it is not known yet that one alone does.
+        self.is_contested = False
+
+    def of_one(
+        self, n_known: int, numbers: Sequence[int | None], received_ns: Sequence[int]
+    ) -> int:
+        """Say which of the messages on is the first that is surely of the only one that sends."""
+        was_contested, n_before, self._n_known = self.is_contested, self._n_known, n_known
+        if n_known <= 1:
+            # The first ones after it may still be of the one that left.
+            self.is_contested, self._number = False, numbers[-1]
+            return len(numbers) if was_contested else 0
+        if n_known > n_before:
+            # Who is new is not known by its first message.
+            self._begin(None, 0)
+        first = 0
+        for place, (number, at_ns) in enumerate(zip(numbers, received_ns, strict=True)):
+            if number is None or self._number is None or number != self._number + 1:
+                self._begin(number, at_ns)
+            else:
+                self._number = number
+                self._n_in_row += 1
+                is_long = at_ns - self._since_ns >= ALONE_NS
+                if self.is_contested and is_long and self._n_in_row >= ALONE_MESSAGES:
+                    self.is_contested = False
+            if self.is_contested:
+                first = place + 1
+        return first
+
+    def _begin(self, number: int | None, at_ns: int) -> None:
+        self._number, self._since_ns = number, at_ns
+        self._n_in_row, self.is_contested = 1, True
+
+
 class RawSubscription:
     """A subscription of `WaitLoop.subscribe`, read by whoever runs the loop."""
 
     def __init__(self, subscription: Subscription, is_hot: bool) -> None:
         self.subscription = subscription
         self.is_hot = is_hot
-        #: Whether it had more than one publisher when that was asked last.
-        self.is_contested = False
+        self.sources = Sources()
         self._take = partial(subscription.handle.take_message, subscription.msg_type, True)
         #: How many publishers the middleware has found; cheap, to be asked while the loop runs.
         self.count_publishers: Callable[[], int] = subscription.handle.get_publisher_count
@@ -72,25 +122,47 @@ class RawSubscription:
         #: What lay between the last two messages, on average over one drain [ns].
         self.interval_ns = 0
 
+    @property
+    def is_contested(self) -> bool:
+        """Whether more than one publisher sends, as far as is known."""
+        return self.sources.is_contested
+
     def drain(self) -> tuple[list[bytes], list[int]]:
         """Take what waits, oldest first and `DRAIN_LIMIT` at most; each with its arrival [ns]."""
+        messages, received_ns, _ = self.drain_numbered()
+        return messages, received_ns
+
+    def drain_of_one(self) -> tuple[list[bytes], list[int], int]:
+        """Take what waits and is surely of one publisher, and tell how much else there was."""
+        messages, received_ns, numbers = self.drain_numbered()
+        if not messages:
+            return messages, received_ns, 0
+        first = self.sources.of_one(self.count_publishers(), numbers, received_ns)
+        return (
+            (messages[first:], received_ns[first:], first) if first else (messages, received_ns, 0)
+        )
+
+    def drain_numbered(self) -> tuple[list[bytes], list[int], list[int | None]]:
+        """Take what waits, with the numbers that publishers gave; None where they gave none."""
         messages: list[bytes] = []
         received_ns: list[int] = []
+        numbers: list[int | None] = []
         take, taken = self._take, self._take()
         if taken is None:
-            return messages, received_ns
+            return messages, received_ns, numbers
         while taken is not None:
             message, info = taken
             messages.append(message)
             received_ns.append(info['received_timestamp'])
+            numbers.append(info['publication_sequence_number'])
             taken = take() if len(messages) < DRAIN_LIMIT else None
         before_ns, self._newest_ns = self._newest_ns, received_ns[-1]
         self.interval_ns = (self._newest_ns - before_ns) // len(messages)
-        before, self._sequence = self._sequence, info['publication_sequence_number']
+        before, self._sequence = self._sequence, numbers[-1]
         if before is not None and self._sequence is not None:
             # Another publisher's numbers can go back.
             self.n_lost += max(0, self._sequence - before - len(messages))
-        return messages, received_ns
+        return messages, received_ns, numbers
 
 
 class WaitLoop:

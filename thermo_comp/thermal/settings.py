@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Annotated, Final, Literal, get_args
 
+from ..quantities import QUANTITIES, refuse_impossible
+
 CELL_SIGMAS: Final = 2.5  # a quantum above this many noise sds has cells ...
 WIDE_CELL_SIGMAS: Final = 8.5  # ... that noise never crosses: six sds of a difference
 OBVIOUS_SHARE: Final = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
@@ -37,12 +39,19 @@ class ThermometerSettings:
     """What is known of a temperature sensor, physically; its keys are the file's keys."""
 
     noise_sd_c: Annotated[
-        float, 'Standard deviation of the white noise of one reading, before quantization, K.'
+        float,
+        QUANTITIES['reading noise'],
+        'Standard deviation of the white noise of one reading, before quantization, K.',
     ] = 0.005
-    quantum_c: Annotated[float, 'Step of the readings, K; 0 for a continuous sensor.'] = 0.0
-    fastest_ramp_k_min: Annotated[float, 'Rate of the fastest ramps it will see, K/min.'] = 3.0
+    quantum_c: Annotated[
+        float, QUANTITIES['quantum'], 'Step of the readings, K; 0 for a continuous sensor.'
+    ] = 0.0
+    fastest_ramp_k_min: Annotated[
+        float, QUANTITIES['ramp'], 'Rate of the fastest ramps it will see, K/min.'
+    ] = 3.0
     lag_s: Annotated[
         float,
+        QUANTITIES['time constant'],
         'Thermal lag between the surroundings and the sensor, s. Together with the ramp it says '
         'how sharply the temperature bends: an onset is an acceleration of ``ramp / lag``.',
     ] = 600.0
@@ -54,6 +63,7 @@ class ThermometerSettings:
             positive=('noise_sd_c', 'fastest_ramp_k_min', 'lag_s'),
             not_negative=('quantum_c',),
         )
+        refuse_impossible(self)
 
     @property
     def has_cells(self) -> bool:
@@ -75,22 +85,29 @@ class DetectorSettings:
     What must be seen and what must not; its keys are the calibration file's `detector` section.
     """
 
-    smallest_ramp_k_min: Annotated[float, 'The slowest ramp that must never be missed, K/min.'] = (
-        0.2
-    )
+    smallest_ramp_k_min: Annotated[
+        float, QUANTITIES['ramp'], 'The slowest ramp that must never be missed, K/min.'
+    ] = 0.2
     false_alarms_per_hour: Annotated[
-        float, "How often the sensor's noise alone may open the dynamic state, per hour of soak."
+        float,
+        QUANTITIES['false alarms'],
+        "How often the sensor's noise alone may open the dynamic state, per hour of soak.",
     ] = 0.02
     ripple_c: Annotated[
         float,
+        QUANTITIES['ripple'],
         "Amplitude of the surroundings' temperature in a soak (a chamber's control ripple), K. "
         'Through the lag it makes a rate of at most ``ripple_c / lag_s``, which is no onset.',
     ] = 0.1
     relaxed_rate_k_min: Annotated[
-        float, "The lag has died when every sensor's rate is surely below this, K/min."
+        float,
+        QUANTITIES['ramp'],
+        "The lag has died when every sensor's rate is surely below this, K/min.",
     ] = 0.05
     dwell_s: Annotated[
-        float, 'How long it must have been below, and the shortest dynamic state, s.'
+        float,
+        QUANTITIES['dwell'],
+        'How long it must have been below, and the shortest dynamic state, s.',
     ] = 60.0
     closes: Annotated[
         Closes,
@@ -111,6 +128,7 @@ class DetectorSettings:
             positive=('smallest_ramp_k_min', 'false_alarms_per_hour', 'relaxed_rate_k_min'),
             not_negative=('ripple_c', 'dwell_s'),
         )
+        refuse_impossible(self)
         if self.closes not in get_args(Closes):
             raise ValueError(f"`closes` must be 'board' or 'case', got {self.closes!r}")
         if self.relaxed_rate_k_min * OBVIOUS_SHARE >= self.smallest_ramp_k_min:

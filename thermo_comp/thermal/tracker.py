@@ -10,6 +10,7 @@ a state comes out for a stamp. What it remembers is `memory`'s.
 
 from __future__ import annotations
 
+from copy import copy
 from math import sqrt
 from typing import Final
 
@@ -80,6 +81,8 @@ class ThermalTracker:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
         self._configure(config, board_lag_s)
+        # A check that another tracker has, too, stays as it is.
+        self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
     def is_live(self, stamp_ns: int, sensor: Thermometer) -> bool:

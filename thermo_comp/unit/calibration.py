@@ -26,14 +26,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
+from ..quantities import QUANTITIES, Bounds
 from ..text import LONGEST_SERIAL, valid_serial
 from ..thermal.settings import DetectorSettings
-from ..typing import Floats
 from .columns import Column
 from .functions import TemperatureFunction, check_reference
-from .gyroscope import Gyroscope
+from .gyroscope import LARGEST_RATE, Gyroscope
 from .posterior import ParameterLayout, Posterior, lay_out
-from .schema import Bounds, NotNegative, NotNegatives, Positive, Positives, Vector, check_ranges
+from .reach import FULL_SCALES, LARGEST_RELATIVE_SCALE, Reach, Term, check_posterior
+from .schema import Vector, check_ranges
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -43,16 +44,17 @@ if TYPE_CHECKING:
 #: The version of the file's layout that this code writes.
 FORMAT_VERSION = 2
 AXES = ('x', 'y', 'z')
-#: A scale function, with every term at its worst, must stay above this fraction of the reference.
-SMALLEST_RELATIVE_SCALE = 0.1
-#: At so many temperatures of its range a function is looked at.
-_GRID = 513
 #: The model of a calibration that stands for a type of unit: a prior.
 POPULATION = 'population'
-# No converter has fewer input units per m/s^2, nor more than one over it.
-_SMALLEST_K = 1e-9
 
-Celsius = Annotated[float, Bounds(at_least=-273.15, below=1000.0)]
+Celsius = Annotated[float, QUANTITIES['temperature']]
+_RateEdge = Annotated[float, QUANTITIES['temperature rate']]
+_Density = Annotated[float, QUANTITIES['noise density']]
+_Slow = Annotated[float, QUANTITIES['slow noise']]
+_Tilt = Annotated[float, QUANTITIES['misalignment deviation']]
+_Error = Annotated[float, QUANTITIES['error']]
+_Number = Annotated[int, QUANTITIES['number']]
+_WeightSd = Annotated[float, QUANTITIES['deviation of a weight']]
 Serial = Annotated[str, Bounds(shortest=1, longest=LONGEST_SERIAL)]
 Input = Literal['counts', 'm/s^2']
 
@@ -63,8 +65,12 @@ class Unit:
 
     serial: Annotated[Serial, 'Serial number of the unit, one printable line.']
     input: Annotated[Input, 'Unit of the raw samples: counts per conversion cycle, or m/s^2.']
-    full_scale: Annotated[Positive, 'A sample at or beyond this is saturated, in input units.']
-    cycle_time_s: Annotated[Positive, 'Length of a conversion cycle = sample interval [s].']
+    full_scale: Annotated[
+        float, QUANTITIES['full scale'], 'A sample at or beyond this is saturated, in input units.'
+    ]
+    cycle_time_s: Annotated[
+        float, QUANTITIES['cycle time'], 'Length of a conversion cycle = sample interval [s].'
+    ]
 
     def __post_init__(self) -> None:
         valid_serial(self.serial)
@@ -78,9 +84,10 @@ class AxisReference:
     bias: Annotated[float, 'dNs(0): zero offset at the reference, in input units.']
 
     def __post_init__(self) -> None:
-        if not _SMALLEST_K <= abs(self.scale_factor) <= 1.0 / _SMALLEST_K:
+        bounds = QUANTITIES['scale factor']
+        if bounds.fault(abs(self.scale_factor)):
             raise ValueError(
-                f'`scale_factor` must be {_SMALLEST_K:g} to {1.0 / _SMALLEST_K:g} in magnitude, '
+                f'`scale_factor` must be {bounds.at_least:g} to {bounds.at_most:g} in magnitude, '
                 f'got {self.scale_factor:g}'
             )
 
@@ -105,7 +112,9 @@ class AxisSet:
     bias_function: Annotated[TemperatureFunction, 'Fs(t), input units; Fs(0) = 0.']
     scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
     delta: Annotated[float, 'Bias of this regime relative to axes.bias, input units.'] = 0.0
-    residual_sd_m_s2: Annotated[NotNegative, 'What it leaves unexplained, as a slow error.'] = 0.0
+    residual_sd_m_s2: Annotated[
+        float, QUANTITIES['deviation'], 'What it leaves unexplained, as a slow error.'
+    ] = 0.0
 
     def __post_init__(self) -> None:
         check_reference('bias_function', self.bias_function, 0.0)
@@ -117,7 +126,7 @@ class LackOfFit:
     """What a set misses near one board temperature, as a slow error beside all that is claimed."""
 
     temperature_c: Annotated[Celsius, 'Board temperature [degC].']
-    sd_m_s2: Annotated[NotNegatives, 'Standard deviation of each axis.']
+    sd_m_s2: Annotated[tuple[_Error, _Error, _Error], 'Standard deviation of each axis.']
 
 
 @dataclass(frozen=True)
@@ -125,7 +134,7 @@ class RegimeSet:
     """The set of one regime; outside its ranges it is held, and the covariance grows."""
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Board temperature [degC].']
-    rate_range_k_min: Annotated[tuple[float, float], 'dT_board/dt [K/min].']
+    rate_range_k_min: Annotated[tuple[_RateEdge, _RateEdge], 'dT_board/dt [K/min].']
     x: AxisSet
     y: AxisSet
     z: AxisSet
@@ -136,7 +145,11 @@ class RegimeSet:
     ] = ()
 
     def __post_init__(self) -> None:
-        check_ranges(self, 'temperature_range_c', 'rate_range_k_min')
+        check_ranges(
+            self,
+            temperature_range_c=QUANTITIES['temperature span'],
+            rate_range_k_min=QUANTITIES['rate span'],
+        )
         at = [one.temperature_c for one in self.lack_of_fit]
         for k, (before, after) in enumerate(pairwise(at)):
             if not before < after:
@@ -164,10 +177,14 @@ class GroupEvidence:
 
     group: Annotated[str, 'The group, as in `response`.']
     part: Annotated[Literal['bias', 'scale'], 'Which of the two it corrects.']
-    explains_m_s2: Annotated[NotNegative, 'RMS of what it explains.']
-    effective_parameters: Annotated[NotNegative, 'How many of its weights the data determine.']
-    log_evidence_change: Annotated[float, 'By how much the log evidence falls without it.']
-    prior_sd: Annotated[tuple[NotNegative, ...], 'Sd of its weights before the data were seen.']
+    explains_m_s2: Annotated[_Error, 'RMS of what it explains.']
+    effective_parameters: Annotated[
+        float, QUANTITIES['number'], 'How many of its weights the data determine.'
+    ]
+    log_evidence_change: Annotated[
+        float, QUANTITIES['log evidence'], 'By how much the log evidence falls without it.'
+    ]
+    prior_sd: Annotated[tuple[_WeightSd, ...], 'Sd of its weights before the data were seen.']
 
 
 @dataclass(frozen=True)
@@ -176,7 +193,7 @@ class Source:
 
     name: str
     sha256: str = ''
-    n_samples: int = 0
+    n_samples: _Number = 0
 
 
 @dataclass(frozen=True)
@@ -184,12 +201,12 @@ class ResidualSummary:
     """|g| error of one section of the fitted data, before and after."""
 
     section: str
-    n_windows: int
-    raw_rms_m_s2: NotNegative
-    rms_m_s2: NotNegative
-    max_m_s2: NotNegative
+    n_windows: _Number
+    raw_rms_m_s2: _Error
+    rms_m_s2: _Error
+    max_m_s2: _Error
     left_out_rms_m_s2: Annotated[
-        NotNegative | None, 'On each position by what the others say of the unit; null if unknown.'
+        _Error | None, 'On each position by what the others say of the unit; null if unknown.'
     ] = None
 
 
@@ -218,29 +235,35 @@ class Calibration:
     format_version: Annotated[int, f'Version of this layout: {FORMAT_VERSION}.']
     unit: Unit
     reference_temperature_c: Annotated[Celsius, 'T_ref; the paper uses 20.']
-    gravity_m_s2: Annotated[float, Bounds(above=9.0, below=10.5), 'Local gravity used by the fit.']
+    gravity_m_s2: Annotated[float, QUANTITIES['gravity'], 'Local gravity used by the fit.']
     axes: Axes
     static: Annotated[RegimeSet, 'The set of the static regime, S = 0.']
     dynamic: Annotated[RegimeSet, 'The set of the dynamic regime, S = 1.']
     noise_density_m_s2_sqrt_hz: Annotated[
-        Positives, 'White noise of each axis; of a sample density^2 / cycle, and rounding.'
+        tuple[_Density, _Density, _Density],
+        'White noise of each axis; of a sample density^2 / cycle, and rounding.',
     ]
     slow_noise_m_s2_sqrt_h: Annotated[
-        NotNegatives, 'Random walk of the bias of each axis, per root hour.'
+        tuple[_Slow, _Slow, _Slow], 'Random walk of the bias of each axis, per root hour.'
     ] = (0.0, 0.0, 0.0)
     misalignment: Annotated[
         tuple[Vector, Vector, Vector],
         'M: lower triangular, unit diagonal; sensitivity axes to frame.',
     ] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     misalignment_sd: Annotated[
-        NotNegatives, 'Deviations of M[1][0], M[2][0], M[2][1], where there is no `posterior`.'
+        tuple[_Tilt, _Tilt, _Tilt],
+        'Deviations of M[1][0], M[2][0], M[2][1], where there is no `posterior`.',
     ] = (0.0, 0.0, 0.0)
     sensors: Annotated[
         tuple[str, ...], 'Thermometers beside the board; the first one leads in a ramp.'
     ] = ('case',)
-    response: Annotated[tuple[ResponseTerm, ...], 'The response, common to both sets.'] = ()
+    response: Annotated[
+        tuple[ResponseTerm, ...], QUANTITIES['columns'], 'The response, common to both sets.'
+    ] = ()
     board_lag_s: Annotated[
-        Positive, 'Lag of T_board behind T_case; times the rate it is the gradient of a lost case.'
+        float,
+        QUANTITIES['time constant'],
+        'Lag of T_board behind T_case; times the rate it is the gradient of a lost case.',
     ] = 900.0
     detector: Annotated[DetectorSettings, 'The thermometers and the regime detector.'] = field(
         default_factory=DetectorSettings
@@ -260,19 +283,23 @@ class Calibration:
         self._check_axes()
         self._check_misalignment()
         self._check_sensors()
-        for regime in ('static', 'dynamic'):
-            self._check_curves(regime)
-        if self.posterior is not None:
-            self.posterior.check_size(parameter_layout(self).n_parameters)
+        self._check_reach()
 
     def _check_axes(self) -> None:
         # Words with an offset have it in the bias, at half their range.
-        farthest = 2.0 * self.unit.full_scale
+        farthest = FULL_SCALES * self.unit.full_scale
+        force = QUANTITIES['full-scale force']
         for name, axis in zip(AXES, self.axes, strict=True):
             if abs(axis.bias) > farthest:
                 raise ValueError(
                     f'`axes.{name}.bias` must be within twice unit.full_scale, {farthest:g}, '
                     f'got {axis.bias:g}'
+                )
+            reached = self.unit.full_scale / abs(axis.scale_factor)
+            if fault := force.fault(reached):
+                raise ValueError(
+                    f'`axes.{name}.scale_factor` makes unit.full_scale a force that {fault}, '
+                    f'got {reached:g}'
                 )
 
     def _check_misalignment(self) -> None:
@@ -301,33 +328,56 @@ class Calibration:
                         f'got {term.sensor!r}'
                     )
 
-    def _check_curves(self, regime: str) -> None:
-        """Check that a set's functions are finite over its ranges, with a scale far from 0."""
+    def _check_reach(self) -> None:
+        """Check what hangs on full scale and temperatures: curves, columns, the posterior."""
+        own, full_scale = self.gyroscope, self.unit.full_scale
+        terms = [Term(one, one.bias, one.scale) for one in self.response]
+        of_rate = [Term(one, one.bias, (0.0,) * 3) for one in own.response] if own else []
         reference = self.reference_temperature_c
-        own = self.static if regime == 'static' else self.dynamic
-        t = np.linspace(*own.temperature_range_c, _GRID) - reference
-        edges = [edge for one in self.regime_sets() for edge in one.temperature_range_c]
-        farthest = np.max(np.abs(np.subtract(edges, reference)))
-        lost = np.zeros(3)
-        with np.errstate(all='ignore'):
-            # Every term of the response at its worst.
-            for term in self.response:
-                if term.during in ('always', regime):
-                    largest = max(map(abs, term.range)) * farthest**term.power
-                    lost += np.abs(np.multiply(term.scale, largest))
-        for name, axis, loss in zip(AXES, own.axes(), lost.tolist(), strict=True):
-            least = _smallest(axis.scale_function, t) - loss
-            if not least > SMALLEST_RELATIVE_SCALE:
-                raise ValueError(
-                    f'`{regime}.{name}.scale_function` must stay above '
-                    f'{SMALLEST_RELATIVE_SCALE:g} over its ranges, reaches {least:.4g}'
-                )
-        both = (('', own), ('gyroscope.', self.gyroscope and getattr(self.gyroscope, regime)))
-        for of, curves in both:
-            for name, curve in zip(AXES, curves.axes() if curves else (), strict=False):
-                if not math.isfinite(_smallest(curve.bias_function, t)):
-                    key = f'{of}{regime}.{name}.bias_function'
-                    raise ValueError(f'`{key}` must be finite over its range')
+        all_edges = [edge for one in self.regime_sets() for edge in one.temperature_range_c]
+        for regime, part in zip(('static', 'dynamic'), self.regime_sets(), strict=True):
+            edges = part.temperature_range_c
+            reach = Reach(edges, all_edges, reference, FULL_SCALES * full_scale)
+            lost = reach.losses(terms, regime)
+            for name, axis, loss in zip(AXES, part.axes(), lost, strict=True):
+                reach.check_scale(f'{regime}.{name}', axis.scale_function, loss)
+            for name, at, axis in zip(AXES, self.axes, part.axes(), strict=True):
+                level = at.bias + axis.delta
+                reach.check_bias(f'{regime}.{name}', level, axis.bias_function)
+            reach.check_terms('response', terms)
+            if own:
+                reach = Reach(edges, all_edges, reference, FULL_SCALES * LARGEST_RATE)
+                curves = own.static if regime == 'static' else own.dynamic
+                for name, at_rest, curve in zip(AXES, own.bias_rad_s, curves.axes(), strict=True):
+                    key = f'gyroscope.{regime}.{name}'
+                    reach.check_bias(key, at_rest + curve.delta, curve.bias_function)
+                reach.check_terms('gyroscope.response', of_rate)
+        self._check_posteriors(terms, of_rate)
+
+    def _check_posteriors(self, terms: list[Term], of_rate: list[Term]) -> None:
+        reference = self.reference_temperature_c
+        static, dynamic = (
+            [edge - reference for edge in one.temperature_range_c] for one in self.regime_sets()
+        )
+        if self.posterior is not None:
+            layout = parameter_layout(self)
+            self.posterior.check_size(layout.n_parameters)
+            axes = zip(self.static.axes(), self.dynamic.axes(), strict=True)
+            blocks = []
+            for bias, scale, (a, b) in zip(layout.bias, layout.scale, axes, strict=True):
+                most = FULL_SCALES * self.unit.full_scale
+                blocks.append((bias, (a.bias_function, b.bias_function), most))
+                most = LARGEST_RELATIVE_SCALE
+                blocks.append((scale, (a.scale_function, b.scale_function), most))
+            check_posterior('posterior.factor', self.posterior, blocks, (static, dynamic), terms)
+        own = self.gyroscope
+        if own is not None and own.posterior is not None:
+            axes_of_rate = zip(own.static.axes(), own.dynamic.axes(), strict=True)
+            pairs = [(a.bias_function, b.bias_function) for a, b in axes_of_rate]
+            laid_out = zip(lay_out(pairs, len(own.response)), pairs, strict=True)
+            of_bias = [(block, pair, FULL_SCALES * LARGEST_RATE) for block, pair in laid_out]
+            key = 'gyroscope.posterior.factor'
+            check_posterior(key, own.posterior, of_bias, (static, dynamic), of_rate)
 
     def correct(
         self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any
@@ -374,13 +424,3 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
     blocks = lay_out(pairs, len(calibration.response))
     end = blocks[-1].end
     return ParameterLayout(blocks[0::2], blocks[1::2], end, end + 3)
-
-
-def _smallest(function: TemperatureFunction, t: Floats) -> float:
-    """Find the smallest value over a range; -inf if any is not finite."""
-    try:
-        with np.errstate(all='ignore'):
-            values = function.value(t)
-    except OverflowError:
-        return -math.inf
-    return float(np.min(values)) if np.isfinite(values).all() else -math.inf

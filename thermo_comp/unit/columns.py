@@ -42,11 +42,12 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
+from ..quantities import QUANTITIES
 from ..thermal.memory import BOARD_INPUT, MemorySpec
 from ..thermal.state import BOARD, RATE, WEIGHT, Layout
 from ..typing import Floats
 from .functions import by_element, hold
-from .schema import Bounds, NotNegative, check_ranges
+from .schema import check_ranges
 
 #: A range that holds nothing back, of any value.
 UNBOUNDED: Final = (-1e9, 1e9)
@@ -62,6 +63,9 @@ BANK_TAUS: Final = FINE_TAUS[::2]
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final = (0.0, 450.0, 900.0, 1800.0)
+
+
+_Value = Annotated[float, QUANTITIES['value of a column']]
 
 
 @dataclass(frozen=True)
@@ -91,22 +95,28 @@ class Column:
     ]
     sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
     tau_s: Annotated[
-        NotNegative, 'Time constant of the lag (board, neighbour, square, cube; play: 0 = none).'
+        float,
+        QUANTITIES['lag'],
+        'Time constant of the lag (board, neighbour, square, cube; play: 0 = none).',
     ] = 0.0
-    width_k: Annotated[NotNegative, 'Width of even, half-width of play.'] = 0.0
-    rest_k: Annotated[float, 'What g_s is at rest, for even, size and square without lag.'] = 0.0
-    power: Annotated[int, Bounds(at_least=0), 'The value is multiplied by t to this power.'] = 0
+    width_k: Annotated[float, QUANTITIES['width'], 'Width of even, half-width of play.'] = 0.0
+    rest_k: Annotated[
+        float,
+        QUANTITIES['gradient'],
+        'What g_s is at rest, for even, size and square without lag.',
+    ] = 0.0
+    power: Annotated[int, QUANTITIES['power'], 'The value is multiplied by t to this power.'] = 0
     during: Annotated[
         Literal['always', 'static', 'dynamic'],
         'always, or multiplied by 1 - w (static) or by w (dynamic), w = weight of the regime.',
     ] = 'always'
     range: Annotated[
-        tuple[float, float],
+        tuple[_Value, _Value],
         'Range of the value before t and w multiply it; held at its edges outside.',
     ] = field(kw_only=True)
 
     def __post_init__(self) -> None:
-        check_ranges(self, 'range')
+        check_ranges(self, range=QUANTITIES['span of a column'])
         for key, kinds in (('tau_s', ('board', 'neighbour')), ('width_k', ('even', 'play'))):
             if self.kind in kinds and not getattr(self, key) > 0.0:
                 raise ValueError(

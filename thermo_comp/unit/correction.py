@@ -33,6 +33,11 @@ LONGEST_TRANSITION = 10.0
 _GAP_TEMPERATURES = 33
 #: Rounding to whole counts, twice 1/12 where the converter carries the remainder on [counts^2].
 ROUNDING_VARIANCE = 1.0 / 6.0
+#: The noise of a message is at least this part of the largest variance that any axis can have, so
+#: that rounding leaves a covariance positive definite; below any instrument's.
+_LEAST_SHARE = 1e-13
+#: What is larger than this is no number of a correction: of what is smaller, samples are finite.
+_LARGEST = 1e140
 #: Of so many states a call for each column costs less than a table of all sums.
 _FEW = 64
 #: So many states at once bound the memory that a line takes.
@@ -157,6 +162,7 @@ class Correction:
         self._span = min(edges), max(edges)
         K = [axis.scale_factor for axis in calibration.axes]
         self.K = np.array(K)[:, np.newaxis]
+        self._full_scale = calibration.unit.full_scale
         self._gravity = calibration.gravity_m_s2
         response, gyroscope = calibration.response, calibration.gyroscope
         columns = (*response, *(gyroscope.response if gyroscope else ()))
@@ -292,7 +298,11 @@ class Correction:
         gap = (sets[1] - sets[0])[:, n:]
         unchanging = np.reshape(slow, (3, 3, n))
         v = self._variance(states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, unchanging)
-        v[:, 0] += self._noise * (1.0 + np.asarray(noise_excess))
+        # What the axes can tell at most [m/s^2], and what that makes of their variances.
+        most = (self._full_scale + np.abs(found[0, :, 0])) / np.abs(found[1, :, 0])
+        whole = v[:, 0] + most * (np.abs(v[:, 1]) + most * (v[:, 2] + max(self.misalignment[3:])))
+        least = _LEAST_SHARE * whole.max(axis=0)
+        v[:, 0] += np.maximum(self._noise * (1.0 + np.asarray(noise_excess)), least)
         line = np.concatenate((found.swapaxes(0, 1).reshape(12, n), v.reshape(9, n)))
         return line.reshape(21, *ends.shape[2:])
 
@@ -361,6 +371,13 @@ class Correction:
         parts[:, :, 1] = 2.0 * variance * bias * scale
         parts[:, :, 2] = variance * scale * scale
         return in_order(parts, 0)
+
+
+def is_sound(line: Floats) -> npt.NDArray[np.bool_]:
+    """Say of what `Correction.line` gives whether all that is made of it is finite."""
+    scale = line[2:12:4]
+    is_finite = (np.abs(line) < _LARGEST).all(axis=0)
+    return np.asarray(is_finite & (scale * (scale + line[3:12:4]) > 0.0).all(axis=0))
 
 
 def in_order(values: Floats, axis: int) -> Floats:

@@ -16,11 +16,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
-from typing import Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from ..quantities import QUANTITIES
 from ..typing import Floats
 
 #: A temperature, or many.
@@ -72,7 +73,7 @@ class _Family(ABC):
 class Polynomial(_Family):
     """``c[0] + c[1] t + c[2] t^2 + ...`` (Eq. (10)): c[0] is 0 for a bias, 1 for a scale."""
 
-    coefficients: tuple[float, ...]
+    coefficients: Annotated[tuple[float, ...], QUANTITIES['coefficients']]
     kind: Literal['polynomial'] = 'polynomial'
 
     def __post_init__(self) -> None:
@@ -108,7 +109,7 @@ class CubicSpline(_Family):
     where the value is 0 (bias) or 1 (scale). Beyond the knots the end value is held.
     """
 
-    knots_k: tuple[float, ...]
+    knots_k: Annotated[tuple[float, ...], QUANTITIES['knots']]
     values: tuple[float, ...]
     kind: Literal['spline'] = 'spline'
 
@@ -173,7 +174,7 @@ class Exponential(_Family):
     """
 
     constant: float
-    amplitudes: tuple[float, ...]
+    amplitudes: Annotated[tuple[float, ...], QUANTITIES['coefficients']]
     e_fold_k: tuple[float, ...]
     kind: Literal['exponential'] = 'exponential'
 

@@ -8,14 +8,24 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from ..quantities import QUANTITIES
 from .columns import Column
 from .functions import TemperatureFunction, check_reference
 from .posterior import Posterior, lay_out
-from .schema import NotNegatives, Positives, Vector
+from .schema import Vector
 
 #: A unit of angular rates [rad/s].
 MILLIDEGREE = math.radians(1e-3)
 NIL = (0.0, 0.0, 0.0)
+#: The largest angular rate that a gyroscope tells, and the largest bias [rad/s].
+LARGEST_RATE = QUANTITIES['angular rate'].at_most or 0.0
+
+_Rate = Annotated[float, QUANTITIES['angular rate']]
+_Density = Annotated[float, QUANTITIES['rate noise density']]
+_Slow = Annotated[float, QUANTITIES['rate slow noise']]
+_Deviation = Annotated[float, QUANTITIES['rate deviation']]
+_Rates, _Densities = tuple[_Rate, _Rate, _Rate], tuple[_Density, _Density, _Density]
+_Slows, _Deviations = tuple[_Slow, _Slow, _Slow], tuple[_Deviation, _Deviation, _Deviation]
 
 
 @dataclass(frozen=True)
@@ -57,13 +67,23 @@ class Gyroscope:
     Parameters of the posterior: by axis level and coefficients of both sets, then the weights.
     """
 
-    bias_rad_s: Annotated[Vector, 'At the reference temperature, in the mean over positions.']
+    bias_rad_s: Annotated[
+        tuple[_Rate, _Rate, _Rate], 'At the reference temperature, in the mean over positions.'
+    ]
     static: RateSet
     dynamic: RateSet
-    noise_density_rad_s_sqrt_hz: Annotated[Positives, 'White noise of each axis.']
-    slow_noise_rad_s_sqrt_h: Annotated[NotNegatives, 'Random walk, per root hour.'] = NIL
-    residual_sd_rad_s: Annotated[NotNegatives, 'What is left, as a slow error: a turn-on.'] = NIL
-    response: Annotated[tuple[RateTerm, ...], 'The thermal response, common to both sets.'] = ()
+    noise_density_rad_s_sqrt_hz: Annotated[
+        tuple[_Density, _Density, _Density], 'White noise of each axis.'
+    ]
+    slow_noise_rad_s_sqrt_h: Annotated[
+        tuple[_Slow, _Slow, _Slow], 'Random walk, per root hour.'
+    ] = NIL
+    residual_sd_rad_s: Annotated[
+        tuple[_Deviation, _Deviation, _Deviation], 'What is left, as a slow error: a turn-on.'
+    ] = NIL
+    response: Annotated[
+        tuple[RateTerm, ...], QUANTITIES['columns'], 'The thermal response, common to both sets.'
+    ] = ()
     posterior: Annotated[Posterior | None, 'Covariance of all parameters; null: unknown.'] = None
 
     def __post_init__(self) -> None:

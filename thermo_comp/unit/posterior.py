@@ -13,9 +13,9 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..quantities import QUANTITIES
 from ..typing import Floats
 from .functions import TemperatureFunction
-from .schema import Bounds
 
 #: What single precision cannot tell from nothing, relative to a variance.
 _NEGLIGIBLE = 1e-7
@@ -28,7 +28,7 @@ _FLOAT32 = np.dtype('<f4')
 class Posterior:
     """Covariance of all parameters, by `ParameterLayout`: factor @ factor.T + diag(rest)."""
 
-    rank: Annotated[int, Bounds(at_least=0), 'Number of columns of the factor.']
+    rank: Annotated[int, QUANTITIES['number'], 'Number of columns of the factor.']
     factor: Annotated[
         str, 'base64 of little-endian float32: one row of `rank` numbers per parameter.'
     ]

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from . import calibration as unit
 from .calibration import Calibration, RegimeSet, parameter_layout
 from .functions import Polynomial
-from .gyroscope import NIL, Gyroscope, RateCurve, RateSet, RateTerm
+from .gyroscope import LARGEST_RATE, NIL, Gyroscope, RateCurve, RateSet, RateTerm
 from .posterior import Posterior
 
 
@@ -32,7 +31,7 @@ def rate_triad(calibration: Calibration) -> Calibration:
     triad = replace(
         calibration,
         # No angular rate is out of the range of an accelerometer.
-        unit=replace(calibration.unit, input='m/s^2', full_scale=math.inf),
+        unit=replace(calibration.unit, input='m/s^2', full_scale=LARGEST_RATE),
         axes=unit.Axes(*(unit.AxisReference(1.0, bias) for bias in own.bias_rad_s)),
         static=regime(calibration.static, own.static),
         dynamic=regime(calibration.dynamic, own.dynamic),

@@ -13,16 +13,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import operator
 import re
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
-from ..text import counted
+from ..quantities import Bounds
 
 #: Longer than any key that there is.
 _LONGEST_NAME = 60
@@ -41,43 +39,10 @@ class SchemaError(ValueError):
         super().__init__(f'{key}: {message}' if key else message)
 
 
-#: When a bound is kept, and what is said where it is not.
-_RULES: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
-    'above': (operator.gt, 'be greater than'),
-    'at_least': (operator.ge, 'be at least'),
-    'below': (operator.lt, 'be less than'),
-    'shortest': (operator.ge, 'have at least'),
-    'longest': (operator.le, 'have at most'),
-}
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Where a number must lie, or how long a text must be."""
-
-    above: float | None = None
-    at_least: float | None = None
-    below: float | None = None
-    shortest: int | None = None
-    longest: int | None = None
-
-    def fault(self, value: Any) -> str | None:
-        """Say what is expected of a value that does not comply."""
-        is_text = isinstance(value, str)
-        for name, (is_kept, said) in _RULES.items():
-            limit = getattr(self, name)
-            if limit is not None and not is_kept(len(value) if is_text else value, limit):
-                shown = counted(limit, 'character') if is_text else f'{limit:g}'
-                return f'must {said} {shown}'
-        return None
-
-
 Positive = Annotated[float, Bounds(above=0.0)]
 NotNegative = Annotated[float, Bounds(at_least=0.0)]
 #: Of three axes.
 Vector = tuple[float, float, float]
-Positives = tuple[Positive, Positive, Positive]
-NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 
 
 def build(hint: type[Value], data: Any, key: str = '') -> Value:
@@ -100,13 +65,17 @@ def naming(key: str) -> Iterator[None]:
         raise SchemaError(_joined(key, named['key']), named['rest']) from error
 
 
-def check_ranges(value: object, *keys: str) -> None:
-    """Raise ValueError, with the name of the key, if a range of a dataclass does not rise."""
-    for key in keys:
+def check_ranges(value: object, **spans: Bounds) -> None:
+    """Raise ValueError, with the name of the key, if a range of a dataclass spans too little."""
+    for key, span in spans.items():
         lower, upper = getattr(value, key)
         if not lower < upper:
             raise ValueError(
                 f'`{key}` must be [lower, upper] with lower < upper, got [{lower}, {upper}]'
+            )
+        if span.at_least is not None and not upper - lower >= span.at_least:
+            raise ValueError(
+                f'`{key}` must span at least {span.at_least:g} {span.unit}, got [{lower}, {upper}]'
             )
 
 

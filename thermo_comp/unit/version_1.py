@@ -9,18 +9,20 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
+from ..quantities import QUANTITIES
 from ..typing import Floats
 from .calibration import AXES, FORMAT_VERSION, Calibration, ResponseTerm, parameter_layout
 from .posterior import posterior_of
-from .schema import Positive, SchemaError, build, check_ranges, naming
+from .schema import SchemaError, build, check_ranges, naming
 
 REGIMES = ('static', 'dynamic')
 _NEW_KEYS = ('sensors', 'response', 'posterior', 'evidence', 'slow_noise_m_s2_sqrt_h', 'gyroscope')
 _Part = TypeVar('_Part')
+_TimeConstant = Annotated[float, QUANTITIES['time constant']]
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class _OfSet:
     memory_range_k: tuple[float, float] = (-50.0, 50.0)
 
     def __post_init__(self) -> None:
-        check_ranges(self, 'gradient_range_k', 'memory_range_k')
+        span = QUANTITIES['span of a column']
+        check_ranges(self, gradient_range_k=span, memory_range_k=span)
 
 
 def read_version_1(data: dict[str, Any]) -> Calibration:
@@ -81,7 +84,7 @@ def read_version_1(data: dict[str, Any]) -> Calibration:
             raise SchemaError(key, 'unknown key in a file of version 1')
     data = deepcopy(data)
     key = 'memory_time_constants_s'
-    lags = build(tuple[Positive, ...], data.pop(key, []), key)
+    lags = build(tuple[_TimeConstant, ...], data.pop(key, []), key)
     edges = [_cut(data, _OfSet, regime) for regime in REGIMES]
     axes = [[_cut(data, _OfAxis, regime, one) for one in AXES] for regime in REGIMES]
     calibration = build(Calibration, {**data, 'format_version': FORMAT_VERSION})

@@ -1,0 +1,351 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Attacks on what lies around the core: clocks, rates, many clients, links, full disks, logs."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from builders import calibration
+from conftest import ROOT, Cli
+
+from thermo_comp.errors import CalibrationError, RecordingError
+from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.unit.calibration_file import load_calibration, save_calibration
+
+START_NS = 1_767_225_600_000_000_000
+FIT = sorted((ROOT / 'bags' / 'fit').glob('*.mcap'))
+HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
+
+ros = pytest.mark.skipif(
+    not __import__('importlib.util').util.find_spec('rclpy'), reason='rclpy is not installed'
+)
+
+
+@pytest.fixture
+def peer() -> Iterator[Any]:
+    from ros_helpers import Peer
+
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+def of_kind(kind: str, cycle_s: float, path: Path) -> Path:
+    full_scale, K = (32767.0, 300.0) if kind == 'counts' else (160.0, 1.0)
+    axes = Axes(*[AxisReference(K, 0.0)] * 3)
+    save_calibration(calibration(unit=Unit('T-1', kind, full_scale, cycle_s), axes=axes), path)
+    return path
+
+
+@ros
+def test_a_clock_that_goes_back_or_pauses_is_none_of_the_samples(
+    peer: Any, tmp_path: Path
+) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray
+    from ros_helpers import drive, node_in_thread, stamp_of, standing
+    from rosgraph_msgs.msg import Clock
+    from sensor_msgs.msg import Imu
+
+    path = of_kind('counts', 0.01, tmp_path / 'unit.yaml')
+    arguments = ['-p', f'calibration_file:={path}', '-p', 'diagnostics_period:=0.02']
+    with node_in_thread(*arguments) as node:
+        heard = peer.listen(Imu, 'imu/data_raw')
+        told = peer.listen(DiagnosticArray, '/diagnostics')
+        driver = drive(peer, node)
+        assert peer.set_parameters(use_sim_time=True)[0].successful
+        clock = peer.publisher(Clock, '/clock')
+        # On, back by an hour, still for five looks, forward by a year, and not at all any more.
+        hour = 3600 * 10**9
+        times = [START_NS, START_NS + hour, START_NS, *[START_NS] * 5, START_NS + 8760 * hour]
+        for n, now_ns in enumerate(times):
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
+            clock.publish(message)
+            for k in range(20 * n, 20 * n + 20):
+                if k % 10 == 0:
+                    driver.temperatures(START_NS + k * 10**7, 20.0, 20.0)
+                driver.counts(START_NS + k * 10**7, *standing(k))
+            peer.wait_for(lambda n=n: len(heard) >= 20 * n + 20, 'all samples')
+            peer.wait_for(
+                lambda now_ns=now_ns: told and stamp_of(told[-1]) == now_ns, 'its time in reports'
+            )
+        assert peer.set_parameters(use_sim_time=False)[0].successful
+        peer.wait_for(lambda: stamp_of(told[-1]) not in times, 'the time of day')
+        stamps = [stamp_of(one) for one in heard]
+        assert stamps == [START_NS + k * 10**7 for k in range(20 * len(times))]
+        assert node._loop.n_failures == 0
+
+
+@ros
+def test_a_rate_that_goes_up_twentyfold_and_back_loses_nothing(peer: Any, tmp_path: Path) -> None:
+    from ros_helpers import drive, node_in_thread, stamp_of
+    from sensor_msgs.msg import Imu
+
+    path = of_kind('m/s^2', 0.01, tmp_path / 'unit.yaml')
+    arguments = ['-p', f'calibration_file:={path}', '-p', 'input:=imu']
+    reliable = '/imu/uncompensated.subscription.reliability:=reliable'
+    with node_in_thread(*arguments, '-p', f'qos_overrides.{reliable}') as node:
+        heard = peer.listen(Imu, 'imu/data_raw')
+        driver = drive(peer, node, Imu, 'imu/uncompensated')
+        now_ns, sent = START_NS, []
+        driver.temperatures(now_ns - 1, 20.0, 20.0)
+        peer.poll(lambda: len(node._relay._readings) == 2, 'the first readings')
+        for round_number in range(6):
+            step_ns = 10**7 if round_number % 2 == 0 else 5 * 10**5
+            for k in range(1000):
+                if k % 50 == 0:
+                    driver.temperatures(now_ns, 20.0, 20.0)
+                message = Imu()
+                message.header.stamp.sec, message.header.stamp.nanosec = divmod(now_ns, 10**9)
+                message.linear_acceleration.z = 9.8 + 1e-3 * (k % 7)
+                driver.imu(message)
+                sent.append(now_ns)
+                now_ns += step_ns
+            peer.wait_for(lambda: len(heard) == len(sent), 'all samples')
+        assert [stamp_of(one) for one in heard] == sent
+
+
+@ros
+def test_twenty_clients_that_set_parameters_at_once_are_all_answered(
+    peer: Any, tmp_path: Path
+) -> None:
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+    from ros_helpers import node_in_thread
+
+    paths = [of_kind('counts', 0.01, tmp_path / f'{k}.yaml') for k in range(3)]
+    with node_in_thread('-p', f'calibration_file:={paths[0]}') as node:
+        name = 'thermo_comp/set_parameters'
+        clients = [peer.node.create_client(SetParameters, name) for _ in range(20)]
+        for client in clients:
+            assert client.wait_for_service(30.0)
+        rng = random.Random(7)
+        choices: list[tuple[str, Any]] = [
+            *(('calibration_file', str(path)) for path in (*paths, tmp_path / 'none')),
+            *(('frame_id', frame) for frame in ('a', 'b', 'x' * 300)),
+            *(('transition_time', value) for value in (0.0, 5.0, -1.0)),
+            *(('diagnostics_period', value) for value in (0.05, 1.0)),
+            *(('input', value) for value in ('imu', 'counts')),
+        ]
+        asked = []
+        for _ in range(15):
+            for client in clients:
+                given = dict(rng.choices(choices, k=3))
+                messages = [Parameter(k, value=v).to_parameter_msg() for k, v in given.items()]
+                request = SetParameters.Request(parameters=messages)
+                asked.append((given, client.call_async(request)))
+            peer.poll(lambda: all(future.done() for _, future in asked), 'all answers')
+        for given, future in asked:
+            results = future.result().results
+            assert len(results) == len(given)
+            for (key, value), result in zip(given.items(), results, strict=True):
+                is_good = value not in (str(tmp_path / 'none'), 'x' * 300, -1.0, 'imu')
+                # Too many at once may be refused, and say so.
+                assert result.successful == is_good or 'too many' in result.reason, (key, value)
+        config = node._config
+        for key in ('calibration_file', 'frame_id', 'transition_time', 'diagnostics_period'):
+            assert node.node.get_parameter(key).value == getattr(config, key)
+        assert node._relay.running.loaded.path == config.calibration_file
+        assert node._loop.n_failures == 0
+
+
+@ros
+def test_links_exchanged_under_the_folder_lead_nowhere_else(tmp_path: Path) -> None:
+    # WHY: between the look at a path and its opening a folder can become a link.
+    from thermo_comp.ros.reader import read
+
+    folder, outside = tmp_path / 'units', tmp_path / 'outside'
+    for place, serial in ((folder / 'real', 'inside'), (outside, 'outside')):
+        place.mkdir(parents=True)
+        unit = Unit(serial, 'counts', 32767.0, 0.01)
+        save_calibration(calibration(unit=unit), place / 'unit.yaml')
+    door, link = folder / 'door', folder / 'link'
+    (folder / 'real').rename(door)
+    link.symlink_to(outside)
+    is_over = threading.Event()
+
+    def swap() -> None:
+        while not is_over.is_set():
+            for one, other in ((door, folder / 'real'), (link, door)):
+                one.rename(other)
+            for one, other in ((door, link), (folder / 'real', door)):
+                one.rename(other)
+
+    thread = threading.Thread(target=swap)
+    thread.start()
+    serials, refusals = set(), set()
+    try:
+        for _ in range(400):
+            try:
+                serials.add(read(f'{door}/unit.yaml', str(folder)).calibration.unit.serial)
+            except CalibrationError as error:  # noqa: PERF203
+                refusals.add(str(error).partition(': ')[2])
+    finally:
+        is_over.set()
+        thread.join()
+    assert serials <= {'inside'}
+    known = ('calibration_directory', 'No such file', 'Not a directory', 'Invalid argument')
+    assert [one for one in refusals if not any(text in one for text in known)] == []
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    disk = tmp_path / 'disk'
+    disk.mkdir()
+    command = ['mount', '-t', 'tmpfs', '-o', 'size=64k', 'none', str(disk)]
+    if os.geteuid() or subprocess.run(command, check=False).returncode:
+        pytest.skip('a small file system can only be mounted by root')
+    yield disk
+    subprocess.run(['umount', str(disk)], check=True)
+
+
+def test_a_full_disk_under_convert_and_fleet(small_disk: Path, tmp_path: Path, cli: Cli) -> None:
+    table = tmp_path / 'log.csv'
+    samples = np.random.default_rng(3).normal((0.0, 0.0, 9.8), 0.1, (9000, 3))
+    rows = [f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(samples)]
+    table.write_text('\n'.join(['time_s,x,y,z,board', *rows]))
+    columns = tmp_path / 'columns.yaml'
+    columns.write_text(
+        'stamp: {rate_hz: 100.0, start_s: 1.0}\n'
+        'accel: {columns: [x, y, z], unit: m/s^2, output: imu}\n'
+        'board: {column: board, unit: degC}\n'
+    )
+    finished = cli('convert', table, '--columns', columns, '-o', small_disk / 'log', code=None)
+    assert finished.returncode == 1, finished.stderr
+    assert 'No space left on device' in finished.stderr
+    fleet = tmp_path / 'fleet' / 'unit1'
+    fleet.mkdir(parents=True)
+    for bag in FIT[:3]:
+        (fleet / bag.name).symlink_to(bag)
+    options = ('--gravity', '9.80665', '--workers', '1', '-o', small_disk / 'out')
+    (small_disk / 'filler').write_bytes(bytes(60_000))
+    finished = cli('fleet', 'fit', tmp_path / 'fleet', *options, code=None)
+    assert finished.returncode == 1, finished.stderr
+    assert 'Traceback' not in finished.stderr
+    assert 'No space left on device' in finished.stderr + finished.stdout
+    assert not list(small_disk.rglob('*.partial*'))
+
+
+SAVING = """
+import os, signal, sys
+from thermo_comp.unit.calibration_file import load_calibration, save_calibration
+new, target, at = load_calibration(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+n = 0
+def trace(frame, event, _):
+    global n
+    if not frame.f_code.co_filename.endswith('thermo_comp/files.py'):
+        return None if event == 'call' and 'thermo_comp' not in frame.f_code.co_filename else trace
+    n += event == 'line'
+    if n == at:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return trace
+for at in range(1, 1000):
+    n, child = 0, os.fork()
+    if not child:
+        sys.settrace(trace)
+        save_calibration(new, target)
+        os._exit(0)
+    ended = os.waitpid(child, 0)[1]
+    found = load_calibration(target).unit.serial
+    print(ended, found, flush=True)
+    if not ended:
+        break
+    save_calibration(load_calibration(sys.argv[3]), target)
+"""
+
+
+def test_a_calibration_killed_at_any_line_of_its_writing_is_the_old_or_the_new(
+    tmp_path: Path,
+) -> None:
+    old, new, target = (tmp_path / f'{name}.yaml' for name in ('old', 'new', 'unit'))
+    for path, serial in ((old, 'old'), (new, 'new'), (target, 'old')):
+        save_calibration(calibration(unit=Unit(serial, 'counts', 32767.0, 0.01)), path)
+    script = SAVING.replace(', at = load', ' = load').replace(', int(sys.argv[3])', '')
+    done = subprocess.run(
+        [sys.executable, '-c', script, new, target, old],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    lines = [line.split() for line in done.stdout.splitlines()]
+    *killed, last = lines
+    assert last == ['0', 'new']
+    # Every line of the way, and both sides of the exchange.
+    assert len(killed) > 30
+    assert {code for code, _ in killed} == {str(signal.SIGKILL.value)}
+    assert [name for name, _ in itertools.groupby(name for _, name in killed)] == ['old', 'new']
+    assert load_calibration(target).unit.serial == 'new'
+
+
+@pytest.mark.parametrize('kind', ['ulog', 'dataflash'])
+def test_crafted_logs_are_refused_in_a_line_or_read(kind: str, tmp_path: Path) -> None:
+    pytest.importorskip('pyulog' if kind == 'ulog' else 'pymavlink')
+    from thermo_comp.convert.autopilot import read_autopilot
+    from thermo_comp.convert.log import write_log
+
+    rng = np.random.default_rng(11)
+    path = tmp_path / f'log.{"ulg" if kind == "ulog" else "bin"}'
+    if kind == 'ulog':
+        from test_convert_ulog import write_two_imus
+
+        write_two_imus(path, rng)
+    else:
+        from test_convert_dataflash import write_new
+
+        write_new(path, rng)
+    good = path.read_bytes()
+    n_read, said = 0, []
+    for number in range(150):
+        data = bytearray(good[:6000])
+        for _ in range(rng.integers(1, 9)):
+            at = int(rng.integers(0, 900 if number % 2 else len(data)))
+            cut = int(rng.integers(0, 9))
+            data[at : at + cut] = rng.bytes(int(rng.integers(0, 9)))
+        path.write_bytes(bytes(data))
+        try:
+            log = read_autopilot(path)
+            write_log(log, tmp_path / f'{number}.mcap')
+            n_read += 1
+        except RecordingError as error:
+            said.append(str(error))
+    assert n_read < 150
+    assert not any('\n' in text for text in said)
+
+
+def test_paths_that_climb_are_no_door(tmp_path: Path, cli: Cli) -> None:
+    from thermo_comp.report.live import LiveReport, LiveServer
+
+    fleet = tmp_path / 'fleet'
+    for unit in ('one', '..two', 'three..'):
+        (fleet / unit).mkdir(parents=True)
+        for bag in FIT[:2]:
+            (fleet / unit / bag.name).symlink_to(bag)
+    (tmp_path / 'secret.txt').write_text('secret')
+    options = ('--gravity', '9.80665', '--workers', '1', '-o', tmp_path / 'out')
+    cli('fleet', 'fit', fleet / '..' / 'fleet', *options, code=None)
+    made = {one.relative_to(tmp_path).parts[0] for one in tmp_path.rglob('*.yaml')}
+    assert made == {'out'}
+    unit = tmp_path / 'unit.yaml'
+    save_calibration(calibration(), unit)
+    with LiveServer(LiveReport(unit, [HELD_OUT])) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        for path in ('../secret.txt', '%2e%2e/secret.txt', '/etc/passwd', '..\\x', 'a/../../etc'):
+            with pytest.raises(urllib.error.HTTPError, match='404'):
+                urllib.request.urlopen(f'{server.url}{path}', timeout=30)  # noqa: S310
+        server.shutdown()
+        thread.join()

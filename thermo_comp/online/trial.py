@@ -1,0 +1,66 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the trial of a calibration: a few samples go through all of it before it is taken into use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ..errors import CalibrationError
+from ..thermal.memory import BOARD_INPUT
+from ..unit.calibration import Calibration
+from .compensator import Compensator, Corrected
+from .segments import Model
+from .status import CompensatorConfig
+
+#: The coldest and the hottest that a thermometer may read, beyond any range [degC].
+_BEYOND: Final = (-273.0, 999.0)
+_STEP_NS: Final = 1_000_000_000
+
+
+def tried(calibration: Calibration, path: str | Path | None = None) -> None:
+    """
+    Apply a calibration to a few samples; CalibrationError where anything of it fails.
+
+    The samples are zero and full scale, the temperatures the edges of the ranges and what is far
+    beyond; each must come out finite, with a covariance that is positive definite.
+    """
+    try:
+        is_sound = all(map(is_sound_sample, _samples(Model(calibration))))
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        rule = f'cannot be applied: {type(error).__name__}: {error}'
+        raise CalibrationError(rule, path) from error
+    if not is_sound:
+        rule = 'cannot be applied: what it gives is not finite, or no covariance'
+        raise CalibrationError(rule, path)
+
+
+def is_sound_sample(row: Corrected) -> bool:
+    """Say whether force and covariance of a sample are numbers that may be published."""
+    if not np.isfinite(row).all():
+        return False
+    xx, xy, xz, yy, yz, zz = row[3:]
+    of_ends = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return bool(of_ends[0] > 0.0)
+
+
+def _samples(model: Model) -> Iterator[Corrected]:
+    calibration = model.calibration
+    edges = [edge for one in calibration.regime_sets() for edge in one.temperature_range_c]
+    largest = 0.999 * calibration.unit.full_scale
+    for celsius in (calibration.reference_temperature_c, *edges, *_BEYOND):
+        compensator = Compensator(model, CompensatorConfig(gravity_tolerance_m_s2=0.0))
+        for k, size in enumerate((1e-3 * largest, largest, -largest)):
+            for name in model.inputs:
+                # Beside the board it is warmer, and more so each time.
+                celsius_there = celsius + k * (name != BOARD_INPUT)
+                compensator.push(name, k * _STEP_NS, celsius_there)
+            row = compensator.process(k * _STEP_NS, size, 0.5 * size, size)
+            if row is not None:
+                yield row

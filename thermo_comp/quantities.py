@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the bounds of every quantity that a calibration is made of: one table, from the physics.
+
+They lie far beyond any instrument and far within what floating point can carry, so that whatever
+keeps them gives finite numbers. What hangs on a unit's own full scale and temperatures (bias,
+curves, weights, their deviations) is in `unit.reach`.
+"""
+
+from __future__ import annotations
+
+import operator
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from types import MappingProxyType
+from typing import Any, Final
+
+from .text import counted
+
+#: When a bound is kept, and what is said where it is not.
+_RULES: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
+    'above': (operator.gt, 'be greater than'),
+    'at_least': (operator.ge, 'be at least'),
+    'nil_or': (lambda value, limit: value == 0 or value >= limit, 'be 0 or at least'),
+    'below': (operator.lt, 'be less than'),
+    'at_most': (operator.le, 'be at most'),
+    'shortest': (operator.ge, 'have at least'),
+    'longest': (operator.le, 'have at most'),
+}
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Where a number must lie, or how long a text or a list must be; and what says so."""
+
+    above: float | None = None
+    at_least: float | None = None
+    nil_or: float | None = None
+    below: float | None = None
+    at_most: float | None = None
+    shortest: int | None = None
+    longest: int | None = None
+    unit: str = ''
+    why: str = ''
+
+    def fault(self, value: Any) -> str | None:
+        """Say what is expected of a value that does not comply."""
+        is_sized = isinstance(value, str | tuple)
+        what = 'character' if isinstance(value, str) else 'number'
+        for name, (is_kept, said) in _RULES.items():
+            limit = getattr(self, name)
+            if limit is not None and not is_kept(len(value) if is_sized else value, limit):
+                shown = counted(limit, what) if is_sized else f'{limit:g}'
+                return f'must {said} {shown}'
+        return None
+
+
+def _between(lower: float, upper: float, unit: str, why: str) -> Bounds:
+    return Bounds(at_least=lower, at_most=upper, unit=unit, why=why)
+
+
+def _positive(lower: float, upper: float, unit: str, why: str) -> Bounds:
+    return Bounds(above=0.0, at_least=lower, at_most=upper, unit=unit, why=why)
+
+
+def _nil_or(lower: float, upper: float, unit: str, why: str) -> Bounds:
+    return Bounds(at_least=0.0, nil_or=lower, at_most=upper, unit=unit, why=why)
+
+
+def _up_to(upper: float, unit: str, why: str) -> Bounds:
+    return Bounds(at_least=0.0, at_most=upper, unit=unit, why=why)
+
+
+_PREPARED: dict[str, Bounds] = {
+    # The unit.
+    'full scale': _positive(1e-6, 1e16, 'input units', 'a float holds whole counts up to 9e15'),
+    'full-scale force': _positive(1e-3, 1e7, 'm/s^2', 'a relative gravimeter; a gun'),
+    'scale factor': _positive(1e-9, 1e9, 'input units per m/s^2', 'by magnitude'),
+    'cycle time': _positive(1e-7, 1e5, 's', 'a converter of 10 MHz; a sample a day'),
+    'gravity': Bounds(above=9.0, below=10.5, unit='m/s^2', why='on Earth 9.76 to 9.84'),
+    'angular rate': _between(-1e3, 1e3, 'rad/s', '57000 deg/s'),
+    # Temperatures.
+    'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='0 K; solder melts'),
+    'temperature span': _positive(1e-2, 1273.15, 'K', 'what a thermometer tells apart'),
+    'temperature rate': _between(-1e5, 1e5, 'K/min', 'a thermal shock is 1e3'),
+    'rate span': _positive(1e-6, 2e5, 'K/min', 'a kelvin in two years'),
+    'time constant': _positive(1e-3, 1e8, 's', 'a bare wire; three years'),
+    'lag': _nil_or(1e-3, 1e8, 's', 'as a time constant; 0 is none'),
+    # The response.
+    'value of a column': _between(-1e10, 1e10, 'of its kind', 'the cube of 1273 K is 2e9'),
+    'span of a column': _positive(1e-9, 2e10, 'of its kind', 'a millionth of a rate of 0.1 K/min'),
+    'width': _nil_or(1e-4, 1e4, 'K', 'what a thermometer tells apart; beyond any difference'),
+    'gradient': _between(-1273.15, 1273.15, 'K', '0 K to where solder melts'),
+    'power': Bounds(at_least=0, at_most=4, why='beyond the third nobody has seen one'),
+    # Noise and deviations.
+    'noise density': _positive(1e-12, 1e3, 'm/s^2/sqrt(Hz)', 'a thousandth of the best; 100 g'),
+    'rate noise density': _positive(1e-12, 1e3, 'rad/s/sqrt(Hz)', 'of the best; 57000 deg/s'),
+    'slow noise': _up_to(1e3, 'm/s^2/sqrt(h)', '100 g in an hour'),
+    'rate slow noise': _up_to(1e3, 'rad/s/sqrt(h)', '57000 deg/s in an hour'),
+    'deviation': _up_to(1e4, 'm/s^2', '1000 g: nothing is known'),
+    'rate deviation': _up_to(1e3, 'rad/s', '57000 deg/s: nothing is known'),
+    'misalignment deviation': _up_to(1.0, 'rad', 'nothing is known'),
+    # What a fit tells of itself, and of its bags.
+    'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
+    'number': _up_to(1e15, '', 'a float tells all of them apart'),
+    'log evidence': _between(-1e15, 1e15, '', 'of so many samples'),
+    'deviation of a weight': _up_to(1e16, 'of its column', 'the largest full scale'),
+    # Thermometers and detector.
+    'reading noise': _positive(1e-6, 1e2, 'K', 'a microkelvin thermometer; none at all'),
+    'quantum': _up_to(1e2, 'K', 'coarser than any'),
+    'ramp': _positive(1e-6, 1e5, 'K/min', 'a kelvin in two years; a thermal shock is 1e3'),
+    'false alarms': _positive(1e-12, 1e4, '1/h', 'one in the age of the Earth; three a second'),
+    'ripple': _up_to(1e3, 'K', 'more than any chamber'),
+    'dwell': _up_to(1e7, 's', 'four months'),
+    # How much a file may hold of one kind.
+    'coefficients': Bounds(shortest=1, longest=12, why='t^11 follows any curve'),
+    'knots': Bounds(longest=100, why='ten per ten kelvins'),
+    'columns': Bounds(longest=2000, why='the bank of ten thermometers'),
+}
+#: By name; the keys of a calibration take theirs from here.
+QUANTITIES: Final[Mapping[str, Bounds]] = MappingProxyType(_PREPARED)
+
+
+@cache
+def _bounds_of(cls: type) -> dict[str, tuple[Bounds, ...]]:
+    hints = typing.get_type_hints(cls, include_extras=True)
+    notes = {name: getattr(hint, '__metadata__', ()) for name, hint in hints.items()}
+    return {
+        name: tuple(one for one in own if isinstance(one, Bounds)) for name, own in notes.items()
+    }
+
+
+def refuse_impossible(value: Any) -> None:
+    """Raise ValueError, with the name of the key, where a dataclass does not keep its bounds."""
+    cls: type = type(value)
+    for name, bounds in _bounds_of(cls).items():
+        for one in bounds:
+            if fault := one.fault(getattr(value, name)):
+                raise ValueError(f'`{name}` {fault}, got {getattr(value, name)}')
