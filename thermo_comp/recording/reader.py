@@ -57,7 +57,7 @@ class RecordingReader(ExitStack):
             self.info = self._open(path)
             self.definitions = {k: d for one in self._files for k, d in one.definitions.items()}
             with translated(path):
-                found = select_topics(self.info.topics, topics, require)
+                found = select_topics(self.info.topics, topics, require, self.info.metadata)
             self.topics: Mapping[Role, str] = found[0]
             self.info = replace(self.info, input=found[1], chosen=found[2])
         except BaseException as error:
