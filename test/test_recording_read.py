@@ -472,6 +472,15 @@ def test_what_is_corrected_already_is_explained(tmp_path: Path) -> None:
         assert reader.topics['accel'] == '/imu/data_raw'
 
 
+def test_one_topic_for_two_inputs_is_refused_by_its_name(tmp_path: Path) -> None:
+    path = written(tmp_path / 'bag', 'imu/temperature', 'temperature/case')
+    for second in ('case', 'temperature/lid'):
+        names = {'board': '/imu/temperature', second: 'imu/temperature'}
+        told = f'/imu/temperature: one topic for both board and {second.rpartition("/")[2]}: '
+        with pytest.raises(RecordingError, match=told):
+            open_recording(path, Topics.named(names), require=('accel',))
+
+
 def test_a_fit_that_fails_names_the_topic_that_was_taken(tmp_path: Path) -> None:
     source, _ = recording_source(driver_bag(tmp_path / 'bag', ('imu/data', 'imu')))
     assert source.name == 'bag (/imu/data)'

@@ -31,6 +31,8 @@ _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
 
 #: Names of further thermometers: those that a role has not.
 _NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
+#: What is said of a topic for two inputs, offline and live.
+TWINS = 'one topic for both {} and {}: a single thermometer is the board, leave the other out'
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
@@ -179,7 +181,16 @@ def select_topics(
     if own and 'accel' not in found:
         chosen.append(_said_own(own))
     found |= _further(present, topics, found, is_read=bool(require))
+    _check_twins(found)
     return found, cast(Any, keys.get('accel')), '; '.join(filter(None, chosen)) or None
+
+
+def _check_twins(found: Mapping[Role, str]) -> None:
+    """Refuse one topic for two inputs."""
+    roles: dict[str, Role] = {}
+    for role, name in found.items():
+        if (twin := roles.setdefault(name, role)) != role:
+            raise RecordingError(TWINS.format(twin, role), key=shown(name))
 
 
 def _candidates(

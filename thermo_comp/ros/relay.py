@@ -30,8 +30,10 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
+from ..errors import ThermoCompError
 from ..online.compensator import Compensator
 from ..online.status import STAMPED_TOPIC, stamped_flag
+from ..recording.topics import TWINS
 from .parameters import NodeConfig
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
@@ -162,6 +164,11 @@ class Relay:
             name: loop.subscribe(Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False)
             for name in compensator.thermal.inputs
         }
+        roles: dict[str, str] = {}
+        for name, one in self.thermometers.items():
+            topic = one.subscription.topic_name
+            if (twin := roles.setdefault(topic, name)) != name:
+                raise ThermoCompError(TWINS.format(twin, name), key=topic)
         imu = loop.publisher(Imu, 'imu/data_raw', OUTPUT_QOS)
         self._publish: Callable[[bytes], None] = imu.handle.publish_raw
         self._flag = loop.publisher(Bool, 'regime/dynamic', FLAG_QOS)
