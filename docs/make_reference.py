@@ -67,7 +67,7 @@ stamps are carried through; the node never stamps with its own clock and needs n
 | in, with `input:=imu` | `imu/uncompensated` | sensor_msgs/Imu, m/s^2; orientation and its covariance pass through, and so do angular rate and its covariance unless the calibration has a `gyroscope` | same |
 | in | `temperature/board`, `temperature/case`, and `temperature/<name>` for any more that the calibration names | sensor_msgs/Temperature, degC | best effort, keep last 50 |
 | out | `imu/data_raw` | sensor_msgs/Imu, specific force in m/s^2 | reliable |
-| out | `regime/dynamic` | std_msgs/Bool: S = 1; on every change and with every case temperature; nothing while unknown | reliable, transient local |
+| out | `regime/dynamic` | std_msgs/Bool: S = 1; on every change and with every reading that decides: of the case, or of the board while there is no case; nothing while unknown | reliable, transient local |
 | out | `regime/stamped` | diagnostic_msgs/DiagnosticArray: the same flag with the stamp of the reading that decides; `status[0].message` is `dynamic` or `static` | reliable, transient local |
 | out | `/diagnostics` | diagnostic_msgs/DiagnosticArray, 1 Hz, hardware_id = serial | reliable |
 
