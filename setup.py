@@ -70,6 +70,7 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         shared('config', '*.yaml', '*.json', '*.xml'),
         shared('config/columns', '*.yaml'),
+        shared('config/drivers', '*.yaml'),
         shared('launch', '*.xml', '*.py'),
     ],
     install_requires=INSTALL,

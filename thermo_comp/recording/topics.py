@@ -10,10 +10,12 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
-from ..errors import RecordingError
+from ..errors import RecordingError, ThermoCompError
+from ..plain_yaml import read_plain_yaml
 from ..text import one_line
 from .columns import Input, Role
 
@@ -21,6 +23,8 @@ VECTOR3_STAMPED = 'geometry_msgs/msg/Vector3Stamped'
 IMU = 'sensor_msgs/msg/Imu'
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
 BOOL = 'std_msgs/msg/Bool'
+#: What a thermometer may be without naming a field, and the field that it is then.
+PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {'counts': VECTOR3_STAMPED, 'imu': IMU, 'board': TEMPERATURE, 'case': TEMPERATURE}
 #: The driver's topic in REP 145, and the node's output: what is beside it tells which.
@@ -85,7 +89,8 @@ class Topics:
     A name matches with or without its leading slash and, where only one topic fits, with any
     namespace in front. Where no usual name is there, imu/data_raw is taken, else the bag's only
     topic of the type, an Imu rather than a Vector3Stamped. Further thermometers are found beside
-    the board's, ``temperature/<name>``, or named.
+    the board's, ``temperature/<name>``, or named. A thermometer may be a field of any message,
+    ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
 
     counts: str = 'accel/counts'
@@ -105,9 +110,13 @@ class Topics:
         roles: dict[str, Any] = {}
         further = {}
         for name, topic in names.items():
+            if name == 'output':  # of the node
+                continue
             own = name.removeprefix('temperature/')
             if not topic.strip('/'):
                 raise ValueError(f'`{name}` needs the name of a topic')
+            if ':' in topic and own in ('counts', 'imu'):
+                raise ValueError(f'`{name}` takes whole messages, got the field {topic}')
             if own in _TYPES and (own == name or _TYPES[own] == TEMPERATURE):
                 roles[own] = topic
             elif own != name and is_thermometer(own):
@@ -123,6 +132,37 @@ class Topics:
 
 
 _USUAL = Topics()
+
+
+class Selected(NamedTuple):
+    """Which topics feed the roles, by which fields, what the input is and what was chosen."""
+
+    topics: dict[Role, str]
+    fields: dict[Role, str]
+    input: Literal['counts', 'imu'] | None
+    chosen: str | None
+
+
+def read_names(path: str | Path) -> dict[str, str]:
+    """Read a file of ``INPUT: TOPIC`` lines, as the drivers' in config/drivers."""
+    found = read_plain_yaml(path)
+    if not isinstance(found, dict) or not all(isinstance(one, str) for one in found.values()):
+        raise ThermoCompError('expected INPUT: TOPIC, one a line', path)
+    return found
+
+
+def parse_name(text: str) -> tuple[str, str]:
+    """Read ``INPUT=TOPIC``; ValueError for another form."""
+    name, equals, topic = text.strip().partition('=')
+    if not equals:
+        raise ValueError(f'expected INPUT=TOPIC, got {text}')
+    return name, topic
+
+
+def split_field(topic: str) -> tuple[str, str]:
+    """Part a topic from the field of its messages that is read; none is ''."""
+    name, _, field = topic.partition(':')
+    return name, field
 
 
 def is_thermometer(name: str) -> bool:
@@ -148,7 +188,7 @@ def select_topics(
     topics: Topics,
     require: Collection[Role],
     metadata: Mapping[str, str] = MappingProxyType({}),
-) -> tuple[dict[Role, str], Literal['counts', 'imu'] | None, str | None]:
+) -> Selected:
     """
     Find the topics that feed the roles, as far as they have messages, what the accelerometer's is,
     and what was taken for want of the usual name. RecordingError for a topic that is ambiguous, of
@@ -164,7 +204,7 @@ def select_topics(
         names = dict(_candidates(present, topics, wanted, own))
         key = next((key for key, name in names.items() if present[name][1]), next(iter(names), ''))
         if key:
-            name = _of_type(present, names[key], _TYPES[key])
+            name = _of_type(present, names[key], _TYPES[key], getattr(topics, key))
             if present[name][1]:
                 found[role], keys[role] = name, key
             elif role in require:
@@ -181,15 +221,20 @@ def select_topics(
     if own and 'accel' not in found:
         chosen.append(_said_own(own))
     found |= _further(present, topics, found, is_read=bool(require))
-    _check_twins(found)
-    return found, cast(Any, keys.get('accel')), '; '.join(filter(None, chosen)) or None
+    named = {**topics.further, 'board': topics.board, 'case': topics.case}
+    fields = {role: split_field(named.get(role, ''))[1] for role in found if role != 'accel'}
+    fields = {role: one or PLAIN.get(present[found[role]][0], '') for role, one in fields.items()}
+    fields = {role: one for role, one in fields.items() if one}
+    _check_twins(found, fields)
+    said = '; '.join(filter(None, chosen)) or None
+    return Selected(found, fields, cast(Any, keys.get('accel')), said)
 
 
-def _check_twins(found: Mapping[Role, str]) -> None:
-    """Refuse one topic for two inputs."""
-    roles: dict[str, Role] = {}
+def _check_twins(found: Mapping[Role, str], fields: Mapping[Role, str]) -> None:
+    """Refuse one topic, or one field of it, for two inputs."""
+    roles: dict[tuple[str, str], Role] = {}
     for role, name in found.items():
-        if (twin := roles.setdefault(name, role)) != role:
+        if (twin := roles.setdefault((name, fields.get(role, '')), role)) != role:
             raise RecordingError(TWINS.format(twin, role), key=shown(name))
 
 
@@ -252,7 +297,7 @@ def _further(
     for own, wanted in topics.further.items():
         name = _match(present, wanted, f'temperature/{own}')
         if name is not None:
-            both[own] = _of_type(present, name, TEMPERATURE)
+            both[own] = _of_type(present, name, TEMPERATURE, wanted)
         elif is_read:
             raise _missing(present, {f'temperature/{own}': wanted})
     beside = found.get('board') or found.get('case') or ''
@@ -267,9 +312,12 @@ def _further(
     return dict(sorted(both.items()))
 
 
-def _of_type(present: Present, name: str, expected: str) -> str:
+def _of_type(present: Present, name: str, expected: str, wanted: str) -> str:
     kind = present[name][0]
-    if kind != expected:
+    is_number = expected == TEMPERATURE and (split_field(wanted)[1] or kind in PLAIN)
+    if kind != expected and not is_number:
+        if expected == TEMPERATURE:
+            expected += ', std_msgs/msg/Float32 or Float64; else name a field, TOPIC:FIELD'
         reason = f'the topic has type {shown(kind)}, expected {expected}'
         raise RecordingError(reason, key=shown(name))
     return name
@@ -282,7 +330,7 @@ def is_called(name: str, wanted: str) -> bool:
 
 def _match(present: Present, wanted: str, key: str) -> str | None:
     """Find a topic by its name, or the only one that has the name behind a namespace."""
-    bare = wanted.strip('/')
+    bare = split_field(wanted)[0].strip('/')
     spaced = [name for name in present if name.strip('/') == bare][:1]
     spaced = spaced or sorted(name for name in present if name.endswith('/' + bare))
     if len(spaced) > 1:

@@ -100,7 +100,11 @@ class CompensationNode:
         self.node.destroy_node()
 
     def _report_every(self, period_s: float) -> None:
-        self._loop.call_every(period_s, lambda: self._reporter.report(self._loaded))
+        self._loop.call_every(period_s, self._report)
+
+    def _report(self) -> None:
+        self._relay.look()
+        self._reporter.report(self._loaded)
 
     def _prepare(self, changes: list[Parameter]) -> LoadedCalibration | None:
         """Read the calibration that a change asks for, beside the samples."""
