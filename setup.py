@@ -71,6 +71,7 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         shared('config', '*.yaml', '*.json', '*.xml'),
         shared('config/columns', '*.yaml'),
+        shared('config/drivers', '*.yaml'),
         shared('launch', '*.xml', '*.py'),
     ],
     install_requires=INSTALL,

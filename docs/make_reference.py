@@ -78,9 +78,9 @@ stamps are carried through; the node never stamps with its own clock and needs n
 |---|---|---|---|
 | in | `accel/counts` | geometry_msgs/Vector3Stamped, counts per cycle | best effort, keep last 2000 |
 | in, with `input:=imu` | `imu/uncompensated` | sensor_msgs/Imu, m/s^2; orientation and its covariance pass through, and so do angular rate and its covariance unless the calibration has a `gyroscope` | same |
-| in | `temperature/board`, `temperature/case`, and `temperature/<name>` for any more that the calibration names | sensor_msgs/Temperature, degC | best effort, keep last 50 |
+| in | `temperature/board`, `temperature/case`, and `temperature/<name>` for any more that the calibration names | sensor_msgs/Temperature, std_msgs/Float32 or Float64, or a field of any message, degC | best effort, keep last 50 |
 | out | `imu/data_raw` | sensor_msgs/Imu, specific force in m/s^2 | reliable |
-| out | `regime/dynamic` | std_msgs/Bool: S = 1; on every change and with every case temperature; nothing while unknown | reliable, transient local |
+| out | `regime/dynamic` | std_msgs/Bool: S = 1; on every change and with every reading that decides: of the case, or of the board while there is no case; nothing while unknown | reliable, transient local |
 | out | `regime/stamped` | diagnostic_msgs/DiagnosticArray: the same flag with the stamp of the reading that decides; `status[0].message` is `dynamic` or `static` | reliable, transient local |
 | out | `/diagnostics` | diagnostic_msgs/DiagnosticArray, 1 Hz, hardware_id = serial | reliable |
 
@@ -97,6 +97,15 @@ the middleware some four times, a quarter of the node's CPU time. A sample lost 
 calibration at this thermal state. Without angular rate or orientation in the input, the first element
 of their covariance is -1 (REP 145). Where the calibration has a `gyroscope`, `angular_velocity` is less its bias at this
 thermal state, and `angular_velocity_covariance` is ours: the noise of one message and what is uncertain of that bias.
+
+## A driver's own topics
+
+The parameter `topics` names the inputs where the driver has them, as `--topic` does offline:
+`topics:=imu=/imu/data,board=/fmu/out/sensor_accel:temperature`, or a file of such lines, of which [config/drivers](drivers.md)
+has some. `TOPIC:FIELD` is a number inside a message, written as for `ros2 topic echo --field`; its type is asked of the
+publisher while the node runs, and only the messages of the driver's package have to be installed. A message without a
+header has no stamp: its reading counts from the newest sample that came before it. `output=TOPIC` names the output, for
+a driver that publishes `imu/data_raw` itself; the node refuses an output that is its input.
 
 ## Recording a test
 

@@ -26,6 +26,7 @@ from std_msgs.msg import Bool
 
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.ros.round_trip import lossless
+from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.unit.calibration import Calibration, Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
@@ -283,6 +284,23 @@ def test_diagnostics_tell_noise_and_bias_apart(
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
             # The regime is unknown: the two sets of that gyroscope differ by some 30 urad/s.
             assert 1e-5 < float(values[f'bias sd of rate {axis} [rad/s]']) < 1e-3
+
+
+@pytest.mark.parametrize('was_fitted_with_case', [False, True])
+def test_a_case_is_missed_only_by_a_calibration_that_knew_one(
+    peer: Peer, saved: Callable[..., list[str]], was_fitted_with_case: bool
+) -> None:
+    seen = DetectorSettings(case=ThermometerSettings(noise_sd_c=0.05))
+    unit = thermal_calibration()
+    unit = replace(unit, detector=seen) if was_fitted_with_case else unit
+    wait = diagnosis(peer)
+    with node_in_thread(*saved(unit)) as node:
+        driver = drive(peer, node)
+        driver.temperatures(START_NS, 20.0)
+        driver.counts(START_NS, *standing(0))
+        _, status, values = wait(lambda _, values: values['samples out'] == '1')
+        assert ('case temperature lost' in status.message) == was_fitted_with_case
+        assert values['case age [s]'] == 'inf'
 
 
 def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]) -> None:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import csv
 import gc
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +42,7 @@ def _collected():
     gc.collect()
 
 
-def thermal_test(path: Path, imu: bool = False) -> int:
+def thermal_test(path: Path, imu: bool = False, has_case: bool = True) -> int:
     """
     Write a soak, a ramp and a soak, with readings that come late; return the number of samples.
 
@@ -64,6 +65,8 @@ def thermal_test(path: Path, imu: bool = False) -> int:
             # The third thermometer of that calibration.
             ('temperature/frame', 0.5 * (board + case) + 1.0, 700_000_000),
         ):
+            if topic == TOPICS.case and not has_case:
+                continue
             noisy = values + 0.004 * rng.standard_normal(len(values))
             late = late_ns * (rng.random(len(values)) < 0.3)
             writer.write_temperature(topic, reading_ns, noisy, reading_ns + late)
@@ -129,6 +132,17 @@ def test_counts(tmp_path: Path) -> None:
     unit = replace(rich_calibration(), unit=UNIT)
     # All but what comes before the first board temperature, which is not late by chance.
     assert run(unit, tmp_path / 'bag', tmp_path) == n
+
+
+def test_the_board_says_the_regime_where_there_is_no_case(tmp_path: Path) -> None:
+    # WHY: nobody published `regime/dynamic`, and the table of a replay said `unknown` throughout.
+    n = thermal_test(tmp_path / 'bag', has_case=False)
+    unit = replace(rich_calibration(), unit=UNIT)
+    assert run(unit, tmp_path / 'bag', tmp_path) == n
+    replay(tmp_path / 'bag', unit, tmp_path / 'out.csv')
+    with (tmp_path / 'out.csv').open() as file:
+        regimes = {row['regime'] for row in csv.DictReader(file)}
+    assert regimes == {'unknown', 'static', 'dynamic'}
 
 
 def test_imu_in_another_frame(tmp_path: Path) -> None:

@@ -82,6 +82,16 @@ def test_bad_start(
     assert text in line
 
 
+def test_one_topic_for_two_thermometers(unit: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    remaps = [f'temperature/{name}:=/imu/temperature' for name in ('board', 'case')]
+    words = [word for one in remaps for word in ('-r', one)]
+    assert main([*arguments(f'calibration_file:={unit}'), *words]) == 1
+    assert capfd.readouterr().err == (
+        'thermo_comp_node: /imu/temperature: one topic for both board and case: a single '
+        'thermometer is the board, leave the other out\n'
+    )
+
+
 def test_bad_start_as_a_process_is_one_line_too(tmp_path: Path) -> None:
     finished = subprocess.run(
         [sys.executable, '-m', 'thermo_comp.ros.node', *arguments('calibration_file:=none')[1:]],

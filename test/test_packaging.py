@@ -161,7 +161,7 @@ def test_share_holds_what_ros_looks_for(tmp_path: Path) -> None:
     share = tmp_path / 'prefix' / 'share'
     assert (share / 'ament_index/resource_index/packages/thermo_comp').is_file()
     assert (share / 'thermo_comp/package.xml').is_file()
-    for folder in ('config', 'config/columns', 'launch'):
+    for folder in ('config', 'config/columns', 'config/drivers', 'launch'):
         kept = {p.name for p in (ROOT / folder).glob('*') if p.suffix in ('.yaml', '.xml')}
         there = share / 'thermo_comp' / folder
         assert kept <= {p.name for p in there.glob('*')}, folder

@@ -30,7 +30,7 @@ from .online.compensator import HELD, SWAPPED, Compensator
 from .online.status import STAMPED_TOPIC, STAMPED_TYPE, CompensatorConfig, Counters, stamped_flag
 from .recording.columns import Block, ImuColumns, Messages, RecordingInfo, Role
 from .recording.reader import RecordingReader, open_recording
-from .recording.topics import Topics
+from .recording.topics import TEMPERATURE, Topics
 from .recording.writer import TABLES, BagWriter, WriteRows, table_writer
 from .typing import Ints
 from .unit.calibration import Calibration
@@ -170,7 +170,7 @@ def _messages_of(
     """Write blocks as the node's messages, and beside them what was recorded until then."""
     with bag as writer:
         taken = {OUTPUT_TOPIC, REGIME_TOPIC, STAMPED_TOPIC}
-        taken |= {topic.strip('/') for topic in reader.topics.values()}
+        taken |= {reader.topics[one].strip('/') for one in reader.topics.keys() - reader.fields}
         others = {topic for topic in reader.info.topics if topic.strip('/') not in taken}
         following = reader.raw(others if all_topics else ())
         one = next(following, None)
@@ -203,8 +203,10 @@ def _messages_of(
                 writer.write_raw(STAMPED_TOPIC, STAMPED_TYPE, times, stamped)
             # Their log time becomes their stamp, as that of the outputs is.
             for role, messages in block.raw.items():
-                name = reader.topics[role]
-                copy(name, reader.info.topics[name][0], messages, block.stamp_ns[role])
+                name, kind = reader.topics[role], ''
+                if role in reader.fields:
+                    name, kind = f'temperature/{role}', TEMPERATURE
+                copy(name, kind or reader.info.topics[name][0], messages, block.stamp_ns[role])
             if len(block):
                 copy_others(block.log_ns['accel'][-1])
             writer.flush()

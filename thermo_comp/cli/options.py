@@ -109,16 +109,11 @@ def names(
     topics: Path | None = option('The same from a file, INPUT: TOPIC a line.', metavar='YAML'),
 ) -> dict[str, str]:
     """Collect what `--topic` says, and what of the file it does not."""
-    from ..plain_yaml import read_plain_yaml
+    from ..recording.topics import parse_name, read_names
 
-    found: Any = {} if topics is None else read_plain_yaml(topics)
-    if not isinstance(found, dict) or not all(isinstance(one, str) for one in found.values()):
-        raise ThermoCompError(f'{topics}: expected INPUT: TOPIC, one a line')
-    for one in topic or ():
-        name, equals, where = one.partition('=')
-        if not equals:
-            raise usage(f'--topic: expected INPUT=TOPIC, got {one}')
-        found[name] = where
+    found = {} if topics is None else read_names(topics)
+    with usage_of('--topic: '):
+        found |= map(parse_name, topic or ())
     return found
 
 

@@ -17,7 +17,7 @@ from ..errors import FitError
 from ..files import shown_name
 from ..recording.columns import Block, Input, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
-from ..recording.topics import Topics
+from ..recording.topics import Topics, is_called, shown
 from ..typing import Floats
 
 _SAMPLES: tuple[Role, ...] = ('accel',)
@@ -97,7 +97,10 @@ def recording_source(
                 if progress is not None and total:
                     progress(min(n_read / total, 1.0))
 
-    name = f'{shown_name(path)}{topics.part if topics else ""}'
+    wanted = topics or Topics()
+    name = f'{shown_name(path)}{wanted.part}'
+    if topic and not any(is_called(topic, one) for one in (wanted.counts, wanted.imu)):
+        name += f' ({shown(topic)})'  # every message then says which topic was taken
     serial = info.metadata.get('serial')
     return FitSource(name, blocks, serial=serial, reader=lambda: latest), info
 

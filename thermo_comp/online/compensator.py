@@ -215,7 +215,7 @@ class Compensator:
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Take the regime flags that became due: (stamp of the leading sensor's reading, S)."""
+        """Take the regime flags that became due: (stamp of the reading that decides, S)."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 

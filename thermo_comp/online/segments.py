@@ -140,13 +140,16 @@ class ThermalSide:
         tracker = self.tracker
         if not tracker.read(name, stamp_ns, celsius):
             self._count_rejected(name, 1)
-        elif name == BOARD_INPUT:
+            return
+        if name == BOARD_INPUT:
             self.counters.n_board += 1
+            decides = not tracker.is_live(stamp_ns, tracker.case)
         else:
             self.counters.n_case += 1
-            regime = tracker.detector.regime
-            if name == self.inputs[1] and regime is not Regime.UNKNOWN:
-                self.flags.append((stamp_ns, regime is Regime.DYNAMIC))
+            decides = name == self.inputs[1]
+        regime = tracker.detector.regime
+        if decides and regime is not Regime.UNKNOWN:
+            self.flags.append((stamp_ns, regime is Regime.DYNAMIC))
 
     def _count_rejected(self, name: str, n_readings: int) -> None:
         if name == BOARD_INPUT:

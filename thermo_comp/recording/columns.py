@@ -29,6 +29,9 @@ ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 #: A block is given out once it has so many messages: what is done per block costs little then.
 BLOCK_MESSAGES = 1 << 15
 
+#: The stamp of what has none: before any that a clock gives, and what a header can hold.
+NO_STAMP_NS = -(2**31) * 10**9
+_JUMP_NS = 10**9  # stamps that go back further are a jump of time, as for the compensator
 LONGEST_PAUSE_NS = 3600 * 10**9  # what a longer jump of the stamps becomes [ns]
 #: More jumps are no clock; and so many days need a message every so many seconds.
 _MOST_JUMPS = 100
@@ -322,6 +325,37 @@ def joined(blocks: Sequence[Block]) -> Block:
         {role: np.concatenate([b.log_ns[role] for b in blocks]) for role in blocks[0].log_ns},
         {role: join_messages(own) for role, own in raws.items()},
     )
+
+
+def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
+    """
+    Give readings without a stamp that of the sample before them, in the block or `last_ns` before
+    it, and tell the newest; readings before any sample are left out.
+
+    So does the node: arrival is told by the samples' own clock, however fast a bag is played.
+    """
+    samples = np.concatenate(([last_ns], block.accel_stamp_ns))
+    jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
+    newest = np.concatenate([np.maximum.accumulate(run) for run in np.split(samples, jumps)])
+    temperatures, kept = dict(block.temperatures), {}
+    for name, one in block.temperatures.items():
+        is_bare = one.stamp_ns == NO_STAMP_NS
+        if is_bare.any():
+            stamp_ns = np.where(is_bare, newest[one.after], one.stamp_ns)
+            temperatures[name] = one._replace(stamp_ns=stamp_ns)
+            kept[name] = stamp_ns != NO_STAMP_NS
+            if name in block.raw:
+                _restamp(block.raw[name], stamp_ns)
+    if kept:
+        everything = {role: np.ones(len(own), bool) for role, own in block.log_ns.items()}
+        block = replace(block, temperatures=temperatures).take({**everything, **kept})
+    return block, int(newest[-1])
+
+
+def _restamp(messages: Messages, stamp_ns: Ints) -> None:
+    """Write stamps into serialized messages, little-endian and with a header each."""
+    stamps = np.stack((stamp_ns // 10**9, stamp_ns % 10**9), axis=1).astype('<i4')
+    scatter(messages.data, messages.start + 4, stamps.view((np.void, 8))[:, 0])
 
 
 def clocks_apart(block: Block) -> str:

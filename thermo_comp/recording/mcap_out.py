@@ -29,9 +29,9 @@ from .. import __version__
 from ..errors import RecordingError
 from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
 from .columns import Messages, join_messages, scatter
+from .fields import typestore
 from .mcap_file import MAGIC, METADATA_NAME
 from .topics import BOOL
-from .wire import typestore
 
 Compression = Literal['none', 'lz4', 'zstd']
 

@@ -15,9 +15,10 @@ import numpy as np
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..thermal.thermometer import COLDEST, HOTTEST
 from .columns import Readings, RecordingInfo
-from .reader import open_recording
+from .fields import temperature_fields
+from .reader import RecordingReader, open_recording
 from .stillness import CellAccumulator, still_intervals
-from .topics import Topics
+from .topics import PLAIN, TEMPERATURE, Topics, shown
 
 #: What no board endures, and a thermometer in kelvins reads.
 KELVINS = (180.0, 480.0)
@@ -60,14 +61,17 @@ class Survey:
     findings: list[str]
 
 
-def thermal_findings(thermometers: Mapping[str, ThermometerSurvey]) -> list[str]:
-    """Say what of thermometers, span and ramps is missing."""
+def thermal_findings(
+    thermometers: Mapping[str, ThermometerSurvey], candidates: Sequence[str] = ()
+) -> list[str]:
+    """Say what of thermometers, span and ramps is missing; `candidates` are unused topics."""
     found = []
+    among = f': {", ".join(candidates)}' if candidates else ''
     board = thermometers.get('board')
     if board is None:
         found.append(
             'no board temperature: a thermal fit needs temperature/board, or name yours with '
-            '--topic board=TOPIC'
+            f'--topic board=TOPIC{among}'
         )
     else:
         heating, cooling = board.steepest_heating_k_min, -board.steepest_cooling_k_min
@@ -86,8 +90,24 @@ def thermal_findings(thermometers: Mapping[str, ThermometerSurvey]) -> list[str]
     if 'case' not in thermometers:
         found.append(
             'no case temperature: the regime will follow the slower board sensor; name yours '
-            'with --topic case=TOPIC'
+            f'with --topic case=TOPIC{among}'
         )
+    return found
+
+
+def unused_thermometers(reader: RecordingReader) -> list[str]:
+    """List what else in a bag may be a thermometer: a barometer's, the air's, another IMU's."""
+    found = []
+    paths = {role: one.path for role, one in reader.fields.items()}
+    used = {(name, paths.get(role)) for role, name in reader.topics.items()}
+    for name, (kind, count) in sorted(reader.info.topics.items()):
+        if not count or (name, None) in used:
+            continue
+        if kind == TEMPERATURE or (kind in PLAIN and 'temp' in name.lower()):
+            found.append(shown(name))
+            continue
+        fields = temperature_fields(kind, reader.definitions)
+        found += [shown(f'{name}:{one}') for one in fields if (name, one) not in used]
     return found
 
 
@@ -125,7 +145,7 @@ def survey_recording(
             cells.add(stamp_ns, block.accel, rate)
             if progress is not None and total:
                 progress(n / total)
-        info = reader.info
+        info, candidates = reader.info, unused_thermometers(reader)
     reduced = cells.finish()
     still = still_intervals(reduced, _MIN_REST_S) if n > 1 else []
     found = ((name, survey_thermometer(own)) for name, own in readings.items())
@@ -134,7 +154,7 @@ def survey_recording(
         (info.truncated, f'cut off: {info.truncated}'),
         (reader.apart, 'a fit needs one clock for all'),
         (not n, _NO_SAMPLES),
-        *((True, one) for one in thermal_findings(thermometers)),
+        *((True, one) for one in thermal_findings(thermometers, candidates)),
         (n and not still, 'it never rests for 3 s: the fit works on positions at rest'),
         (n_backwards, f'{n_backwards} stamps do not rise: those samples are left out'),
         (n_gaps, f'{n_gaps} gaps, the longest {longest_gap:.3g} s'),

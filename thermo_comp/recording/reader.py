@@ -25,9 +25,10 @@ from ..plain_yaml import PlainYamlError, load_plain_yaml
 from . import columns
 from .chunks import MAX_CHUNK_BYTES, expand, inflate, inflate_ros1_chunk, translated
 from .columns import ROLES, Block, Messages, RecordingInfo, Role, Topic
+from .fields import Field, definitions_of
 from .mcap_file import McapFile
-from .topics import WHOLE, Topics, select_topics, shown
-from .wire import decode_blocks
+from .topics import WHOLE, Selected, Topics, select_topics, shown
+from .wire import Feed, decode_blocks
 
 _MAX_BYTES = 1 << 24
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
@@ -42,7 +43,8 @@ class RecordingReader(ExitStack):
 
     Roles that are required are an error where they are absent. `info` is what the bag says of
     itself; once all blocks are read, its `truncated` names what did not come. `topics` are the
-    bag's own names, `definitions` encoding and text of message types. Raises RecordingError for
+    bag's own names, `fields` what is read of messages that hold more than the role, and
+    `definitions` encoding and text of message types. Raises RecordingError for
     what is no bag, a damaged one, a missing or ambiguous topic.
     """
 
@@ -57,9 +59,13 @@ class RecordingReader(ExitStack):
             self.info = self._open(path)
             self.definitions = {k: d for one in self._files for k, d in one.definitions.items()}
             with translated(path):
-                found = select_topics(self.info.topics, topics, require)
-            self.topics: Mapping[Role, str] = found[0]
-            self.info = replace(self.info, input=found[1], chosen=found[2])
+                found = select_topics(self.info.topics, topics, require, self.info.metadata)
+                self.topics: Mapping[Role, str] = found.topics
+                self.fields = dict(self._fields(found))
+            bare = [role for role, one in self.fields.items() if not one.has_stamp]
+            said = f'{", ".join(bare)} without a stamp: counts from the sample before it'
+            chosen = '; '.join(filter(None, (found.chosen, said if bare else '')))
+            self.info = replace(self.info, input=found.input, chosen=chosen or None)
         except BaseException as error:
             self.close()
             if isinstance(error, OSError):
@@ -69,6 +75,15 @@ class RecordingReader(ExitStack):
         #: Where the part that is read begins, since the bag's first sample [s]; known then.
         self.since_s = 0.0
         self.apart = ''  # which thermometer has another clock, as far as is read
+
+    def _fields(self, found: Selected) -> Iterator[tuple[Role, Field]]:
+        for role, path in found.fields.items():
+            topic = found.topics[role]
+            kind = self.info.topics[topic][0]
+            try:
+                yield role, Field(kind, path, definitions_of(kind, self.definitions))
+            except RecordingError as error:
+                raise RecordingError(error.message, key=shown(f'{topic}:{path}')) from error
 
     def _open(self, path: Path) -> RecordingInfo:
         """Open the files; those that rosbag2 has compressed as a whole are expanded beside."""
@@ -118,17 +133,22 @@ class RecordingReader(ExitStack):
         return self._cut(self._blocks(raw))
 
     def _blocks(self, raw: bool = False) -> Iterator[Block]:
-        roles = {topic: role for role, topic in self.topics.items()}
-
         def decoded() -> Iterator[Block]:
-            for path, topics, messages in self._read(roles, {'cdr', 'ros1'}):
-                feeds = {number: (roles[one.name], one) for number, one in topics.items()}
+            for path, topics, messages in self._read(set(self.topics.values()), {'cdr', 'ros1'}):
+                feeds = [
+                    Feed(number, role, one, self.fields.get(role))
+                    for role, name in self.topics.items()
+                    for number, one in topics.items()
+                    if one.name == name
+                ]
                 with translated(path):
                     found = decode_blocks(messages, feeds, self.topics, keep_raw=raw)
                 yield from found
 
         n_read = dict.fromkeys(self.topics, 0)
-        for block in columns.gathered(decoded()):
+        last_ns = columns.NO_STAMP_NS
+        for gathered in columns.gathered(decoded()):
+            block, last_ns = columns.with_stamps(gathered, last_ns)
             self.apart = self.apart or columns.clocks_apart(block)
             for role in n_read:
                 n_read[role] += len(block.log_ns[role])
@@ -207,7 +227,7 @@ def read_recording(
 ) -> columns.Recording:
     """Read a whole bag into memory; as `open_recording`, and RecordingError for damaged data."""
     with open_recording(path, topics, require=require) as reader:
-        blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), {}, ROLES)
+        blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), (), ROLES)
         return columns.Recording(reader.info, columns.joined(blocks))
 
 

@@ -7,12 +7,15 @@ Owns the search for the inputs' topics in a bag, and the sentences said when one
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite
-from typing import Any, Literal, cast
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple, cast
 
-from ..errors import RecordingError
+from ..errors import RecordingError, ThermoCompError
+from ..plain_yaml import read_plain_yaml
 from ..text import one_line
 from .columns import Input, Role
 
@@ -20,12 +23,20 @@ VECTOR3_STAMPED = 'geometry_msgs/msg/Vector3Stamped'
 IMU = 'sensor_msgs/msg/Imu'
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
 BOOL = 'std_msgs/msg/Bool'
+#: What a thermometer may be without naming a field, and the field that it is then.
+PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {'counts': VECTOR3_STAMPED, 'imu': IMU, 'board': TEMPERATURE, 'case': TEMPERATURE}
-_OUTPUT = '/imu/data_raw'  # what the node gives out is no input of it
+#: The driver's topic in REP 145, and the node's output: what is beside it tells which.
+_RAW = 'imu/data_raw'
+_BESIDE_OUTPUT = ('regime/dynamic', 'regime/stamped')
+#: Words in the names of vector topics that are no specific force.
+_NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
 
 #: Names of further thermometers: those that a role has not.
 _NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
+#: What is said of a topic for two inputs, offline and live.
+TWINS = 'one topic for both {} and {}: a single thermometer is the board, leave the other out'
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
@@ -76,8 +87,10 @@ class Topics:
     """
     Where the inputs stand in a bag, which of counts and Imu is read, and which part of it.
     A name matches with or without its leading slash and, where only one topic fits, with any
-    namespace in front. Where a usual name is not there, the bag's only topic of the type is taken.
-    Further thermometers are found beside the board's, ``temperature/<name>``, or named.
+    namespace in front. Where no usual name is there, imu/data_raw is taken, else the bag's only
+    topic of the type, an Imu rather than a Vector3Stamped. Further thermometers are found beside
+    the board's, ``temperature/<name>``, or named. A thermometer may be a field of any message,
+    ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
 
     counts: str = 'accel/counts'
@@ -90,13 +103,20 @@ class Topics:
 
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> Topics:
-        """Take topics by ``counts``, ``imu``, ``board``, ``case`` or ``temperature/<name>``."""
+        """
+        Take topics by ``counts``, ``imu``, ``board``, ``case`` or ``temperature/<name>``; of
+        counts and Imu the only one that is named is read.
+        """
         roles: dict[str, Any] = {}
         further = {}
         for name, topic in names.items():
+            if name == 'output':  # of the node
+                continue
             own = name.removeprefix('temperature/')
             if not topic.strip('/'):
                 raise ValueError(f'`{name}` needs the name of a topic')
+            if ':' in topic and own in ('counts', 'imu'):
+                raise ValueError(f'`{name}` takes whole messages, got the field {topic}')
             if own in _TYPES and (own == name or _TYPES[own] == TEMPERATURE):
                 roles[own] = topic
             elif own != name and is_thermometer(own):
@@ -105,10 +125,44 @@ class Topics:
                 raise ValueError(
                     f'`{name}` is no input; expected {", ".join(_TYPES)} or temperature/NAME'
                 )
+        given = [key for key in ('counts', 'imu') if key in roles]
+        if len(given) == 1 and others.get('input', 'auto') == 'auto':
+            others['input'] = given[0]
         return cls(**roles, further=further, **others)
 
 
 _USUAL = Topics()
+
+
+class Selected(NamedTuple):
+    """Which topics feed the roles, by which fields, what the input is and what was chosen."""
+
+    topics: dict[Role, str]
+    fields: dict[Role, str]
+    input: Literal['counts', 'imu'] | None
+    chosen: str | None
+
+
+def read_names(path: str | Path) -> dict[str, str]:
+    """Read a file of ``INPUT: TOPIC`` lines, as the drivers' in config/drivers."""
+    found = read_plain_yaml(path)
+    if not isinstance(found, dict) or not all(isinstance(one, str) for one in found.values()):
+        raise ThermoCompError('expected INPUT: TOPIC, one a line', path)
+    return found
+
+
+def parse_name(text: str) -> tuple[str, str]:
+    """Read ``INPUT=TOPIC``; ValueError for another form."""
+    name, equals, topic = text.strip().partition('=')
+    if not equals:
+        raise ValueError(f'expected INPUT=TOPIC, got {text}')
+    return name, topic
+
+
+def split_field(topic: str) -> tuple[str, str]:
+    """Part a topic from the field of its messages that is read; none is ''."""
+    name, _, field = topic.partition(':')
+    return name, field
 
 
 def is_thermometer(name: str) -> bool:
@@ -124,12 +178,17 @@ def shown(name: str) -> str:
 def said_choice(name: str, key: str, wanted: str, among: str = 'only') -> str:
     """Say that a topic was taken for an input by its type; nothing where it is the one wanted."""
     kind = _TYPES[key].rpartition('/')[2]
-    return '' if _fits(name, wanted) else f'{shown(name)}, its {among} {kind}, is taken for {key}'
+    return (
+        '' if is_called(name, wanted) else f'{shown(name)}, its {among} {kind}, is taken for {key}'
+    )
 
 
 def select_topics(
-    present: Present, topics: Topics, require: Collection[Role]
-) -> tuple[dict[Role, str], Literal['counts', 'imu'] | None, str | None]:
+    present: Present,
+    topics: Topics,
+    require: Collection[Role],
+    metadata: Mapping[str, str] = MappingProxyType({}),
+) -> Selected:
     """
     Find the topics that feed the roles, as far as they have messages, what the accelerometer's is,
     and what was taken for want of the usual name. RecordingError for a topic that is ambiguous, of
@@ -139,21 +198,95 @@ def select_topics(
         raise RecordingError('the bag holds no messages')
     found: dict[Role, str] = {}
     keys: dict[Role, str] = {}
+    own = _corrected(present, metadata)
     inputs = ['counts', 'imu'] if topics.input == 'auto' else [topics.input]
-    for role, own in {'accel': inputs, 'board': ['board'], 'case': ['case']}.items():
-        names = {key: name for key in own if (name := _find(present, topics, key)) is not None}
+    for role, wanted in {'accel': inputs, 'board': ['board'], 'case': ['case']}.items():
+        names = dict(_candidates(present, topics, wanted, own))
         key = next((key for key, name in names.items() if present[name][1]), next(iter(names), ''))
         if key:
-            name = _of_type(present, names[key], _TYPES[key])
+            name = _of_type(present, names[key], _TYPES[key], getattr(topics, key))
             if present[name][1]:
                 found[role], keys[role] = name, key
             elif role in require:
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
-            raise _missing(present, {key: getattr(topics, key) for key in own})
-    chosen = [said_choice(found[role], key, getattr(topics, key)) for role, key in keys.items()]
+            raise _missing(present, {key: getattr(topics, key) for key in wanted}, own)
+    among = ["driver's", 'only']  # the name that drivers use, else nothing else has the type
+    chosen = [
+        said_choice(
+            found[role], key, getattr(topics, key), among[not is_called(found[role], _RAW)]
+        )
+        for role, key in keys.items()
+    ]
+    if own and 'accel' not in found:
+        chosen.append(_said_own(own))
     found |= _further(present, topics, found, is_read=bool(require))
-    return found, cast(Any, keys.get('accel')), '; '.join(filter(None, chosen)) or None
+    named = {**topics.further, 'board': topics.board, 'case': topics.case}
+    fields = {role: split_field(named.get(role, ''))[1] for role in found if role != 'accel'}
+    fields = {role: one or PLAIN.get(present[found[role]][0], '') for role, one in fields.items()}
+    fields = {role: one for role, one in fields.items() if one}
+    _check_twins(found, fields)
+    said = '; '.join(filter(None, chosen)) or None
+    return Selected(found, fields, cast(Any, keys.get('accel')), said)
+
+
+def _check_twins(found: Mapping[Role, str], fields: Mapping[Role, str]) -> None:
+    """Refuse one topic, or one field of it, for two inputs."""
+    roles: dict[tuple[str, str], Role] = {}
+    for role, name in found.items():
+        if (twin := roles.setdefault((name, fields.get(role, '')), role)) != role:
+            raise RecordingError(TWINS.format(twin, role), key=shown(name))
+
+
+def _candidates(
+    present: Present, topics: Topics, keys: Sequence[str], own: str
+) -> Iterator[tuple[str, str]]:
+    """Give topics that may feed an input: by name, by REP 145, by type; an Imu before counts."""
+    for key in keys:
+        if (name := _match(present, getattr(topics, key), key)) is not None:
+            yield key, name
+            if present[name][1]:
+                return
+    usual = [key for key in keys if getattr(topics, key) == getattr(_USUAL, key)]
+    taken = [*(getattr(topics, other) for other in _TYPES), *topics.further.values()]
+    for key in ('imu', 'counts', 'board'):
+        if key not in usual:
+            continue
+        of_type = [
+            name
+            for name, (kind, count) in present.items()
+            if count
+            and kind == _TYPES[key]
+            and name != own
+            and not any(is_called(name, other) for other in taken)
+        ]
+        raw = [name for name in of_type if is_called(name, _RAW)]
+        only = raw or of_type
+        if key == 'counts':
+            only = [name for name in only if not _NO_FORCE.search(name)]
+        if len(only) == 1:
+            yield key, only[0]
+        if of_type and key == 'imu':
+            return  # several: no vector is taken for want of a choice
+
+
+def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
+    """Find the topic that the node or `replay` wrote; nothing where there is none."""
+    for name in present:
+        front = name.removesuffix(_RAW)
+        is_beside = any(front + other in present for other in _BESIDE_OUTPUT)
+        if is_called(name, _RAW) and (is_beside or 'corrected_by' in metadata):
+            return name
+    return ''
+
+
+def _among(present: Present, name: str) -> str:
+    n_alike = sum(count > 0 and kind == present[name][0] for kind, count in present.values())
+    return 'only' if n_alike == 1 else "driver's"
+
+
+def _said_own(name: str) -> str:
+    return f'{shown(name)} is corrected already: thermo_comp wrote it, it is not an input'
 
 
 def _further(
@@ -164,7 +297,7 @@ def _further(
     for own, wanted in topics.further.items():
         name = _match(present, wanted, f'temperature/{own}')
         if name is not None:
-            both[own] = _of_type(present, name, TEMPERATURE)
+            both[own] = _of_type(present, name, TEMPERATURE, wanted)
         elif is_read:
             raise _missing(present, {f'temperature/{own}': wanted})
     beside = found.get('board') or found.get('case') or ''
@@ -179,21 +312,25 @@ def _further(
     return dict(sorted(both.items()))
 
 
-def _of_type(present: Present, name: str, expected: str) -> str:
+def _of_type(present: Present, name: str, expected: str, wanted: str) -> str:
     kind = present[name][0]
-    if kind != expected:
+    is_number = expected == TEMPERATURE and (split_field(wanted)[1] or kind in PLAIN)
+    if kind != expected and not is_number:
+        if expected == TEMPERATURE:
+            expected += ', std_msgs/msg/Float32 or Float64; else name a field, TOPIC:FIELD'
         reason = f'the topic has type {shown(kind)}, expected {expected}'
         raise RecordingError(reason, key=shown(name))
     return name
 
 
-def _fits(name: str, wanted: str) -> bool:
+def is_called(name: str, wanted: str) -> bool:
+    """Tell whether a bag's topic has a name, perhaps with a namespace in front."""
     return f'/{name.strip("/")}'.endswith(f'/{wanted.strip("/")}')
 
 
 def _match(present: Present, wanted: str, key: str) -> str | None:
     """Find a topic by its name, or the only one that has the name behind a namespace."""
-    bare = wanted.strip('/')
+    bare = split_field(wanted)[0].strip('/')
     spaced = [name for name in present if name.strip('/') == bare][:1]
     spaced = spaced or sorted(name for name in present if name.endswith('/' + bare))
     if len(spaced) > 1:
@@ -205,30 +342,13 @@ def _match(present: Present, wanted: str, key: str) -> str | None:
     return spaced[0] if spaced else None
 
 
-def _find(present: Present, topics: Topics, key: str) -> str | None:
-    wanted: str = getattr(topics, key)
-    name = _match(present, wanted, key)
-    # A case is no board, and a bag without a case's thermometer is an ordinary one.
-    if name is not None or key == 'case' or wanted != getattr(_USUAL, key):
-        return name
-    taken = [getattr(topics, other) for other in _TYPES if other != key]
-    taken += topics.further.values()
-    only = [
-        name
-        for name, (kind, count) in present.items()
-        if count
-        and kind == _TYPES[key]
-        and not name.endswith(_OUTPUT)
-        and not any(_fits(name, other) for other in taken)
-    ]
-    return only[0] if len(only) == 1 else None
-
-
-def _missing(present: Present, wanted: Mapping[str, str]) -> RecordingError:
+def _missing(present: Present, wanted: Mapping[str, str], own: str = '') -> RecordingError:
     names = sorted(present)[:_MAX_LISTED]
     listed = ', '.join(f'{shown(name)} ({shown(present[name][0])})' for name in names)
     if len(present) > len(names):
         listed += f' and {len(present) - len(names)} more'
+    if own and not {'counts', 'imu'}.isdisjoint(wanted):
+        listed += f'; {_said_own(own)}'
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
     return RecordingError(
         f'no such topic; the bag has {listed}; name another with {option}',

@@ -16,11 +16,10 @@ which stamps and numbers are views. Messages of ROS 1 are serialized anew by `ro
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
 from struct import pack
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,7 @@ from numpy.typing import NDArray
 from ..errors import RecordingError
 from ..typing import Bytes, Floats, Ints
 from .columns import ROLES, Block, ImuColumns, Messages, Readings, Role, Topic, gather, number_at
+from .fields import Field, typestore
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, shown
 
 #: How many float64 numbers follow the header of each type.
@@ -41,32 +41,40 @@ _MAX_PADDING = 7
 _NS = 1_000_000_000
 
 
+class Feed(NamedTuple):
+    """Which role a channel of a bag feeds, with its topic; a field of its messages, or all."""
+
+    channel: int
+    role: Role
+    topic: Topic
+    field: Field | None = None
+
+
 def decode_blocks(
-    messages: Messages,
-    feeds: Mapping[int, tuple[Role, Topic]],
-    roles: Iterable[Role],
-    *,
-    keep_raw: bool = False,
+    messages: Messages, feeds: Collection[Feed], roles: Iterable[Role], *, keep_raw: bool = False
 ) -> list[Block]:
     """
-    Decode messages, in their order; a block ends where the frame changes. `feeds` are role and
-    topic of each channel, `roles` those of the whole bag. RecordingError, without a path, for a
+    Decode messages, in their order; a block ends where the frame changes. `roles` are those of the
+    whole bag. A field's reading is kept as a Temperature. RecordingError, without a path, for a
     message whose bytes do not fit its type.
     """
     roles = tuple(dict.fromkeys((*ROLES, *roles)))
-    topics = dict(feeds.values())
+    topics = {feed.role: feed.topic for feed in feeds}
+    fields = {feed.role: feed.field for feed in feeds if feed.field is not None}
     is_imu = 'accel' in topics and topics['accel'].type == IMU
     temperatures, log_ns, raw = {}, {}, {}
     for role in roles:
         kind = TEMPERATURE if role != 'accel' else IMU if is_imu else VECTOR3_STAMPED
-        channels = {number: topic for number, (own, topic) in feeds.items() if own == role}
+        channels = {feed.channel: feed.topic for feed in feeds if feed.role == role}
         rank = messages.places_of(channels)
         own = messages.take(rank)
         try:
             if len({topic[:3] for topic in channels.values()}) > 1:
                 raise RecordingError('its messages have several encodings')
             if role in topics and topics[role].encoding == 'ros1':
-                own = as_cdr(own, kind)
+                own = as_cdr(own, topics[role].type)
+            if role in fields:
+                own = _as_temperatures(own, *fields[role].read(own))
             stamp_ns, numbers, frame = decode_stamped(own, kind)
         except RecordingError as error:
             raise RecordingError(error.message, key=shown(topics[role].name)) from error
@@ -97,6 +105,14 @@ def decode_blocks(
             raw,
         )
     ]
+
+
+def _as_temperatures(messages: Messages, stamp_ns: Ints, values: Floats) -> Messages:
+    """Serialize readings in place of the messages that hold them."""
+    rows = encode_stamped(stamp_ns, '', N_NUMBERS[TEMPERATURE], [(0, values[:, None])])
+    size = np.full(len(rows), rows.shape[1])
+    begins = np.cumsum(size) - size
+    return Messages(rows.ravel(), begins, size, messages.channel, messages.log_ns)
 
 
 def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:
@@ -170,14 +186,6 @@ def encode_stamped(
         if values.ndim > 1:
             numbers[:, column : column + values.shape[1]] = values
     return data
-
-
-@lru_cache(maxsize=1)
-def typestore() -> Any:
-    """Give the message types of ROS 2 Jazzy."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def as_cdr(messages: Messages, kind: str) -> Messages:

@@ -25,13 +25,22 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
+from ..errors import ThermoCompError
 from ..online.status import STAMPED_TOPIC
-from ..recording.columns import Messages, Role, Topic
+from ..recording.columns import NO_STAMP_NS, Messages, Role, Topic, with_stamps
 from ..recording.growing import News
-from ..recording.topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics, is_thermometer
-from ..recording.wire import decode_blocks
+from ..recording.topics import (
+    IMU,
+    TEMPERATURE,
+    VECTOR3_STAMPED,
+    Topics,
+    is_thermometer,
+    split_field,
+)
+from ..recording.wire import Feed, decode_blocks
 from ..recording.writer import BagWriter
 from ..typing import Ints
+from .fields import LiveField, live_field
 from .waitloop import RawSubscription, WaitLoop, own_node, type_name
 
 #: The node's outputs.
@@ -158,6 +167,8 @@ class LiveTopics(_Listener):
         super().__init__('thermo_comp_record', ros_args)
         self._topics = topics
         self._feeds: dict[Role, Topic] = {}
+        self._fields: dict[Role, LiveField] = {}
+        self._last_ns = NO_STAMP_NS
         self.problems: tuple[str, ...] = ()  # why nothing comes, one sentence each
 
     def _open(self) -> None:
@@ -180,16 +191,21 @@ class LiveTopics(_Listener):
             # The thread may have put more behind them.
             del self._came[: len(waiting)]
             if waiting:
-                feeds = dict(enumerate(self._feeds.items()))
-                numbers = {role: number for number, (role, _) in feeds.items()}
+                feeds = [Feed(k, *one) for k, one in enumerate(self._feeds.items())]
+                numbers = {feed.role: feed.channel for feed in feeds}
                 messages = Messages.of(
-                    [one for _, messages, _ in waiting for one in messages],
+                    [one for role, own, _ in waiting for one in self._readable(role, own)],
                     [numbers[role] for role, messages, _ in waiting for _ in messages],
                     [one for _, _, received_ns in waiting for one in received_ns],
                 ).in_order()
-                for block in decode_blocks(messages, feeds, numbers, keep_raw=True):
+                for decoded in decode_blocks(messages, feeds, numbers, keep_raw=True):
+                    block, self._last_ns = with_stamps(decoded, self._last_ns)
                     yield block, None
             yield None
+
+    def _readable(self, role: Role, messages: list[bytes]) -> list[bytes]:
+        field = self._fields.get(role)
+        return messages if field is None else list(map(field.as_temperature, messages))
 
     def _look(self) -> None:
         """Subscribe to what is published; say what is not."""
@@ -218,14 +234,22 @@ class LiveTopics(_Listener):
 
     def _hear(self, role: Role, topic: str, kind: str, problems: list[str]) -> bool:
         """Subscribe to a topic if somebody publishes it; tell whether it is heard."""
-        name = self._node.resolve_topic_name(topic)
+        name = self._node.resolve_topic_name(split_field(topic)[0])
         if role in self._heard:
             n_publishers = self._heard[role].count_publishers()
             if n_publishers != 1:
                 problems.append(f'{n_publishers or "no"} publishers on {name}, expected one')
             return True
         offers = self._node.get_publishers_info_by_topic(name)
-        if any(one.topic_type != kind for one in offers):
+        try:
+            field = live_field(self._node, topic) if kind == TEMPERATURE else None
+        except ThermoCompError as error:
+            problems.append(str(error))
+            return False
+        if field is not None:
+            self._fields[role], self._feeds[role] = field, Topic(name, TEMPERATURE, 'cdr')
+            self._heard[role] = self._loop.subscribe(field.kind, name, _AS_OFFERED, is_hot=False)
+        elif any(one.topic_type != kind for one in offers):
             problems.append(f'{name} has the type {offers[0].topic_type}, expected {kind}')
         elif offers:
             self._feeds[role] = Topic(name, kind, 'cdr')

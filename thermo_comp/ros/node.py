@@ -81,7 +81,7 @@ class CompensationNode:
         self._reporter = Reporter(self._loop, self._relay)
         self._reader = Reader()
         self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
-        self._loop.call_every(config.diagnostics_period, self._reporter.report)
+        self._report_every(config.diagnostics_period)
         topics = [self.node.resolve_topic_name(topic) for _, topic in INPUTS.values()]
         # The input that is not open may be opened later, with these.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
@@ -103,6 +103,13 @@ class CompensationNode:
         self._reader.close()
         self._requests.close()
         self.node.destroy_node()
+
+    def _report_every(self, period_s: float) -> None:
+        self._loop.call_every(period_s, self._report)
+
+    def _report(self) -> None:
+        self._relay.look()
+        self._reporter.report()
 
     @property
     def _config(self) -> parameters.NodeConfig:
@@ -154,7 +161,7 @@ class CompensationNode:
     def _run_with(self, running: Running) -> None:
         period_s, self._relay.running = self._config.diagnostics_period, running
         if running.config.diagnostics_period != period_s:
-            self._loop.call_every(running.config.diagnostics_period, self._reporter.report)
+            self._report_every(running.config.diagnostics_period)
 
     def _check(
         self, loaded: LoadedCalibration, config: parameters.NodeConfig, inputs: tuple[str, ...]

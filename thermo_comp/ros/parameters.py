@@ -28,6 +28,7 @@ from rclpy.service import Service
 
 from ..errors import ThermoCompError
 from ..online.status import CompensatorConfig
+from ..recording.topics import Topics, parse_name, read_names
 from ..text import LONGEST_SERIAL, one_line
 from .waitloop import WaitLoop, overrides
 
@@ -49,7 +50,7 @@ def _parameter(
 
 @dataclass(frozen=True, slots=True)
 class NodeConfig:
-    """The parameters, all live but `calibration_directory`; descriptions have the units."""
+    """The parameters, live but for two; descriptions have the units."""
 
     calibration_file: str = _parameter(
         '',
@@ -66,9 +67,17 @@ class NodeConfig:
     serial: str = _parameter(
         '', 'Serial number that the calibration must be for; empty accepts any.'
     )
+    topics: str = _parameter(
+        '',
+        'Topics of the inputs other than above: INPUT=TOPIC[:FIELD] by commas, or a file of such '
+        'lines, as config/drivers has. Only at start.',
+        longest=4096,
+        is_fixed=True,
+    )
     input: str = _parameter(
         'counts',
-        'What is compensated: accel/counts (Vector3Stamped) or imu/uncompensated (Imu).',
+        'What is compensated: accel/counts (Vector3Stamped) or imu/uncompensated (Imu); the one '
+        'that `topics` names, if it names one.',
         choices=('counts', 'imu'),
     )
     frame_id: str = _parameter(
@@ -129,11 +138,26 @@ class ParameterError(ThermoCompError):
 def declare(node: Node) -> NodeConfig:
     """Declare every parameter with the user's value; ParameterError where it does not fit."""
     values, given = {}, overrides(node)
+    names = named_topics(_checked('topics', given.get('topics', '')))
+    inputs = [one for one in ('counts', 'imu') if one in names]
+    if len(inputs) == 1:
+        given['input'] = inputs[0]
     for name, entry in _TABLE.items():
         # Not by rclpy, to whom a whole number is no float.
         values[name] = _checked(name, given.get(name, entry.default))
         node.declare_parameter(name, values[name], descriptor(name), ignore_override=True)
     return NodeConfig(**values)
+
+
+def named_topics(text: str) -> dict[str, str]:
+    """Read the parameter `topics`: by input the topic; ParameterError for what is none."""
+    try:
+        names = dict(map(parse_name, text.split(','))) if '=' in text else {}
+        names = read_names(text) if text and not names else names
+        Topics.named(names)
+    except ValueError as error:
+        raise ParameterError(f'parameter `topics`: {error}') from error
+    return names
 
 
 def descriptor(name: str) -> ParameterDescriptor:

@@ -19,6 +19,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from operator import itemgetter
 from typing import Any
 
@@ -30,10 +31,14 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
+from ..errors import ThermoCompError
 from ..online.compensator import Compensator
 from ..online.segments import Model
 from ..online.status import STAMPED_TOPIC, stamped_flag
-from .parameters import NodeConfig
+from ..recording.columns import NO_STAMP_NS
+from ..recording.topics import TWINS, split_field
+from .fields import LiveField, live_field
+from .parameters import NodeConfig, named_topics
 from .reader import LoadedCalibration
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
@@ -173,20 +178,67 @@ class Relay:
         config: NodeConfig,
     ) -> None:
         self._loop = loop
+        self._names = named_topics(config.topics)
         self.traffic = Traffic()
         samples = self._open_samples(config)
         self.running = Running(loaded, config, compensator, samples, self._converter(config))
-        #: By their names.
+        #: By their names; and the fields of those that are no Temperature.
         self.thermometers = {
-            name: loop.subscribe(Temperature, f'temperature/{name}', TEMPERATURE_QOS, is_hot=False)
+            name: loop.subscribe(
+                Temperature, split_field(self._topic(name))[0], TEMPERATURE_QOS, is_hot=False
+            )
             for name in compensator.thermal.inputs
         }
-        imu = loop.publisher(Imu, 'imu/data_raw', OUTPUT_QOS)
+        self._fields: dict[str, LiveField] = {}
+        self._problems: set[str] = set()
+        imu = loop.publisher(Imu, self._names.get('output', 'imu/data_raw'), OUTPUT_QOS)
         self._publish: Callable[[bytes], None] = imu.handle.publish_raw
+        self._check_topics(imu.topic_name)
         self._flag = loop.publisher(Bool, 'regime/dynamic', FLAG_QOS)
         self._stamped = loop.publisher(DiagnosticArray, STAMPED_TOPIC, FLAG_QOS)
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
+
+    def _topic(self, name: str) -> str:
+        """Give the topic of a thermometer, with the field of its messages if one is named."""
+        usual = f'temperature/{name}'
+        return self._names.get(name, self._names.get(usual, usual))
+
+    def _check_topics(self, output: str) -> None:
+        """Refuse one topic for two thermometers, and an output that is the input."""
+        roles: dict[tuple[str, str], str] = {}
+        for name, one in self.thermometers.items():
+            topic = one.subscription.topic_name
+            twin = roles.setdefault((topic, split_field(self._topic(name))[1]), name)
+            if twin != name:
+                raise ThermoCompError(TWINS.format(twin, name), key=topic)
+        if self.samples.subscription.topic_name == output:
+            reason = 'is both input and output: remap imu/data_raw to another name'
+            raise ThermoCompError(reason, key=output)
+
+    def look(self) -> None:
+        """Subscribe anew to thermometers whose messages turn out to be of another type."""
+        for name, one in list(self.thermometers.items()):
+            if name in self._fields or one.count_publishers():
+                continue
+            try:
+                field = live_field(self._loop.node, self._topic(name))
+            except ThermoCompError as error:
+                if str(error) not in self._problems:
+                    self._problems.add(str(error))
+                    self._loop.node.get_logger().error(str(error))
+                continue
+            if field is not None:
+                self._fields[name], topic = field, one.subscription.topic_name
+                self._loop.unsubscribe(self.thermometers.pop(name))
+                # The middleware has one type a topic: when the loop has let go of the first.
+                self._loop.call_soon(partial(self._hear, name, topic, field))
+
+    def _hear(self, name: str, topic: str, field: LiveField) -> None:
+        one = self._loop.subscribe(field.kind, topic, TEMPERATURE_QOS, is_hot=False)
+        everything = {**self.thermometers, name: one}
+        names = self.running.compensator.thermal.inputs
+        self.thermometers = {own: everything[own] for own in names if own in everything}
 
     @property
     def samples(self) -> RawSubscription:
@@ -199,7 +251,9 @@ class Relay:
         return {'sample': self.samples, **self.thermometers}
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
-        return self._loop.subscribe(*INPUTS[config.input], SAMPLE_QOS)
+        """Subscribe to the samples of a configuration."""
+        kind, usual = INPUTS[config.input]
+        return self._loop.subscribe(kind, self._names.get(config.input, usual), SAMPLE_QOS)
 
     def _converter(self, config: NodeConfig) -> SampleConverter:
         return SampleConverter(INPUTS[config.input][0], config.frame_id, self.traffic)
@@ -248,6 +302,8 @@ class Relay:
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:
+            if reading[1] == NO_STAMP_NS:
+                continue  # only a sample tells when it came
             if reading[1] <= horizon_ns:
                 compensator.push(*reading)
             else:
@@ -256,12 +312,14 @@ class Relay:
         self._publish_flags()
 
     def _take_readings(self, name: str, messages: list[bytes], received_ns: list[int]) -> None:
+        read = self._fields[name].read if name in self._fields else read_temperature
         for data, received in zip(messages, received_ns, strict=True):
-            reading = read_temperature(data)
+            reading = read(data)
             if reading is None:
                 self.traffic.n_malformed += 1
             else:
-                self._newest_reading_ns = reading[0]
+                if reading[0] != NO_STAMP_NS:
+                    self._newest_reading_ns = reading[0]
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
@@ -273,7 +331,12 @@ class Relay:
         for received, reading in readings:
             end = bisect_left(received_ns, received, start)
             self._relay(messages[start:end])
-            push(*reading)
+            name, stamp_ns, celsius = reading
+            now_ns = self.running.compensator.now_ns
+            if stamp_ns != NO_STAMP_NS:
+                push(name, stamp_ns, celsius)
+            elif now_ns is not None:
+                push(name, now_ns, celsius)
             start = end
         return messages[start:]
 

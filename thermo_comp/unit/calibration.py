@@ -28,7 +28,7 @@ import numpy as np
 
 from ..quantities import QUANTITIES, Bounds
 from ..text import LONGEST_SERIAL, valid_serial
-from ..thermal.settings import DetectorSettings
+from ..thermal.settings import DetectorSettings, ThermometerSettings
 from .columns import Column
 from .functions import TemperatureFunction, check_reference
 from .gyroscope import LARGEST_RATE, Gyroscope
@@ -402,6 +402,16 @@ class Calibration:
         for rate in (*own.static.axes(), *own.dynamic.axes()) if own else ():
             weights += (rate.delta, *rate.bias_function.free_coefficients)
         return any(weights) or bool(self.response or (own and own.response))
+
+    @property
+    def needs_case(self) -> bool:
+        """Whether it was fitted with a case thermometer, or has columns made of its readings."""
+        own = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
+        return self.detector.case != ThermometerSettings() or any(
+            one.kind in {'now', 'neighbour', 'size', 'even'}
+            or (one.kind == 'square' and not one.tau_s)
+            for one in own
+        )
 
     @property
     def has_uncertainty(self) -> bool:

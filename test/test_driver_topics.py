@@ -1,0 +1,179 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A driver's own topics over DDS: a temperature in another message, or without a stamp."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+from builders import thermal_calibration
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.serialization import deserialize_message, serialize_message
+from ros_helpers import SECOND_NS, TIMEOUT, Peer, node_in_thread, stamped, standing
+from sensor_msgs.msg import BatteryState, Temperature
+from std_msgs.msg import Float64
+
+from thermo_comp.errors import ThermoCompError
+from thermo_comp.recording.topics import Topics
+from thermo_comp.ros.fields import LiveField
+from thermo_comp.ros.listener import LiveTopics
+from thermo_comp.ros.node import main
+from thermo_comp.unit.calibration import Unit
+from thermo_comp.unit.calibration_file import save_calibration
+
+START_NS = 1_767_225_600 * SECOND_NS
+NAMES = {'board': '/pack:temperature', 'case': '/case_t'}
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    path = tmp_path / 'unit.yaml'
+    save_calibration(thermal_calibration(), path)
+    return path
+
+
+def arguments(unit: Path, topics: str) -> list[str]:
+    words = [f'calibration_file:={unit}', f'topics:={topics}', 'diagnostics_period:=0.05']
+    return [word for override in words for word in ('-p', override)]
+
+
+def sample(stamp_ns: int) -> Vector3Stamped:
+    message = stamped(Vector3Stamped(), stamp_ns, 'imu')
+    message.vector.x, message.vector.y, message.vector.z = standing(0)
+    return message
+
+
+@pytest.mark.parametrize('is_file', [False, True])
+def test_the_node_finds_the_type_while_it_runs(peer: Peer, unit: Path, is_file: bool) -> None:
+    topics = ','.join(f'{name}={topic}' for name, topic in NAMES.items())
+    if is_file:
+        (unit.parent / 'lab.yaml').write_text(
+            ''.join(f'{name}: {topic}\n' for name, topic in NAMES.items())
+        )
+        topics = str(unit.parent / 'lab.yaml')
+    heard = peer.listen(DiagnosticArray, '/diagnostics')
+
+    def values(**expected: float) -> Callable[[], bool]:
+        def look() -> bool:
+            found = {one.key: one.value for array in heard for one in array.status[0].values}
+            return all(
+                found.get(name, 'x').replace('.', '').lstrip('-').isdecimal()
+                and abs(float(found[name]) - value) < 1e-6
+                for name, value in expected.items()
+            )
+
+        return look
+
+    with node_in_thread(*arguments(unit, topics)):
+        # Each finds a subscriber of its own type.
+        board = peer.publisher(BatteryState, '/pack')
+        case = peer.publisher(Float64, '/case_t')
+        samples = peer.publisher(Vector3Stamped, 'accel/counts')
+        board.publish(stamped(BatteryState(temperature=25.0), START_NS))
+        peer.wait_for(values(unpublished=0), 'a report')
+        samples.publish(sample(START_NS))
+        peer.wait_for(values(**{'board temperature [degC]': 25.0}), 'the board')
+        # Without a stamp: it counts from the sample before it.
+        case.publish(Float64(data=23.0))
+        samples.publish(sample(START_NS + SECOND_NS))
+        samples.publish(sample(START_NS + 2 * SECOND_NS))
+        peer.wait_for(
+            values(**{'case minus board [K]': -2.0, 'case age [s]': 2.0}), 'the case, 2 s old'
+        )
+
+
+@pytest.mark.parametrize(
+    ('topics', 'text'),
+    [
+        ('bord=/t', 'parameter `topics`: `bord` is no input'),
+        ('board=/t,case', 'parameter `topics`: expected INPUT=TOPIC, got case'),
+        ('/none/drivers.yaml', '/none/drivers.yaml: cannot be read'),
+        ('board=/t,case=/t', '/t: one topic for both board and case'),
+        ('imu=/imu/data_raw', "must be 'm/s^2' (parameter `input` is imu), got 'counts'"),
+    ],
+)
+def test_topics_that_cannot_be(
+    unit: Path, topics: str, text: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['thermo_comp_node', '--ros-args', *arguments(unit, topics)]) == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert text in line
+
+
+def test_a_drivers_imu_data_raw_needs_another_output(
+    unit: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    calibration = replace(thermal_calibration(), unit=Unit('T-1', 'm/s^2', 160.0, 0.01))
+    save_calibration(calibration, unit, overwrite=True)
+    assert main(['thermo_comp_node', '--ros-args', *arguments(unit, 'imu=/imu/data_raw')]) == 1
+    said = '/imu/data_raw: is both input and output: remap imu/data_raw to another name'
+    assert said in capfd.readouterr().err
+    with node_in_thread(*arguments(unit, 'imu=/imu/data_raw,output=/imu/compensated')) as node:
+        assert node.node.count_publishers('/imu/compensated') == 1
+
+
+def test_record_writes_them_as_temperatures(peer: Peer) -> None:
+    found: dict[str, list[bytes]] = {}
+    pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
+    messages: list[tuple[str, Any]] = [
+        ('accel', sample(START_NS)),
+        ('case', Float64(data=23.0)),
+        ('board', stamped(BatteryState(temperature=25.0), START_NS + 5)),
+    ]
+    with LiveTopics(Topics.named({**NAMES, 'counts': 'accel/counts'})) as live:
+        publishers = {
+            'accel': peer.publisher(Vector3Stamped, 'accel/counts'),
+            'case': peer.publisher(Float64, '/case_t'),
+            'board': peer.publisher(BatteryState, '/pack'),
+        }
+        sent: list[str] = []
+
+        def wait(_seconds: float) -> bool:
+            """Send a message when the one before has come; end when all have."""
+            if len(found) == len(sent) < len(messages):
+                role, message = messages[len(sent)]
+                sent.append(role)
+                publishers[role].publish(message)
+            pause.wait(0.02)
+            return len(found) == len(messages) or time.monotonic() > deadline
+
+        for news in live.blocks(wait):
+            for role, own in news[0].raw.items() if news else ():
+                found.setdefault(role, []).extend(own)
+    case, board = (deserialize_message(found[one][0], Temperature) for one in ('case', 'board'))
+    # Without a stamp of its own, that of the sample before it.
+    assert (case.temperature, case.header.stamp.sec) == (23.0, START_NS // SECOND_NS)
+    assert (board.temperature, board.header.stamp.nanosec) == (25.0, 5)
+
+
+def test_a_live_field_reads_what_rclpy_wrote() -> None:
+    message = stamped(BatteryState(temperature=25.0, cell_temperature=[1.0, 2.5]), START_NS + 7)
+    data = serialize_message(message)
+    for path, value in (('temperature', 25.0), ('cell_temperature[1]', 2.5)):
+        field = LiveField('/pack', 'sensor_msgs/msg/BatteryState', path)
+        assert field.read(data) == (START_NS + 7, value)
+    assert LiveField('/pack', 'sensor_msgs/msg/BatteryState', 'cell_voltage[3]').read(data) is None
+    for kind, path, said in (
+        ('px4_msgs/msg/SensorAccel', 'temperature', '/t: its type px4_msgs.* is not installed'),
+        ('sensor_msgs/msg/Imu', 'temperature', 'Imu has no number `temperature`'),
+        ('sensor_msgs/msg/Imu', 'header', 'Imu has no number `header`'),
+    ):
+        with pytest.raises(ThermoCompError, match=said):
+            LiveField('/t', kind, path)

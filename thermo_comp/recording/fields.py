@@ -1,0 +1,224 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns one number inside messages of any type: found by the type's definition, in many at once.
+
+A topic is named ``TOPIC:FIELD``, as for ``ros2 topic echo --field``. In plain CDR a field begins
+at a multiple of its size behind the encapsulation; strings and sequences have their length, a
+uint32, in front. Positions are kept for all messages together and moved on field by field.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import ChainMap
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from ..errors import RecordingError
+from ..typing import Floats, Ints
+from .columns import NO_STAMP_NS, Messages, gather, number_at
+
+_STEP = re.compile(r'([A-Za-z]\w*)(?:\[([0-9]{1,6})\])?')
+_KINDS = {
+    'bool': 'u1', 'byte': 'u1', 'char': 'u1', 'octet': 'u1', 'int8': 'i1', 'uint8': 'u1',
+    'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4', 'int64': 'i8', 'uint64': 'u8',
+    'float32': 'f4', 'float64': 'f8',
+}  # fmt: skip
+_HEADER = 'std_msgs/msg/Header'
+_IDL = '=' * 80 + '\nIDL: '
+
+#: By type the constants and the fields, each a name and a description as `rosbags` has them.
+Definitions = Mapping[str, tuple[Any, list[tuple[str, Any]]]]
+
+
+@lru_cache(maxsize=1)
+def typestore() -> Any:
+    """Give the message types of ROS 2 Jazzy."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitions:
+    """Find what a type is made of: by the bag's definitions, else those of ROS 2 Jazzy."""
+    from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+
+    own: dict[str, Any] = {}
+    encoding, text = known.get(kind, ('', ''))
+    try:
+        if encoding == 'ros2msg':
+            own = get_types_from_msg(text, kind)
+        elif encoding == 'ros2idl':
+            for part in filter(None, text.split(_IDL)):
+                own |= get_types_from_idl(part.partition('\n')[2] if _IDL in text else part)
+    except TypesysError as error:
+        raise RecordingError(f'the definition of {kind} cannot be read') from error
+    found = ChainMap(own, typestore().fielddefs)
+    if kind not in found:
+        raise RecordingError(f'the bag does not define its type {kind}')
+    return found
+
+
+def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[str]:
+    """List the numbers of a type whose name says temperature."""
+    try:
+        fields = definitions_of(kind, known)[kind][1]
+    except RecordingError:
+        return []
+    return [
+        name
+        for name, (node, content) in fields
+        if 'temp' in name.lower() and node == _BASE and content[0] in _KINDS
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A number in the messages of a type, by names that lead to it; RecordingError for none."""
+
+    kind: str
+    path: str
+    definitions: Definitions
+
+    def __post_init__(self) -> None:
+        """Refuse a path that leads to no number."""
+        self._find(Messages.of([], [], []), self.path)
+
+    @property
+    def has_stamp(self) -> bool:
+        """Whether the messages have a header, or one within their own kind of header."""
+        return bool(self._header)
+
+    @property
+    def _header(self) -> str:
+        kind, path = self.kind, ''
+        for _ in range(2):
+            inner = dict(self.definitions[kind][1]).get('header')
+            if inner is None or inner[0] != _NAME:
+                return ''
+            kind, path = inner[1], f'{path}header.'
+            if kind == _HEADER:
+                return path
+        return ''
+
+    def read(self, messages: Messages) -> tuple[Ints, Floats]:
+        """Read stamps [ns], `NO_STAMP_NS` where messages have none, and numbers, shape (n,)."""
+        values = self._find(messages, self.path).astype(np.float64)
+        if not self.has_stamp:
+            return np.full(len(messages), NO_STAMP_NS), values
+        seconds, rest = (
+            self._find(messages, f'{self._header}stamp.{one}') for one in ('sec', 'nanosec')
+        )
+        return seconds.astype(np.int64) * 10**9 + rest, values
+
+    def _find(self, messages: Messages, path: str) -> Any:
+        try:
+            return self._walk(messages, path)
+        except RecursionError as error:
+            raise RecordingError(f'its type {self.kind} holds itself') from error
+
+    def _walk(self, messages: Messages, path: str) -> Any:
+        cursor, kind = _Cursor(messages, self.definitions), self.kind
+        description: Any = None
+        for step in path.split('.'):
+            match = _STEP.fullmatch(step)
+            fields = self.definitions[kind][1] if kind else []
+            if match is None or match[1] not in dict(fields):
+                among = ', '.join(name for name, _ in fields[:20]) or 'none'
+                raise RecordingError(f'{kind or "a number"} has the fields {among}, no `{step}`')
+            for name, description in fields:
+                if name == match[1]:
+                    break
+                cursor.skip(description)
+            if match[2] is not None:
+                description = cursor.enter(description, int(match[2]))
+            kind = description[1] if description[0] == _NAME else ''
+        if description[0] != _BASE or description[1][0] not in _KINDS:
+            raise RecordingError(f'`{path}` of {self.kind} is no number')
+        return cursor.number(_KINDS[description[1][0]])
+
+
+_BASE, _NAME, _ARRAY = (
+    1,
+    2,
+    3,
+)  # of a description: a basic type, a message, an array; or a sequence
+
+
+class _Cursor:
+    """Positions in many messages [bytes behind the encapsulation]."""
+
+    def __init__(self, messages: Messages, definitions: Definitions) -> None:
+        self._messages, self._definitions = messages, definitions
+        self._at = np.zeros(len(messages), np.int64)
+        heads = number_at(gather(messages.data, messages.start, 2), 0, '>u2')
+        if (messages.size < 4).any() or (heads > 1).any():
+            raise RecordingError('only plain CDR (0 or 1) is read')
+        self._is_big = heads == 0
+
+    def number(self, kind: str) -> Any:
+        """Read a number of each message, and go behind it."""
+        size = int(kind[1:])
+        self._at = (self._at + size - 1) // size * size
+        at, self._at = self._at + 4, self._at + size
+        if (self._at + 4 > self._messages.size).any():
+            raise RecordingError('damaged message: it ends inside a field')
+        rows = gather(self._messages.data, self._messages.start + at, size)
+        little, big = number_at(rows, 0, f'<{kind}'), number_at(rows, 0, f'>{kind}')
+        return np.where(self._is_big, big, little)
+
+    def skip(self, description: Any) -> None:
+        """Go behind a field."""
+        node, content = description
+        if node == _NAME:
+            for _, one in self._definitions[content][1]:
+                self.skip(one)
+        elif node != _BASE:
+            counts = self._count(description)
+            kind = _KINDS.get(content[0][1][0]) if content[0][0] == _BASE else None
+            if kind:
+                self._leap(counts, int(kind[1:]))
+            else:
+                self._skip_each(content[0], counts)
+        elif content[0] == 'string':
+            self._leap(self.number('u4').astype(np.int64), 1)
+        elif content[0] in _KINDS:
+            self._leap(np.ones_like(self._at), int(_KINDS[content[0]][1:]))
+        else:
+            raise RecordingError(f'a {content[0]} in front of the field is not understood')
+
+    def enter(self, description: Any, place: int) -> Any:
+        """Go to an element of an array or a sequence, and give its description."""
+        if description[0] in (_BASE, _NAME):
+            raise RecordingError(f'[{place}] of what is no array')
+        counts, element = self._count(description), description[1][0]
+        if (counts <= place).any():
+            raise RecordingError(f'[{place}] of an array of {int(counts.min())}')
+        for _ in range(place):
+            self.skip(element)
+        return element
+
+    def _count(self, description: Any) -> Ints:
+        if description[0] == _ARRAY:
+            return np.full_like(self._at, description[1][1])
+        return np.asarray(self.number('u4').astype(np.int64))
+
+    def _leap(self, counts: Ints, size: int) -> None:
+        aligned = (self._at + size - 1) // size * size
+        self._at = np.where(counts > 0, aligned + counts * size, self._at)
+        if (self._at + 4 > self._messages.size).any():
+            raise RecordingError('damaged message: it ends inside a field')
+
+    def _skip_each(self, element: Any, counts: Ints) -> None:
+        """Go behind elements of which no two need have one size."""
+        while (rows := np.flatnonzero(counts > 0)).size:
+            some = _Cursor(self._messages.take(rows), self._definitions)
+            some._at = self._at[rows]
+            some.skip(element)
+            self._at[rows] = some._at
+            counts = counts - 1

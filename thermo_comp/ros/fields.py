@@ -1,0 +1,83 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns temperatures in messages of any type, live: the type's class is found while the node runs.
+
+So no message package is a dependency: that of a driver is installed where the driver runs.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Temperature
+
+from ..errors import ThermoCompError
+from ..recording.columns import NO_STAMP_NS
+from ..recording.topics import PLAIN, split_field
+
+_STEP = re.compile(r'([A-Za-z]\w*)|\[([0-9]{1,6})\]|\.')
+
+
+class LiveField:
+    """A number in the messages of a topic; ThermoCompError for a type or field that is not."""
+
+    def __init__(self, topic: str, kind: str, path: str) -> None:
+        package, _, name = kind.partition('/msg/')
+        try:
+            self.kind: Any = getattr(import_module(f'{package}.msg'), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            reason = f'its type {kind} is not installed here'
+            raise ThermoCompError(reason, key=topic) from error
+        self._steps: Sequence[Any] = [
+            name or int(place) for name, place in _STEP.findall(path) if name or place
+        ]
+        try:
+            self._value(self.kind())
+        except IndexError:
+            pass  # of a sequence, which is empty in a new message
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ThermoCompError(f'{kind} has no number `{path}`', key=topic) from error
+
+    def _value(self, message: Any) -> float:
+        for step in self._steps:
+            message = message[step] if isinstance(step, int) else getattr(message, step)
+        return float(message)
+
+    def read(self, data: bytes) -> tuple[int, float] | None:
+        """Read stamp [ns], `NO_STAMP_NS` without a header, and number; None if there is none."""
+        try:
+            message = deserialize_message(data, self.kind)
+            header = getattr(message, 'header', None)
+            # Some have a header of their own kind, and the usual one in it.
+            stamp = getattr(getattr(header, 'header', header), 'stamp', None)
+            value = self._value(message)
+        except (RuntimeError, ValueError, IndexError):
+            return None
+        if stamp is None:
+            return NO_STAMP_NS, value
+        return stamp.sec * 1_000_000_000 + stamp.nanosec, value
+
+    def as_temperature(self, data: bytes) -> bytes:
+        """Serialize the reading of a message as a Temperature; NaN where there is none."""
+        stamp_ns, value = self.read(data) or (NO_STAMP_NS, float('nan'))
+        message = Temperature(temperature=value)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+        return bytes(serialize_message(message))
+
+
+def live_field(node: Node, topic: str) -> LiveField | None:
+    """Find what is published on ``TOPIC[:FIELD]``; None before that, and for a Temperature."""
+    name, path = split_field(topic)
+    name = node.resolve_topic_name(name)
+    offers = node.get_publishers_info_by_topic(name)
+    if not offers:
+        return None
+    kind = offers[0].topic_type
+    path = path or PLAIN.get(kind, '')
+    return LiveField(name, kind, path) if path else None
