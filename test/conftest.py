@@ -62,11 +62,12 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 #: Files that take longest, the longest first: whoever works in parallel begins with them, so that
 #: no worker is left alone with one at the end (`make test` keeps this order).
 _LONG = (
+    *('test_fitting_selection', 'test_fitting', 'test_priors', 'test_fitting_change'),
     *('test_gyroscope', 'test_cli_help', 'test_third_thermometer', 'test_real_data'),
     *('test_report_certificate', 'test_offset', 'test_fitting_windows', 'test_record'),
     *('test_docs', 'test_cli_demo', 'test_fleet_unit', 'test_node_startup'),
-    *('test_fitting_selection', 'test_convert', 'test_simulation_presets', 'test_readme'),
-    *('test_priors', 'test_properties', 'test_text', 'test_recording_damage'),
+    *('test_convert', 'test_simulation_presets', 'test_readme'),
+    *('test_properties', 'test_text', 'test_recording_damage'),
     *('test_report_figures', 'test_stillness', 'test_cli_errors', 'test_recording_walk'),
     *('test_fault_files', 'test_allow', 'test_faults', 'test_cli', 'test_degenerate'),
     *('test_layers', 'test_rests', 'test_compensator', 'test_sample_checks', 'test_report'),

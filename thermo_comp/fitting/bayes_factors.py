@@ -23,18 +23,21 @@ from .regression import Posterior, Regression
 from .unknowns import Prior
 
 
-def log_bayes_factor(
-    mode: Floats, covariance: Floats, places: Ints, prior_sd: float | Floats
-) -> float:
-    """Fall of the log evidence when some weights are held at 0 (Savage-Dickey ratio, [1]_)."""
-    mode, covariance = mode[places], covariance[np.ix_(places, places)]
-    root = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
+def log_bayes_factors(mode: Floats, covariance: Floats, places: Ints, prior_sd: Floats) -> Floats:
+    """
+    Fall of the log evidence when some weights are held at 0 (Savage-Dickey ratio, [1]_), of each
+    row of places, shape (n, k); `prior_sd` has shape (n,) or (n, k).
+    """
+    means = mode[places]
+    blocks = covariance[places[:, :, None], places[:, None, :]]
+    root = np.sqrt(np.einsum('nii->ni', blocks))
+    values, vectors = np.linalg.eigh(blocks / (root[:, :, None] * root[:, None, :]))
     values = np.maximum(values, 1e-12)
-    along = vectors.T @ (mode / root)
-    determinant = float(np.log(values).sum() + 2.0 * np.log(root).sum())
-    known = float(np.sum(np.log(np.broadcast_to(prior_sd, mode.shape))))
-    return 0.5 * float(np.sum(along**2 / values)) + 0.5 * determinant - known
+    along = np.einsum('nij,ni->nj', vectors, means / root)
+    determinant = np.log(values).sum(axis=1) + 2.0 * np.log(root).sum(axis=1)
+    sd = np.broadcast_to(prior_sd if prior_sd.ndim > 1 else prior_sd[:, None], means.shape)
+    square = np.sum(along**2 / values, axis=1)
+    return np.asarray(0.5 * (square + determinant) - np.log(sd).sum(axis=1))
 
 
 def group_evidence(
@@ -56,14 +59,17 @@ def group_evidence(
             added = regression.columns[:, used] @ state.weights[k][:, used].T
             if part == 'scale':
                 added = added * force
-            places, sd = layout.weights[k][:, used], prior.column_sd[k][used]
+            places, sd = layout.weights[k][:, used].ravel(), prior.column_sd[k][used]
+            (gain,) = log_bayes_factors(
+                mode, posterior.covariance, places[None], np.tile(sd, 3)[None]
+            )
             result.append(
                 GroupEvidence(
                     group,
                     part,
                     float(np.sqrt(np.mean(added**2))),
                     max(float(effective[k][used].sum()), 0.0),
-                    log_bayes_factor(mode, posterior.covariance, places.ravel(), np.tile(sd, 3)),
+                    float(gain),
                     tuple(sd.tolist()),
                 )
             )

@@ -43,6 +43,8 @@ Progress = Callable[[float], None]
 
 # Usual full scales of units that report m/s^2.
 _G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+# Sets that leave less than this part of the noise may be of a regime that closes otherwise.
+_SETS_EXPLAIN = 0.8
 # A bias beyond this part of 1 g is a word of no force.
 _LARGEST_BIAS = 0.5
 
@@ -202,7 +204,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     tell(0.7)
     regression, selected, typical = regress(windows, start, up, options, tell)
     asks = has_case and known is None and options.detector is None
-    if asks and any(SET in trial.groups and trial.is_chosen for trial in selected.trials):
+    if asks and _may_have_sets(selected):
         # Only the sets feel when the regime closes: with the case, or with the board too.
         others = thermal_windows(bags, replace(model, detector=replace(detector, closes='case')))
         again = regress(others, start, up, options, tell)
@@ -247,6 +249,15 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         windows=windows,
         bags=tuple(bags),
         rates=rates,
+    )
+
+
+def _may_have_sets(selected: Selected) -> bool:
+    """Whether sets are chosen, or would explain much more although left-out data are not sure."""
+    least = _SETS_EXPLAIN * selected.prior.sigma
+    return any(
+        SET in one.groups and (one.is_chosen or (one.is_near and (one.prior.sigma < least).all()))
+        for one in selected.trials
     )
 
 

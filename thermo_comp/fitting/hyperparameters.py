@@ -24,7 +24,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats
-from .bayes_factors import log_bayes_factor
+from .bayes_factors import log_bayes_factors
 from .regression import Posterior, Regression
 from .unknowns import Prior, State
 
@@ -194,11 +194,9 @@ def pruned(posterior: Posterior, prior: Prior, fixed: Bools, least_gain: float) 
     asked = np.argwhere((prior.column_sd > 0.0) & ~fixed).tolist()
     column_sd = prior.column_sd.copy()
     while asked:
-        places = [layout.weights[part, :, column] for part, column in asked]
-        gains = [
-            log_bayes_factor(mode, covariance, at, prior.column_sd[part, column])
-            for at, (part, column) in zip(places, asked, strict=True)
-        ]
+        part, column = np.array(asked).T
+        places = layout.weights[part, :, column]
+        gains = log_bayes_factors(mode, covariance, places, prior.column_sd[part, column])
         least = int(np.argmin(gains))
         if gains[least] >= least_gain:
             break

@@ -31,7 +31,7 @@ _RATIOS = 10.0 ** np.arange(-2.5, 3.6, 0.5)
 # Candidate correlation times: multiples of the shortest one, which is this many windows.
 _TIME_STEP, _SHORTEST_WINDOWS = 10.0**0.5, 3.0
 # A recording shows a correlation time that it holds this many times.
-_SPANS = 5.0
+_SPANS = 10.0
 # Twice the log likelihood that two further parameters must gain: 1 % of the chi-square.
 _LEAST_GAIN = 9.2
 

@@ -244,6 +244,7 @@ class Regression(Equations):
         if len(bags) == self.n_bags > 1 and layout.start.size:
             common = self._common(prior, layout, state, factors, answers)
             determinant += 2.0 * float(np.log(np.diag(common.factor)).sum())
+            determinant -= layout.start.shape[1] * float(np.log(prior.start_share))
         return Reduced(information, pull, tuple(factors), determinant, common)
 
     def _common(
