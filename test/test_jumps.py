@@ -109,7 +109,7 @@ def behind_a_low_pass(rng, rest, tau_s, sd):
 
 @pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0, 3.0])
 def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
-    # WHY: phones filter their samples; one rest of ten minutes became 8 .. 37, and many of them were
+    # WHY: phones filter their samples; a rest of ten minutes became 8 .. 37, many of which were
     # said to begin with a jump: a mean counted as if every sample told something new.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
