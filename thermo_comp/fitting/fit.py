@@ -92,8 +92,8 @@ def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
     )
     if not bag.n_samples:
         raise FitError(f'{source.name}: no accelerometer samples')
-    if not bag.intervals:
-        raise FitError(f'{source.name}: no still interval: {bag.restless}')
+    if bag.restless:
+        raise FitError(f'{source.name}: {bag.restless}')
     return bag
 
 
@@ -101,6 +101,20 @@ def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
     """Fit a calibration to bags that have been reduced; FitError if they contradict themselves."""
+    try:
+        return _fit_about_offset(bags, options, progress)
+    except ValueError as error:
+        if 'misalignment' not in str(error):
+            raise
+        raise FitError(
+            'its axes stand at less than 60 degrees to each other, which no accelerometer has: is '
+            'it the right topic, and did the axes stay the same in all positions?'
+        ) from error
+
+
+def _fit_about_offset(
+    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
+) -> FitResult:
     offset = find_offset(bags, options)
     if not offset.any():
         return _fit(bags, options, progress)

@@ -298,11 +298,17 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
         least = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
         return (
             f'its samples scatter by {1e3 * least:.3g} mg where they are quietest, and by less '
-            f'than {1e3 * still_sd:.3g} mg at rest (--still-sd)'
+            f'than {1e3 * still_sd:.3g} mg at rest (--still-sd): worn, driven or shaken?'
         )
     if (full & under & _is_turning(cells)).sum() > 0.5 * full.sum():
         return 'its gyroscope turns all the time (is it in rad/s?)'
-    return 'the unit must rest in each position'
+    edges = np.diff(np.r_[0, (full & under).astype(np.int8), 0])
+    runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
+    longest_s = float(np.max(runs, initial=0)) * cells.cell_s
+    return (
+        f'it is quiet for {longest_s:.3g} s at most, as if worn or driven: the unit must rest in '
+        'each position'
+    )
 
 
 def _is_full(cells: Cells) -> Bools:
