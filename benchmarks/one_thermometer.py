@@ -48,20 +48,20 @@ def without_case(bag: Path, target: Path) -> Path:
     return target
 
 
-def bags_of(unit: str, folder: Path) -> tuple[list[Path], Path]:
-    """Give the bags of a fit and a held-out one, simulated but for the sample unit's."""
+def bags_of(unit: str, folder: Path) -> tuple[list[Path], list[Path]]:
+    """Give the bags of a fit and held-out ones, simulated but for the sample unit's."""
     if unit == 'sample':
-        return sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), ROOT / 'bags' / 'held_out.mcap'
+        return sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), [ROOT / 'bags' / 'held_out.mcap']
     common = ('simulate', '--unit', unit, '--rate-hz', RATE_HZ)
     command(*common, '--plan', 'chamber-9', '-o', folder / 'fit')
     command(*common, '--plan', 'held-out', '-o', folder / 'held')
-    return sorted((folder / 'fit').iterdir()), folder / 'held'
+    return sorted((folder / 'fit').iterdir()), sorted((folder / 'held').iterdir())
 
 
-def left(bags: list[Path], held: Path, calibration: Path) -> dict[str, float]:
+def left(bags: list[Path], held: list[Path], calibration: Path) -> dict[str, float]:
     """Fit, and give RMS of |f| - g on the held-out run, raw and corrected [m/s^2]."""
     command('fit', *bags, '-o', calibration, '--gravity', '9.80665')
-    found: dict[str, float] = command('evaluate', held, '-c', calibration)['sections_m_s2']['all']
+    found: dict[str, float] = command('evaluate', *held, '-c', calibration)['sections_m_s2']['all']
     return found
 
 
@@ -77,7 +77,7 @@ def main() -> None:
             ones = folder / 'one'
             ones.mkdir()
             alone = [without_case(bag, ones / f'{bag.stem}.mcap') for bag in bags]
-            held_alone = without_case(held, folder / 'held_one.mcap')
+            held_alone = [without_case(bag, ones / f'held_{bag.stem}.mcap') for bag in held]
             two = left(bags, held, folder / 'two.yaml')
             one = left(alone, held_alone, folder / 'one.yaml')
             values = (two['raw_rms'], two['rms'], one['rms'])

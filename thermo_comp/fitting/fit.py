@@ -16,6 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from ..errors import FitError
+from ..recording.stillness import widened
 from ..text import valid_serial
 from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
@@ -279,8 +280,10 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     serial = check_serial([bag.source for bag in bags], options)
     full_scale = options.saturated_at
+    largest = max(bag.reach for bag in bags)
+    if full_scale == COUNTS_FULL_SCALE and bags[0].is_integer:
+        full_scale = widened(full_scale, np.array([[np.rint(largest)]]))
     if full_scale is None:
-        largest = max(bag.reach for bag in bags)
         full_scale = next(
             (r * STANDARD_GRAVITY for r in _G_RANGES if r * STANDARD_GRAVITY > 1.1 * largest),
             2.0 * largest,

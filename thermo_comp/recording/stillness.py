@@ -43,6 +43,7 @@ _LONGEST_CELL_NS = 86400e9  # stamps may lie anywhere; no unit rests in one cell
 MIN_SAMPLES = 30
 _LARGEST = 1e100  # a sample beyond has a square that is no number; it is none itself
 _WORD = 32768.0  # the middle of words of 16 bits
+_LONGER = (23, 31)  # bits beside the sign of longer words
 _STUCK = 0.3  # noise below this many quanta leaves a sensor on one number for long
 
 
@@ -114,6 +115,7 @@ class CellAccumulator:
         if self._full_scale is not None:
             if self._full_scale == _WORD - 1.0 and not self._middle:
                 self._look_for_sign(samples[use])
+                self._full_scale = widened(self._full_scale, samples[use])
             saturated = use & (np.abs(samples - self._middle) >= self._full_scale).any(axis=1)
             self._n_saturated += int(saturated.sum())
             use &= ~saturated
@@ -196,6 +198,14 @@ class CellAccumulator:
             sums[0, 1:] += last[-1, 1:]
             self._sums[-1] = last[:-1]
         self._sums.append(sums)
+
+
+def widened(full_scale: float, samples: Floats) -> float:
+    """Give the full scale of longer words, of 24 or 32 bits, where most samples are such."""
+    size = np.max(np.abs(samples), axis=1) if len(samples) else np.zeros(1)
+    if np.median(size) < 2.0 * _WORD or (samples != np.rint(samples)).any():
+        return full_scale
+    return next(2.0**bits - 1.0 for bits in _LONGER if np.median(size) < 2.0**bits or bits == 31)
 
 
 def _part_of(window_s: float, least: float) -> float:
