@@ -147,7 +147,9 @@ def as_bags(
         bags = {}
         for number, path in enumerate(others):
             bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
-            write_log(_read(out, path, columns=columns, rate_hz=rate_hz), bags[path])
+            log = _read(out, path, columns=columns, rate_hz=rate_hz)
+            out.told([(path, log.chosen, None)])
+            write_log(log, bags[path])
         yield [bags.get(path, path) for path in paths]
 
 
