@@ -91,6 +91,49 @@ def spoilt(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
     return make
 
 
+def imu(
+    change: Callable[[np.ndarray], np.ndarray], claimed: float = 0.0
+) -> Callable[[Path], Path]:
+    """Write sensor_msgs/Imu with changed samples [m/s^2], their covariance begun by a number."""
+
+    def make(folder: Path) -> Path:
+        columns, path = whole(), folder / 'bag.mcap'
+        force = change(columns.counts * (9.80665 / 2900.0))
+        with BagWriter(path, metadata={'serial': columns.serial}) as bag:
+            bag.write_imu('imu/data', columns.stamp_ns, force, [claimed] + 8 * [0.0])
+            bag.write_temperature('temperature/board', columns.reading_ns, columns.board)
+        return path
+
+    return make
+
+
+def _by_turns(force: np.ndarray) -> np.ndarray:
+    """Make each second row exactly zero, as a driver does that sends the gyroscope between."""
+    return force * (np.arange(len(force)) % 2)[:, None]
+
+
+def _without_gravity(force: np.ndarray) -> np.ndarray:
+    """Take off the mean of each position."""
+    own = force.reshape(POSITIONS, -1, 3)
+    return (own - own.mean(axis=1, keepdims=True)).reshape(-1, 3)
+
+
+def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Move all the time but for a second now and then, as an arm does, or a car at crossings."""
+
+    def change(force: np.ndarray) -> np.ndarray:
+        rng = np.random.default_rng(9)
+        is_moved = np.arange(len(force)) % (20 * RATE_HZ) > longest_s * RATE_HZ
+        return force + sd * is_moved[:, None] * rng.normal(size=force.shape)
+
+    return change
+
+
+def _leaning(force: np.ndarray) -> np.ndarray:
+    """Let y read a good part of x, as no triad does."""
+    return force @ np.array([[1.0, 0.6, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]])
+
+
 def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
     """Let the clock jump in the middle, or after every so many stamps."""
 
@@ -229,6 +272,14 @@ INPUTS: dict[str, Input] = {
     'all values 1e308': Input(spoilt(lambda c: _set('counts', c.counts * 0 + 1e308)(c))),
     'a reading of 1e308': Input(spoilt(lambda c: c.board.__setitem__(9, 1e308))),
     'all NaN': Input(spoilt(lambda c: _set('counts', c.counts * np.nan)(c))),
+    'zeros by turns': Input(imu(_by_turns)),
+    'no acceleration in it': Input(imu(np.zeros_like, -1.0)),
+    'gravity taken off': Input(imu(_without_gravity)),
+    'samples in g': Input(imu(lambda force: force / 9.80665)),
+    'stamps all zero': Input(stamps(np.zeros_like)),
+    'worn on a wrist': Input(imu(_worn(4.0, 2.9))),
+    'a drive': Input(imu(_worn(1.5, 0.0))),
+    'axes that lean': Input(imu(_leaning)),
     'all zeros': Input(spoilt(lambda c: _set('counts', c.counts * 0)(c))),
     'a span of 1 K': Input(spoilt(lambda c: _set('board', 20 + c.board / 30)(c))),
     'Cyrillic serial': Input(spoilt(_set('serial', 'блок 7'))),

@@ -64,8 +64,8 @@ def write_new(path: Path, rng, parameters=(('INS_TCAL1_ENABLE', 0.0),)) -> np.nd
     log.define('IMU', *NEW_IMU)
     log.define('BARO', *NEW_BARO)
     log.define('PARM', *PARM)
-    for name, value in parameters:
-        log.write('PARM', 1000, name.encode(), value, 0.0)
+    for name, value, *at in parameters:
+        log.write('PARM', at[0] if at else 1000, name.encode(), value, 0.0)
     force = np.array([still(rng), still(rng)])
     for k in range(N):
         now = 2_000_000 + k * STEP_US
@@ -145,6 +145,30 @@ def test_corrected_log_is_refused(tmp_path, rng):
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
     # The second IMU's drift was left as it is.
     assert len(read_autopilot(path, imu=1).stamp_ns) == N
+
+
+HALF_US = 2_000_000 + N // 2 * STEP_US
+
+
+@pytest.mark.parametrize(
+    ('course', 'kept', 'share'),
+    [
+        # Switched on in flight, and off again.
+        ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
+        ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
+        # WHY: a log of learning was refused, because ArduPilot sets 1 when it has learnt.
+        ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
+    ],
+)
+def test_what_was_corrected_is_left_out(tmp_path, rng, course, kept, share):
+    path = tmp_path / 'log.BIN'
+    force = write_new(path, rng, [('INS_TCAL1_ENABLE', *one) for one in course])
+    read = read_autopilot(path)
+    np.testing.assert_array_equal(read.accel, force[0][kept])
+    assert f'INS_TCAL1_ENABLE was 1 for {share} % of the samples' in read.chosen
+    assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
+    # The temperatures go on: the fit needs to know what the unit went through.
+    assert len(read.temperatures['board'].celsius) > 1
 
 
 def test_simulator_is_refused(tmp_path):

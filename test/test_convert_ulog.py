@@ -179,12 +179,11 @@ COMBINED += 'uint32_t accelerometer_integral_dt;'
 AIR = 'vehicle_air_data:uint64_t timestamp;uint64_t timestamp_sample;float baro_temp_celcius;'
 
 
-def write_combined(path: Path, rng, **parameters: int) -> np.ndarray:
+def write_combined(path: Path, rng, later=None, **parameters: int) -> np.ndarray:
     """Write a log of PX4's default profile before it logged each sensor."""
     log = UlogWriter(COMBINED, AIR)
     for name, value in parameters.items():
-        key = f'int32_t {name}'.encode()
-        log.message('P', bytes([len(key)]) + key + struct.pack('<i', value))
+        log.message('P', parameter(name, value))
     number, air = log.subscribe('sensor_combined', 0), log.subscribe('vehicle_air_data', 0)
     force = still(rng)
     for k, vector in enumerate(force):
@@ -201,8 +200,16 @@ def write_combined(path: Path, rng, **parameters: int) -> np.ndarray:
             )
         if k % 100 == 0:
             log.data(air, struct.pack('<QQf', now, now, 40.0 + 0.01 * k))
+        for name, value in (later or {}).items():
+            if k == N // 2 - 1:
+                log.message('P', parameter(name, value))
     path.write_bytes(log.body)
     return force
+
+
+def parameter(name: str, value: int) -> bytes:
+    key = f'int32_t {name}'.encode()
+    return bytes([len(key)]) + key + struct.pack('<i', value)
 
 
 def test_the_combined_sensor_stands_in(tmp_path, rng, cli):
@@ -226,6 +233,18 @@ def test_a_combined_sensor_that_px4_compensated_is_refused(tmp_path, rng):
     with pytest.raises(RecordingError, match=r'TC_A_ENABLE was 1.*SDLOG_PROFILE'):
         read_autopilot(path)
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
+
+
+@pytest.mark.parametrize('begin', [0, 1])
+def test_what_px4_compensated_is_left_out(tmp_path, rng, begin):
+    path = tmp_path / 'half.ulg'
+    force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
+    read = read_autopilot(path)
+    assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
+    # A parameter has the stamp of the message before it: one sample may count to either half.
+    n = min(len(read.accel), N // 2) - 1
+    part = slice(-n, None) if begin else slice(n)
+    np.testing.assert_array_equal(read.accel[part], force[part])
 
 
 def test_a_log_of_1_hz_says_what_it_is_good_for(tmp_path, rng, cli):

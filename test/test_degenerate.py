@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
+from conftest import ROOT, Cli
 
 sys.path.insert(0, str(ROOT / 'benchmarks'))
 
@@ -48,3 +48,27 @@ def test_it_ends_with_a_sentence_in_bounded_memory(
         (out / 'map.yaml').write_text(degenerate.MAP)
         done = degenerate.run(name, command, path, out)
         assert not done.is_bad, done
+
+
+@pytest.mark.parametrize(
+    ('name', 'said'),
+    [
+        ('zeros by turns', '50 % of its samples are exactly zero, between others: two sources'),
+        ('no acceleration in it', '(linear_acceleration_covariance[0] = -1): another topic'),
+        ('gravity taken off', 'gravity is taken off (a linear or free acceleration)'),
+        ('samples in g', 'its samples are in g, make them m/s^2 with thermo_comp convert'),
+        ('stamps all zero', 'all its samples are stamped 0 s: the driver does not stamp them'),
+        ('worn on a wrist', 'as if worn or driven: the unit must rest in each position'),
+        ('a drive', 'worn, driven or shaken?'),
+        ('axes that lean', 'with one unit for three axes at right angles?'),
+    ],
+)
+def test_the_cause_is_said_in_the_users_words(
+    name: str, said: str, tmp_path: Path, cli: Cli
+) -> None:
+    path = degenerate.INPUTS[name].make(tmp_path)
+    failed = cli('fit', path, '--gravity', '9.81', '-o', tmp_path / 'out.yaml', code=1)
+    (line,) = [one for one in failed.stderr.splitlines() if ': error: ' in one]
+    assert said in line
+    # The topic is said where it was taken by its type.
+    assert 'bag.mcap (/imu/data)' in line or name in {'stamps all zero', 'axes that lean'}

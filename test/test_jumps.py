@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from position_helpers import GRAVITY, MG, Rest
+from scipy.signal import lfilter
 
 from thermo_comp.fitting.jumps import find_jumps
 from thermo_comp.fitting.reduction import reduce_source
@@ -97,3 +98,33 @@ def test_drift_with_temperature_is_no_step(rng):
     rest = Rest(rng)
     rest.accel[:, 2] += 2.0 * MG * (rest.temperature(rest.time) - 20.0)
     assert look(rest) == ()
+
+
+def behind_a_low_pass(rng, rest, tau_s, sd):
+    """Replace the noise by a first-order one, of this time constant and standard deviation."""
+    r = np.exp(-1.0 / (rest.rate_hz * tau_s))
+    white = sd * np.sqrt(1.0 - r * r) * rng.standard_normal(rest.accel.shape)
+    rest.accel[:] = np.array(rest.level) + lfilter([1.0], [1.0, -r], white, axis=0)
+
+
+@pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0, 3.0])
+def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
+    # WHY: phones filter their samples; a rest of ten minutes became 8 .. 37, many of which were
+    # said to begin with a jump: a mean counted as if every sample told something new.
+    rest = Rest(rng)
+    behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
+    bag = reduce_source(rest.source(), full_scale=None)
+    assert len(bag.intervals) == 1
+    assert find_jumps(bag) == ()
+    # As its samples scatter, all of it is at rest, but for the ends of the interval.
+    assert bag.n_still_cells > 0.98 * bag.n_cells
+
+
+@pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0])
+def test_a_jump_far_beyond_such_noise_is_found(rng, tau_s):
+    rest = Rest(rng)
+    behind_a_low_pass(rng, rest, tau_s, 1.0 * MG)
+    rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)
+    (event,) = find_jumps(reduce_source(rest.source(), full_scale=None))
+    # Means of 10 s on each side of 10 s / (2 tau) independent samples beside a free drift: 4 sd.
+    assert event.along / MG == pytest.approx(20.0, abs=8.0 * np.sqrt(2.0 * 2.0 * tau_s / 10.0))

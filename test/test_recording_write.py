@@ -27,6 +27,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader as Reader2
 
 from thermo_comp.errors import OutputError, RecordingError
+from thermo_comp.online.status import STAMPED_TYPE, stamped_flag
 from thermo_comp.recording.columns import ImuColumns
 from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.writer import BagWriter
@@ -394,3 +395,23 @@ def test_a_bag_without_messages_is_a_bag(tmp_path: Path) -> None:
         with Reader2(tmp_path / name) as reader:
             assert reader.message_count == 0
         assert read_recording(tmp_path / name, require=()).info.n_messages == 0
+
+
+@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
+def test_regime_topics_are_offered_as_the_node_offers_them(tmp_path: Path, name: str) -> None:
+    # WHY: a bag of `replay` offered `regime/stamped` as volatile: who joined late got no regime.
+    with BagWriter(tmp_path / name) as bag:
+        bag.write_bool('imu0/regime/dynamic', [1], [True])
+        for topic in ('imu0/regime/stamped', '/diagnostics'):
+            bag.write_raw(topic, STAMPED_TYPE, [1], [stamped_flag(1, True, 'T-1')])
+    path = tmp_path / name / 'bag_0.mcap' if name == 'bag' else tmp_path / name
+    with path.open('rb') as file:
+        channels = make_reader(file).get_summary().channels.values()
+        offered = {
+            one.topic: yaml.safe_load(one.metadata['offered_qos_profiles'])[0] for one in channels
+        }
+    assert {topic: one['durability'] for topic, one in offered.items()} == {
+        '/imu0/regime/dynamic': 'transient_local',
+        '/imu0/regime/stamped': 'transient_local',
+        '/diagnostics': 'volatile',
+    }

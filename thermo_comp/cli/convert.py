@@ -58,9 +58,10 @@ def convert(
     """
     Make a bag of a table of numbers or of an autopilot's log.
 
-    A table needs a column map: which column is what, in which unit; what the
-    sensor reads at rest must agree with it. config/columns has examples. One
-    of [t] ax ay az [wx wy wz] without headings needs none. Of a PX4 or
+    A column map says which column is what, in which unit; what the sensor
+    reads at rest must agree with it. config/columns has examples. Without
+    one, it is guessed from the headings and printed; a table of [t] ax ay az
+    [wx wy wz] needs no headings. Of a PX4 or
     ArduPilot log the IMU's own temperature becomes the board's, the
     barometer's the case's. Of a bag the thermometer beside the Imu topic
     becomes the board's, one beside a barometer the case's.
@@ -146,13 +147,16 @@ def as_bags(
         bags = {}
         for number, path in enumerate(others):
             bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
-            write_log(_read(out, path, columns=columns, rate_hz=rate_hz), bags[path])
+            log = _read(out, path, columns=columns, rate_hz=rate_hz)
+            out.told([(path, log.chosen, None)])
+            write_log(log, bags[path])
         yield [bags.get(path, path) for path in paths]
 
 
 def _read(out: Output, path: Path, **given: Any) -> 'ForeignLog':
     """Read a table, log or bag, which its name tells; refuse options that it has no use for."""
     from ..convert import autopilot, bag, columns
+    from ..convert.headings import map_lines
 
     kind = _kind_of(path)
     said = {name: value for name, value in given.items() if value is not None}
@@ -176,8 +180,13 @@ def _read(out: Output, path: Path, **given: Any) -> 'ForeignLog':
     if path.suffix.lower() in ('.parquet', '.pq'):
         raise options.usage('a Parquet table needs --columns MAP')
     guessed = columns.guess_columns(path, rate_hz)
-    taken = columns.spoken_columns(guessed)
-    out.line(f'{path}: taken as {taken}; --columns says otherwise')
+    if guessed.format is None:  # told by its headings
+        out.line(f'{path}: taken as this column map; edit it and give it as --columns if not so')
+        for line in map_lines(guessed):
+            out.line(f'  {line}')
+    else:
+        taken = columns.spoken_columns(guessed)
+        out.line(f'{path}: taken as {taken}; --columns says otherwise')
     return columns.table_log(path, guessed)
 
 

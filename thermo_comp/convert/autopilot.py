@@ -12,8 +12,9 @@ with the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` asks for
 missing, ``sensor_combined`` stands in: after PX4's calibration, and without a temperature.
 
 ArduPilot's DataFlash (``.BIN``): one message type per IMU in old logs (``IMU``, ``IMU2``), one
-with an instance number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. A log made
-with ``INS_TCALn_ENABLE = 1`` is refused: its thermal drift is already taken out.
+with an instance number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. What was
+logged while ``INS_TCALn_ENABLE`` was 1 is left out: its thermal drift is already taken out. The
+parameter is followed over time; learning (2) corrects nothing, and sets it to 1 at its end.
 
 https://docs.px4.io/main/en/dev_log/ulog_file_format
 https://ardupilot.org/copter/docs/logmessages.html
@@ -27,7 +28,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -39,8 +40,19 @@ from ..typing import Floats, Ints
 from .log import NO_STAMP, SLOW_HZ, ForeignLog, find_stillness, library, thin
 
 T = TypeVar('T')
-#: What a log holds by instance: IMUs, barometers, and why an IMU's thermal drift is gone.
-_Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, str]]
+
+
+class _Correction(NamedTuple):
+    """A parameter that is 1 while drift is taken out: its values from stamps on; what to do."""
+
+    parameter: str
+    since_ns: Sequence[int]
+    values: Sequence[float]
+    advice: str
+
+
+#: What a log holds by instance: IMUs, barometers, and what took out an IMU's thermal drift.
+_Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, _Correction]]
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
@@ -69,10 +81,10 @@ def read_autopilot(
     except (ArithmeticError, LookupError, TypeError, ValueError) as failure:
         # Formats that contradict their messages, in whichever way.
         raise RecordingError(f'damaged: {failure}', path=path) from failure
-    why = compensated.get(min(imus, default=0) if imu is None else imu)
-    if why and not allow_compensated:
-        raise RecordingError(why, path=path)
     rows = _instance(imus, imu, 'IMU', path)
+    correction = compensated.get(min(imus, default=0) if imu is None else imu)
+    if correction and not allow_compensated:
+        rows = _uncorrected(rows, correction)
     stamped = rows.stamp_ns != NO_STAMP
     rest = find_stillness(rows.stamp_ns[stamped], rows.accel[stamped])
     if rest.noise <= _NO_NOISE * rest.magnitude:
@@ -91,6 +103,27 @@ def read_autopilot(
     return replace(rows, temperatures=dict(named))
 
 
+def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
+    """Leave out what was logged while the parameter was 1; RecordingError if that is all."""
+    name, since_ns, values, advice = correction
+    at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
+    is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
+    told = 'the autopilot has already taken the thermal drift out of these readings'
+    if is_corrected.all():
+        raise RecordingError(f'{name} was 1: {told}; {advice}', path=rows.path)
+    if not is_corrected.any():
+        return rows
+    share = 100.0 * float(is_corrected.mean())
+    kept = ~is_corrected
+    return replace(
+        rows,
+        stamp_ns=rows.stamp_ns[kept],
+        accel=rows.accel[kept],
+        gyro=None if rows.gyro is None else rows.gyro[kept],
+        chosen=f'{name} was 1 for {share:.0f} % of the samples, which are left out: {told}',
+    )
+
+
 def _ulog(path: Path) -> _Held:
     with open_regular(path) as file:
         log = _read('pyulog', 'ULog', 'px4', 'a ULog file', path, file, list(_TOPICS))
@@ -107,17 +140,20 @@ def _ulog(path: Path) -> _Held:
     if log.file_corruption:
         metadata['px4_corruption'] = 'parts of the file could not be read'
     accels, gyros, hint = by_topic['sensor_accel'], by_topic['sensor_gyro'], ''
-    compensated = {}
+    compensated: dict[int, _Correction] = {}
     if not accels:
         both = {number: _combined(one) for number, one in by_topic['sensor_combined'].items()}
         accels, gyros = ({number: one[part] for number, one in both.items()} for part in (0, 1))
         hint = f'sensor_accel is missing, sensor_combined is after CAL_ACC*; {_PROFILE}'
-        if log.initial_parameters.get('TC_A_ENABLE') == 1:
-            said = (
-                'it holds sensor_combined alone, and TC_A_ENABLE was 1: PX4 has already taken the '
-                f'thermal drift out of these readings; {_PROFILE}'
-            )
-            compensated = dict.fromkeys(accels, said)
+        name = 'TC_A_ENABLE'
+        changes = [one for one in log.changed_parameters if one[1] == name]
+        correction = _Correction(
+            name,
+            [0, *(int(one[0]) * 1000 for one in changes)],
+            [float(log.initial_parameters.get(name, 0)), *(float(one[2]) for one in changes)],
+            f'it holds sensor_combined alone: {_PROFILE}',
+        )
+        compensated = dict.fromkeys(accels, correction)
     imus = {}
     for number, columns in accels.items():
         stamp_ns = _stamps(columns)
@@ -191,14 +227,20 @@ def _dataflash(path: Path) -> _Held:
     imus: dict[int, ForeignLog] = {}
     baros: dict[int, Readings] = {}
     metadata = {}
+    changes: dict[str, list[tuple[int, float]]] = {}
     if any(str(key).startswith('SIM_') for key in reader.params):
         metadata['ardupilot_simulated'] = 'it has SIM_ parameters: a simulator wrote this log'
     try:
         for name in sorted(reader.name_to_id):
-            if not re.fullmatch(r'IMU\d?|BARO|BAR\d', name):
+            if not re.fullmatch(r'IMU\d?|BARO|BAR\d|PARM', name):
                 continue
             found, n_short = _messages(reader, name, path)
             stamp_us = found.get('TimeUS', found.get('TimeMS', np.empty(0)) * 1000.0)
+            if name == 'PARM' and found.keys() >= {'Name', 'Value'}:
+                for at, label, value in zip(stamp_us, found['Name'], found['Value'], strict=False):
+                    title = label.decode('ascii', 'replace')
+                    changes.setdefault(title, []).append((int(at) * 1000, float(value)))
+                continue
             # The second IMU's old type is IMU2: counted from 1, the first without its number.
             old = int(name[-1]) - 1 if name[-1].isdigit() else 0
             found |= {'timestamp': stamp_us, 'I': found.get('I', np.full(len(stamp_us), old))}
@@ -220,12 +262,13 @@ def _dataflash(path: Path) -> _Held:
                     )
     finally:
         reader.close()
-    compensated = {
-        number: f'{name} was 1: ArduPilot has already taken the thermal drift out of these '
-        'readings; set it to 0 and record again'
-        for number in imus
-        if reader.params.get(name := f'INS_TCAL{number + 1}_ENABLE') == 1.0
-    }
+    compensated = {}
+    for number in imus:
+        name = f'INS_TCAL{number + 1}_ENABLE'
+        course = changes.get(name) or [(0, float(reader.params.get(name, 0.0)))]
+        since_ns, values = zip(*course, strict=True)
+        advice = 'set it to 0 and record again'
+        compensated[number] = _Correction(name, since_ns, values, advice)
     return imus, baros, compensated
 
 

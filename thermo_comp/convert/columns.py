@@ -3,14 +3,16 @@
 """
 Owns tables with a column map: which column is what, in which unit, and how it becomes a message.
 
-A map is a small YAML file beside the log; config/columns/ has examples. A table of numbers alone,
+A map is a small YAML file beside the log; config/columns/ has examples. Without one, headings are
+asked what they name (see `headings`). A table of numbers alone,
 ``[t] ax ay az [wx wy wz]`` as for imu_tk, has its map guessed: times rise; what rests reads
 gravity in its unit; and a gyroscope that counts in degrees is faster than any hand in radians.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,8 +25,9 @@ from ..recording.columns import Readings
 from ..recording.topics import is_thermometer
 from ..typing import Floats
 from ..unit.schema import Positive, SchemaError, build
+from .headings import read_headings
 from .log import NO_STAMP, ForeignLog, Unit, believed_unit, find_stillness, thin
-from .table import STAMP_EXPONENTS, Column, Format, Stamp, read_parquet, read_text
+from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, read_parquet, read_text
 
 Triple = tuple[Column, Column, Column]
 
@@ -176,14 +179,14 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
 
 
 def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
-    """Tell the columns of a table without headings; `rate_hz` is for one without times."""
+    """Tell the columns of a table; `rate_hz` is for one without headings and times."""
     table = read_text(path, None, Stamp(rate_hz=1.0))
     width = len(table.values)
-    if table.has_headings or width not in (3, 4, 6, 7):
+    if table.headings:
+        return _by_headings(path, table)
+    if width not in (3, 4, 6, 7):
         raise RecordingError(
-            f'{width} columns, {"with" if table.has_headings else "without"} headings, do not say '
-            f'what they are: {_GIVE_MAP}',
-            path=path,
+            f'{width} columns without headings do not say what they are: {_GIVE_MAP}', path=path
         )
     first = int(width in (4, 7))
     x, y, z = first, first + 1, first + 2
@@ -201,6 +204,51 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
         gyro = Gyro((x + 3, y + 3, z + 3), 'deg/s' if is_fast else 'rad/s')
     accel_map = Accel((x, y, z), believed, 'counts' if believed == 'counts' else 'imu')
     return ColumnMap(stamp, accel_map, gyro=gyro, format=Format(header=False))
+
+
+def _by_headings(path: Path, table: Table) -> ColumnMap:
+    """Tell the columns by their headings, and the units that these do not state by the numbers."""
+    named = read_headings(table.headings)
+    if named is None:
+        listed = ', '.join(map(repr, table.headings[:20]))
+        raise RecordingError(
+            f'its headings name no time or no accelerometer: {listed}; {_GIVE_MAP}', path=path
+        )
+    place = {name: number for number, name in reversed(list(enumerate(table.headings)))}
+
+    def values(columns: Sequence[str]) -> Floats:
+        return np.column_stack([table.values[place[one]] for one in columns])
+
+    accel, stamp = values(named.accel), None
+    unit = named.accel_unit
+    if not unit:
+        still = find_stillness(np.arange(len(accel)) * 10**9, accel)
+        unit, reason = believed_unit(still.magnitude)
+        if unit == 'unknown':
+            raise RecordingError(f'{reason}: {_GIVE_MAP}', path=path)
+    times = table.values[place[named.time]]
+    if not np.isfinite(times).any():
+        stamp = Stamp(named.time, 'iso')
+    elif named.time_unit:
+        stamp = build(Stamp, {'column': named.time, 'unit': named.time_unit})
+    gyro = None
+    if named.gyro is not None and unit != 'counts':
+        is_fast = np.nanquantile(np.abs(values(named.gyro)), 0.999) > _FASTEST_RAD_S
+        rates = named.gyro_unit or ('deg/s' if is_fast else 'rad/s')
+        gyro = build(Gyro, {'columns': list(named.gyro), 'unit': rates})
+    output = 'counts' if unit == 'counts' else 'imu'
+    thermometers = {
+        name: build(Thermometer, {'column': column, 'unit': degrees})
+        for name, (column, degrees) in named.thermometers.items()
+    }
+    return ColumnMap(
+        stamp or replace(_stamp(path, times, None, accel), column=named.time),
+        build(Accel, {'columns': list(named.accel), 'unit': unit, 'output': output}),
+        thermometers.pop('board', None),
+        thermometers.pop('case', None),
+        tuple(Further(one.column, one.unit, name=name) for name, one in thermometers.items()),
+        gyro,
+    )
 
 
 def spoken_columns(columns: ColumnMap) -> str:

@@ -13,8 +13,10 @@ import csv
 import os
 import re
 from array import array
+from calendar import timegm
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from decimal import Decimal
 from io import TextIOWrapper
 from itertools import chain, islice
@@ -32,13 +34,18 @@ from ..unit.schema import NotNegative, Positive
 from .log import NO_STAMP, library
 
 Column = str | int
-TimeUnit = Literal['s', 'ms', 'us', 'ns']
+TimeUnit = Literal['s', 'ms', 'us', 'ns', 'iso']
 
 _SNIFF_BYTES = 65536
 _PREAMBLE_ROWS = 1000  # a logger's preamble is no longer than this
 _MOST_ROWS_PER_BYTE = 4  # what packs numbers more tightly holds no measurement
 #: Powers of ten from a unit of time to nanoseconds.
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
+#: ISO 8601, with the name of a zone behind it as some loggers have; without a zone it is UTC.
+_ISO = re.compile(
+    r'(\d{4})-(\d\d)-(\d\d)[T ](\d\d):(\d\d)(?::(\d\d)(?:[.,](\d{1,9})\d*)?)?'
+    r'\s*(?:(Z|UTC)|([+-])(\d\d):?(\d\d)?)?(?:\s*\[[^\]]*\])?'
+)
 
 _DELIMITERS = {'tab': '\t', 'blank': ' '}
 
@@ -66,7 +73,7 @@ class Stamp:
         if (self.column is None) == (self.rate_hz is None):
             raise ValueError('give either `column` and `unit`, or `rate_hz`')
         if self.column is not None and self.unit is None:
-            raise ValueError('`unit` must be s, ms, us or ns where there is a column')
+            raise ValueError('`unit` must be s, ms, us, ns or iso where there is a column')
 
     def ticks(self, n: int) -> Ints:
         """Give the stamps of rows at the fixed rate, shape (n,); no rounding adds up."""
@@ -82,7 +89,7 @@ class Table:
     values: dict[Column, Floats]  # NaN where a cell is no number
     stamp_ns: Ints  # `NO_STAMP` where a cell is no number
     n_short: int = 0  # rows with too few cells, as where a log was cut off: left out
-    has_headings: bool = True
+    headings: tuple[str, ...] = ()
 
 
 def read_text(
@@ -208,7 +215,7 @@ def _collect(
         values={name: np.array(column) for name, column in values.items()},
         stamp_ns=stamp.ticks(len(line)) if at is None else np.array(stamps),
         n_short=n_short,
-        has_headings=bool(headings),
+        headings=tuple(headings),
     )
 
 
@@ -230,12 +237,29 @@ def _place(path: Path, name: Column, headings: Sequence[str], width: int) -> int
 
 
 def exact_ns(cell: object, unit: TimeUnit | None) -> int:
-    """Return the stamp of a decimal number, exact to the last digit; else `NO_STAMP`."""
+    """Return the stamp of a number or a date, exact to the last digit; else `NO_STAMP`."""
+    if unit == 'iso':
+        return _iso_ns(str(cell).strip())
     try:
         number = Decimal(str(cell).strip()) * 10 ** STAMP_EXPONENTS[unit or 'ns']
         return round(number) if abs(number) < 2**63 - 1 else NO_STAMP
     except ArithmeticError:
         return NO_STAMP
+
+
+def _iso_ns(text: str) -> int:
+    found = _ISO.fullmatch(text)
+    if found is None:
+        return NO_STAMP
+    *moment, fraction, _, sign, hours, minutes = found.groups()
+    year, month, day, hour, minute, second = (int(part or 0) for part in moment)
+    try:
+        seconds = timegm(datetime(year, month, day, hour, minute, second).timetuple())
+    except ValueError:  # a thirteenth month
+        return NO_STAMP
+    east_s = 3600 * int(hours or 0) + 60 * int(minutes or 0)
+    seconds += east_s if sign == '-' else -east_s
+    return seconds * 10**9 + int((fraction or '').ljust(9, '0'))
 
 
 def read_parquet(

@@ -17,6 +17,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..errors import FitError
+from ..recording.stillness import widened
 from ..text import valid_serial
 from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
@@ -93,8 +94,8 @@ def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
     )
     if not bag.n_samples:
         raise FitError(f'{source.name}: no accelerometer samples')
-    if not bag.intervals:
-        raise FitError(f'{source.name}: no still interval: {bag.restless}')
+    if bag.restless:
+        raise FitError(f'{source.name}: {bag.restless}')
     return bag
 
 
@@ -102,12 +103,22 @@ def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
     """Fit a calibration to bags that have been reduced; FitError if they contradict themselves."""
-    # Thousands of small products: threads would wait for each other.
-    with threadpool_limits(1, 'blas'):
-        return _fit_words(bags, options, progress)
+    try:
+        # Thousands of small products: threads would wait for each other.
+        with threadpool_limits(1, 'blas'):
+            return _fit_about_offset(bags, options, progress)
+    except ValueError as error:
+        if 'misalignment' not in str(error):
+            raise
+        raise FitError(
+            'its axes stand at less than 60 degrees to each other, which no accelerometer has: is '
+            'it the right topic, and did the axes stay the same in all positions?'
+        ) from error
 
 
-def _fit_words(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) -> FitResult:
+def _fit_about_offset(
+    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
+) -> FitResult:
     offset = find_offset(bags, options)
     if not offset.any():
         return _fit(bags, options, progress)
@@ -282,8 +293,10 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     serial = check_serial([bag.source for bag in bags], options)
     full_scale = options.saturated_at
+    largest = max(bag.reach for bag in bags)
+    if full_scale == COUNTS_FULL_SCALE and bags[0].is_integer:
+        full_scale = widened(full_scale, np.array([[np.rint(largest)]]))
     if full_scale is None:
-        largest = max(bag.reach for bag in bags)
         full_scale = next(
             (r * STANDARD_GRAVITY for r in _G_RANGES if r * STANDARD_GRAVITY > 1.1 * largest),
             2.0 * largest,

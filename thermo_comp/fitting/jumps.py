@@ -28,6 +28,7 @@ _LONGEST_GAP_S, _NEAR = 30.0, np.cos(np.radians(10.0))
 # Readings on either side of the gap that say what the level was.
 _MARGIN_S = 10.0
 _FEWEST_SAMPLES = 8
+_PIECES = 40  # into which the readings around a gap are cut for their correlation
 # A step this many sd is one; the search over its place makes about 5 by chance.
 _STEP_SDS = 8.0
 # A hand on the unit leaves far more than this many times the quiet noise.
@@ -102,11 +103,12 @@ def _examine(
     beside = before | after
     # A bump passes: only what the quiet samples on both sides show is a step.
     at = _place_of_step(time, accel, quiet_sd)
-    lasting, known, _ = _step(time[beside], accel[beside], time[at])
-    if not np.any(np.abs(lasting) > _STEP_SDS * quiet_sd * known):
+    lasting, known, left = _step(time[beside], accel[beside], time[at])
+    lasting_sd = quiet_sd * known * _correlation(left, quiet_sd)
+    if not np.any(np.abs(lasting) > _STEP_SDS * lasting_sd):
         return None
-    step, known, _ = _step(time, accel, time[at])
-    step_sd = quiet_sd * known
+    step, known, left = _step(time, accel, time[at])
+    step_sd = quiet_sd * known * _correlation(left, quiet_sd)
     sides = accel[:at], accel[at:]
     # Noise from neighbouring differences, which a drift does not widen.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(one, axis=0) ** 2, axis=0) for one in sides))
@@ -132,6 +134,23 @@ def _examine(
         temperature_change=warmed,
         temperature_change_sd=warmed_sd,
     )
+
+
+def _correlation(left: Floats, sd: Floats) -> Floats:
+    """
+    How much less well a mean is known than by white noise of `sd`, per axis, 1 or more.
+
+    What is left beside a step, (n, 3), in twentieths of each side: their variance, and their
+    correlation r from one to the next, which makes means worse by (1 + r) / (1 - r).
+    """
+    size = max(len(left) // _PIECES, 1)
+    n = len(left) // size
+    means = left[: n * size].reshape(n, size, 3).mean(axis=1)
+    square = np.mean(means**2, axis=0)
+    follows = np.sum(means[1:] * means[:-1], axis=0) / np.maximum(n * square, 1e-300)
+    r = np.clip(follows, 0.0, 1.0 - 1.0 / n)
+    worse = size * square * (1.0 + r) / (1.0 - r)
+    return np.asarray(np.sqrt(np.maximum(worse / np.maximum(sd**2, 1e-300), 1.0)))
 
 
 def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> tuple[float, float]:

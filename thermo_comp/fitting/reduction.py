@@ -22,6 +22,7 @@ import numpy as np
 
 from ..errors import FitError
 from ..recording import stillness
+from ..recording.causes import CauseCounter
 from ..recording.columns import RecordingInfo
 from ..recording.stillness import CellAccumulator, Cells
 from ..thermal.thermometer import COLDEST, HOTTEST
@@ -91,7 +92,7 @@ class ReducedBag:
     or a multiple where the samples are slow; `cycle_s` is typical between samples. `middle` is the
     word of no force where the words have no sign, else 0; `reach` how far the readings go but for
     single glitches; `since_s` where the part begins that was read [s]; `restless` what speaks
-    against rests, where there is none; `angular_rate` how much of the bag has one, all finite.
+    against rests; `angular_rate` how much of the bag has one, all finite.
     """
 
     source: FitSource
@@ -148,12 +149,14 @@ def reduce_source(
     readings: dict[str, list[Readings]] = {}
     n_samples = 0
     n_impossible: Counter[str] = Counter()
+    causes = CauseCounter()
     has_rate = True
     for block in source.blocks():
         rate = angular_velocity(block)
         if len(block.accel_stamp_ns):
             has_rate &= rate is not None and bool(np.isfinite(rate).all())
         cells.add(block.accel_stamp_ns, block.accel, rate)
+        causes.add(block)
         for name, (reading_ns, celsius, _) in block.temperatures.items():
             own = readings.setdefault(name, [NO_READINGS])
             n_impossible[name] += int(np.count_nonzero(np.abs(celsius) > HOTTEST))
@@ -213,7 +216,8 @@ def reduce_source(
         reach=_reach(found),
         info=reader.info if reader else NO_RECORDING,
         since_s=reader.since_s if reader else 0.0,
-        restless='' if ranges else _why_restless(found, n_samples, still_sd),
+        restless=causes.cause(found, still_sd)
+        or ('' if ranges else f'no still interval: {_why_restless(found, n_samples, still_sd)}'),
         angular_rate='whole' if has_rate else 'part' if found.rate.any() else 'none',
     )
 

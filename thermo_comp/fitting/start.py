@@ -52,7 +52,10 @@ def constant_calibration(
     # Scattered points are met best by a patch of a huge ellipsoid with its centre far away.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < _LARGEST_RMS * gravity:
-        raise FitError('the positions lie on no ellipsoid: is every one of them at rest?')
+        raise FitError(
+            'the positions lie on no ellipsoid: is every one of them at rest, and is it an '
+            'accelerometer, with one unit for three axes at right angles?'
+        )
     return calibration
 
 

@@ -31,7 +31,7 @@ from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
 from .columns import Messages, join_messages, scatter
 from .fields import typestore
 from .mcap_file import MAGIC, METADATA_NAME
-from .topics import BOOL
+from .topics import REGIME_TOPICS
 
 Compression = Literal['none', 'lz4', 'zstd']
 
@@ -109,7 +109,7 @@ class McapOutput:
             message_encoding='cdr',
             schema_id=schema.id,
             metadata={
-                'offered_qos_profiles': dump_yaml([_offered_qos(kind)]).strip(),
+                'offered_qos_profiles': dump_yaml([_offered_qos(topic)]).strip(),
                 'topic_type_hash': type_hash,
             },
         )
@@ -155,7 +155,7 @@ class McapOutput:
                     'name': one.topic,
                     'type': kinds[one.schema_id],
                     'serialization_format': 'cdr',
-                    'offered_qos_profiles': [_offered_qos(kinds[one.schema_id])],
+                    'offered_qos_profiles': [_offered_qos(one.topic)],
                     'type_description_hash': one.metadata['topic_type_hash'],
                 },
                 'message_count': self._counts[one.id],
@@ -266,9 +266,9 @@ class McapOutput:
         self._put(MAGIC)
 
 
-def _offered_qos(kind: str) -> dict[str, Any]:
+def _offered_qos(topic: str) -> dict[str, Any]:
     """Give the QoS profile that is recorded as offered: reliable, so that any reader matches."""
-    is_flag = kind == BOOL  # of which a late reader gets the last one
+    is_flag = topic.endswith(REGIME_TOPICS)  # of which a late reader gets the last one
     return {
         'history': 'keep_last',
         'depth': 1 if is_flag else 10,

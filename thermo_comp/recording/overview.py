@@ -14,10 +14,11 @@ import numpy as np
 
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..thermal.thermometer import COLDEST, HOTTEST
+from .causes import CauseCounter
 from .columns import Readings, RecordingInfo
 from .fields import temperature_fields
 from .reader import RecordingReader, open_recording
-from .stillness import CellAccumulator, still_intervals
+from .stillness import STILL_SD, CellAccumulator, still_intervals, why_restless
 from .topics import PLAIN, TEMPERATURE, Topics, shown
 
 #: What no board endures, and a thermometer in kelvins reads.
@@ -118,7 +119,7 @@ def survey_recording(
     with open_recording(path, topics, require=()) as reader:
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
-        cells = CellAccumulator(_CELL_S, None)
+        cells, causes = CellAccumulator(_CELL_S, None), CauseCounter()
         # A thermal test has few readings beside its samples.
         readings: dict[str, list[Readings]] = {}
         n = n_gaps = n_backwards = first_ns = last_ns = 0
@@ -143,11 +144,13 @@ def survey_recording(
             n += len(stamp_ns)
             rate = None if block.imu is None else block.imu.angular_velocity
             cells.add(stamp_ns, block.accel, rate)
+            causes.add(block)
             if progress is not None and total:
                 progress(n / total)
         info, candidates = reader.info, unused_thermometers(reader)
     reduced = cells.finish()
     still = still_intervals(reduced, _MIN_REST_S) if n > 1 else []
+    cause = causes.cause(reduced, STILL_SD) if n > 1 else ''
     found = ((name, survey_thermometer(own)) for name, own in readings.items())
     thermometers = {name: one for name, one in found if one is not None}
     findings = [
@@ -155,7 +158,11 @@ def survey_recording(
         (reader.apart, 'a fit needs one clock for all'),
         (not n, _NO_SAMPLES),
         *((True, one) for one in thermal_findings(thermometers, candidates)),
-        (n and not still, 'it never rests for 3 s: the fit works on positions at rest'),
+        (cause, cause),
+        (
+            n and not still and not cause,
+            f'it never rests for 3 s, and a fit works on rests: {why_restless(reduced)}',
+        ),
         (n_backwards, f'{n_backwards} stamps do not rise: those samples are left out'),
         (n_gaps, f'{n_gaps} gaps, the longest {longest_gap:.3g} s'),
     ]

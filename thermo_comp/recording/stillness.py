@@ -29,6 +29,10 @@ STILL_SD = 0.05
 # drifts with temperature and is taken over stretches [rad/s, s].
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
+# Quantiles in sd: a tenth, and what chance exceeds once in 1e11; degrees of freedom, as a part of
+# the samples', from which on noise is coloured, and the fewest of a cell.
+_TENTH, _NEVER = -1.2816, 6.7
+_COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
 # A drift is the median step of so many around, and no faster than this [parts of g per s].
@@ -39,6 +43,7 @@ _LONGEST_CELL_NS = 86400e9  # stamps may lie anywhere; no unit rests in one cell
 MIN_SAMPLES = 30
 _LARGEST = 1e100  # a sample beyond has a square that is no number; it is none itself
 _WORD = 32768.0  # the middle of words of 16 bits
+_LONGER = (23, 31)  # bits beside the sign of longer words
 _STUCK = 0.3  # noise below this many quanta leaves a sensor on one number for long
 
 
@@ -49,6 +54,7 @@ class Cells:
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
     Dropped are samples that are not finite or whose stamp does not rise. `quantum` is their step,
     0 without one; `middle` that of words of 16 bits without a sign, or 0; rates are in rad/s.
+    `roughness` is half the mean square change from sample to sample: the variance of white noise.
     """
 
     start_ns: int
@@ -63,13 +69,14 @@ class Cells:
     index: Ints
     mean: Floats
     variance: Floats
+    roughness: Floats
     rate: Floats
     rate_variance: Floats
 
     def part(self, which: slice) -> Cells:
         """Choose a run of them."""
-        names = ('time', 'count', 'mean', 'variance', 'index', 'rate', 'rate_variance')
-        return replace(self, **{name: getattr(self, name)[which] for name in names})
+        names = 'time count index mean variance roughness rate rate_variance'
+        return replace(self, **{name: getattr(self, name)[which] for name in names.split()})
 
 
 class CellAccumulator:
@@ -90,8 +97,9 @@ class CellAccumulator:
         self._cell_ns = self._start_ns = 0
         self._last_ns: int | None = None
         self._shift = np.zeros(3)
-        # Number, samples, time, sums and sums of squares of each cell; the last one is open.
-        self._sums: list[Floats] = [np.empty((0, 9))]
+        # Number, samples, time, sums, sums of squares, and of squared changes of each cell; the
+        # last one is open.
+        self._sums: list[Floats] = [np.empty((0, 12))]
         self._n_dropped = self._n_saturated = self._n_looked_at = 0
         self._is_integer, self._is_negative = True, False
         self._middle, self._quantum = 0.0, np.zeros(3)
@@ -107,6 +115,7 @@ class CellAccumulator:
         if self._full_scale is not None:
             if self._full_scale == _WORD - 1.0 and not self._middle:
                 self._look_for_sign(samples[use])
+                self._full_scale = widened(self._full_scale, samples[use])
             saturated = use & (np.abs(samples - self._middle) >= self._full_scale).any(axis=1)
             self._n_saturated += int(saturated.sum())
             use &= ~saturated
@@ -115,7 +124,7 @@ class CellAccumulator:
             return
         if self._last_ns is None:
             self._begin(stamp_ns, samples)
-            self._sums = [np.empty((0, 9 if rate is None else 15))]
+            self._sums = [np.empty((0, 12 if rate is None else 18))]
         self._last_ns = int(stamp_ns[-1])
         if self._n_looked_at < _QUANTUM_SAMPLES:
             found = _quantum_of(samples[: _QUANTUM_SAMPLES - self._n_looked_at])
@@ -136,7 +145,8 @@ class CellAccumulator:
         sums = np.concatenate(self._sums)
         self._sums = [sums]  # whoever asks again asks for little more
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
-        total, square = np.split(sums[:, 3:], 2, axis=1)
+        total, square = np.split(sums[:, 3:-3], 2, axis=1)
+        pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)
         mean = total / count[:, None]
         spread = np.maximum(square - count[:, None] * mean**2, 0.0)
         variance = spread / np.maximum(count[:, None] - 1.0, 1.0)
@@ -149,7 +159,8 @@ class CellAccumulator:
             *(self._start_ns, cell_s, self._n_dropped, self._n_saturated),
             *(self._is_integer, self._quantum, self._middle),
             *(sums[:, 2] / count + index * cell_s, count.astype(np.int64), index),
-            *(mean[:, :3] + self._shift, variance[:, :3], rate, rate_variance),
+            *(mean[:, :3] + self._shift, variance[:, :3], sums[:, -3:] / pairs),
+            *(rate, rate_variance),
         )
 
     def _look_for_sign(self, samples: Floats) -> None:
@@ -171,13 +182,15 @@ class CellAccumulator:
         ids = since // self._cell_ns
         first = np.flatnonzero(np.concatenate(([True], ids[1:] != ids[:-1])))
         columns = np.zeros((len(since), self._sums[0].shape[1]))
-        n = columns.shape[1] // 2 - 1
+        n = columns.shape[1] // 2 - 3
         columns[:, 1] = 1.0
         columns[:, 2] = (since - ids * self._cell_ns) * 1e-9
         columns[:, 3:6] = samples - self._shift
         if n > 3 and rate is not None:
             columns[:, 6:9] = np.where(np.abs(rate) < _LARGEST, rate, 0.0)
-        columns[:, 3 + n :] = columns[:, 3 : 3 + n] ** 2
+        columns[:, 3 + n : -3] = columns[:, 3 : 3 + n] ** 2
+        columns[1:, -3:] = np.diff(samples, axis=0) ** 2
+        columns[first, -3:] = 0.0  # from the cell before
         sums = np.add.reduceat(columns, first, axis=0)
         sums[:, 0] = ids[first]
         last = self._sums[-1]
@@ -185,6 +198,14 @@ class CellAccumulator:
             sums[0, 1:] += last[-1, 1:]
             self._sums[-1] = last[:-1]
         self._sums.append(sums)
+
+
+def widened(full_scale: float, samples: Floats) -> float:
+    """Give the full scale of longer words, of 24 or 32 bits, where most samples are such."""
+    size = np.max(np.abs(samples), axis=1) if len(samples) else np.zeros(1)
+    if np.median(size) < 2.0 * _WORD or (samples != np.rint(samples)).any():
+        return full_scale
+    return next(2.0**bits - 1.0 for bits in _LONGER if np.median(size) < 2.0**bits or bits == 31)
 
 
 def _part_of(window_s: float, least: float) -> float:
@@ -230,6 +251,7 @@ def still_intervals(
     # variance lies a little below its mean; 1.3 covers it for cells of 32 samples.
     drift = _drift(cells, believable)
     level = np.quantile(cells.variance[believable], 0.1, axis=0)
+    level = level * _spread_of_variances(cells, believable, level)
     limit = ratio * np.maximum(1.3 * level, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12, give or take what noise makes of it.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
@@ -250,6 +272,35 @@ def still_intervals(
     ]
 
 
+def _spread_of_variances(cells: Cells, believable: Bools, level: Floats) -> Floats:
+    """
+    How much further the variances of cells at rest spread than those of white noise, per axis.
+
+    Behind a low pass a cell holds few independent samples. With a correlation r from one to the
+    next they are worth (1 - r) / (1 + r) of their number, and the roughness is 1 - r of the
+    variance; that follows from the tenth percentile `level` for as many degrees of freedom.
+    """
+    n_free = float(np.median(cells.count[believable])) - 1.0
+    quiet = believable & (cells.variance <= level).any(axis=1)
+    rough = np.median(cells.roughness[quiet], axis=0)
+    result = np.ones(3)
+    for axis in range(3):
+        n = n_free
+        for _ in range(_ITERATIONS if level[axis] > 0.0 else 0):
+            white = min(rough[axis] / level[axis] * _part_of_mean(n, _TENTH), 1.0)
+            n = max(n_free * white / (2.0 - white), _FEWEST_FREE)
+        if n < _COLOURED * n_free:
+            tails = [_part_of_mean(k, _NEVER) / _part_of_mean(k, _TENTH) for k in (n, n_free)]
+            result[axis] = tails[0] / tails[1]
+    return result
+
+
+def _part_of_mean(n_free: float, sigmas: float) -> float:
+    """Quantile of a chi-square variance in parts of its mean (Wilson and Hilferty)."""
+    width = 2.0 / (9.0 * n_free)
+    return float((1.0 - width + sigmas * np.sqrt(width)) ** 3)
+
+
 def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     """Say what speaks against rests in a bag that has none."""
     full, under = _is_full(cells), is_under(cells, still_sd)
@@ -257,11 +308,17 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
         least = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
         return (
             f'its samples scatter by {1e3 * least:.3g} mg where they are quietest, and by less '
-            f'than {1e3 * still_sd:.3g} mg at rest (--still-sd)'
+            f'than {1e3 * still_sd:.3g} mg at rest (--still-sd): worn, driven or shaken?'
         )
     if (full & under & _is_turning(cells)).sum() > 0.5 * full.sum():
         return 'its gyroscope turns all the time (is it in rad/s?)'
-    return 'the unit must rest in each position'
+    edges = np.diff(np.r_[0, (full & under).astype(np.int8), 0])
+    runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
+    longest_s = float(np.max(runs, initial=0)) * cells.cell_s
+    return (
+        f'it is quiet for {longest_s:.3g} s at most, as if worn or driven: the unit must rest in '
+        'each position'
+    )
 
 
 def _is_full(cells: Cells) -> Bools:

@@ -29,7 +29,7 @@ PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64'
 _TYPES = {'counts': VECTOR3_STAMPED, 'imu': IMU, 'board': TEMPERATURE, 'case': TEMPERATURE}
 #: The driver's topic in REP 145, and the node's output: what is beside it tells which.
 _RAW = 'imu/data_raw'
-_BESIDE_OUTPUT = ('regime/dynamic', 'regime/stamped')
+REGIME_TOPICS = ('regime/dynamic', 'regime/stamped')
 #: Words in the names of vector topics that are no specific force.
 _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
 
@@ -274,7 +274,7 @@ def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
     """Find the topic that the node or `replay` wrote; nothing where there is none."""
     for name in present:
         front = name.removesuffix(_RAW)
-        is_beside = any(front + other in present for other in _BESIDE_OUTPUT)
+        is_beside = any(front + other in present for other in REGIME_TOPICS)
         if is_called(name, _RAW) and (is_beside or 'corrected_by' in metadata):
             return name
     return ''

@@ -51,7 +51,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
     if not name:
         raise CalibrationError(
             'parameter `calibration_file` is not set; start with '
-            '--ros-args -p calibration_file:=PATH'
+            '--ros-args -p calibration_file:=PATH, or launch with calibration_file:=PATH'
         )
     try:
         path = Path(name).expanduser()

@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the table of what a second thermometer is worth: fits with and without the case, on new runs.
+
+    python benchmarks/one_thermometer.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from thermo_comp.recording.reader import read_recording
+from thermo_comp.recording.writer import BagWriter
+
+ROOT = Path(__file__).resolve().parent.parent
+UNITS = ('thermostatted', 'bare-quartz', 'mems', 'sample')
+RATE_HZ = '2'
+MICRO_G = 9.80665e-6
+
+
+def command(*arguments: object) -> dict[str, Any]:
+    """Run a command and give what it says as JSON; its exit code 1 is a verdict, too."""
+    line = [sys.executable, '-m', 'thermo_comp', *map(str, arguments), '--json']
+    done = subprocess.run(line, capture_output=True, text=True, check=False, cwd=ROOT)
+    if done.returncode not in {0, 1} or not done.stdout:
+        raise RuntimeError(done.stderr)
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def without_case(bag: Path, target: Path) -> Path:
+    """Copy samples and board temperatures."""
+    found = read_recording(bag, require=('accel', 'board'))
+    columns, board = found.columns, found.columns.temperatures['board']
+    with BagWriter(target, metadata=dict(found.info.metadata)) as writer:
+        log_ns = columns.log_ns
+        stamps = columns.accel_stamp_ns
+        writer.write_counts('accel/counts', stamps, columns.accel, log_ns=log_ns['accel'])
+        names = 'temperature/board', board.stamp_ns, board.celsius
+        writer.write_temperature(*names, log_ns['board'])
+    return target
+
+
+def bags_of(unit: str, folder: Path) -> tuple[list[Path], list[Path]]:
+    """Give the bags of a fit and held-out ones, simulated but for the sample unit's."""
+    if unit == 'sample':
+        return sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), [ROOT / 'bags' / 'held_out.mcap']
+    common = ('simulate', '--unit', unit, '--rate-hz', RATE_HZ)
+    command(*common, '--plan', 'chamber-9', '-o', folder / 'fit')
+    command(*common, '--plan', 'held-out', '-o', folder / 'held')
+    return sorted((folder / 'fit').iterdir()), sorted((folder / 'held').iterdir())
+
+
+def left(bags: list[Path], held: list[Path], calibration: Path) -> dict[str, float]:
+    """Fit, and give RMS of |f| - g on the held-out run, raw and corrected [m/s^2]."""
+    command('fit', *bags, '-o', calibration, '--gravity', '9.80665')
+    found: dict[str, float] = command('evaluate', *held, '-c', calibration)['sections_m_s2']['all']
+    return found
+
+
+def main() -> None:
+    """Print a row for each unit."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
+    parser.add_argument('units', nargs='*', default=list(UNITS))
+    print(f'{"unit":16}{"raw ug":>8}{"two":>8}{"one":>8}')
+    for unit in parser.parse_args().units:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            bags, held = bags_of(unit, folder)
+            ones = folder / 'one'
+            ones.mkdir()
+            alone = [without_case(bag, ones / f'{bag.stem}.mcap') for bag in bags]
+            held_alone = [without_case(bag, ones / f'held_{bag.stem}.mcap') for bag in held]
+            two = left(bags, held, folder / 'two.yaml')
+            one = left(alone, held_alone, folder / 'one.yaml')
+            values = (two['raw_rms'], two['rms'], one['rms'])
+            print(f'{unit:16}' + ''.join(f'{one / MICRO_G:8.3g}' for one in values), flush=True)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,156 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tables as other programs write them: headings, dates with zones, words of 24 bits."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from conftest import Cli
+from position_helpers import Rest
+
+from thermo_comp.convert.columns import guess_columns, load_column_map, table_log
+from thermo_comp.convert.headings import map_lines, read_headings
+from thermo_comp.convert.log import NO_STAMP
+from thermo_comp.convert.table import exact_ns
+from thermo_comp.errors import RecordingError
+from thermo_comp.fitting.reduction import reduce_source
+
+N, STEP_NS = 1200, 10**7
+START = datetime(2026, 3, 29, 1, 30, tzinfo=timezone.utc)
+START_NS = int(START.timestamp()) * 10**9
+UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axis=0)
+
+
+@pytest.mark.parametrize(
+    ('text', 'seconds'),
+    [
+        ('2026-03-29T01:30:00Z', 0),
+        ('2026-03-29 01:30:00', 0),  # without a zone it is UTC
+        ('2026-03-29T03:30:00.5+02:00', 0.5),
+        ('2026-03-29T03:30:00+0200', 0),  # GGIR
+        ('2026-03-29 03:30:00.250+0200 [Europe/Paris]', 0.25),  # actipy
+        ('2026-03-28 20:00:00-05:30', 0),
+        ('2026-03-29 01:30', 0),
+    ],
+)
+def test_dates_with_their_zones(text: str, seconds: float) -> None:
+    assert exact_ns(text, 'iso') == START_NS + round(seconds * 1e9)
+
+
+def test_nanoseconds_of_a_date_are_exact() -> None:
+    assert exact_ns('2026-03-29T01:30:00.123456789Z', 'iso') == START_NS + 123456789
+
+
+@pytest.mark.parametrize('text', ['', '01:30', '2026-13-29 01:30:00', '2026-03-29T01:30:00+2'])
+def test_what_is_no_date_is_no_stamp(text: str) -> None:
+    assert exact_ns(text, 'iso') == NO_STAMP
+
+
+def times(kind: str) -> list[str]:
+    """Write the stamps of the rows as a program does."""
+    if kind == 'pandas':
+        zone = timezone(timedelta(hours=2))
+        ticks = (START.astimezone(zone) + timedelta(microseconds=k * 10**4) for k in range(N))
+        return [str(one) for one in ticks]
+    if kind == 'actipy':
+        ticks = (START + timedelta(microseconds=k * 10**4) for k in range(N))
+        return [f'{one:%Y-%m-%d %H:%M:%S.%f}'[:-3] + '+0000 [Europe/London]' for one in ticks]
+    if kind == 'epoch':
+        return [f'{START_NS // 10**9 + k / 100:.2f}' for k in range(N)]
+    return [str(START_NS + k * STEP_NS) for k in range(N)]
+
+
+@pytest.mark.parametrize(
+    ('kind', 'headings', 'unit', 'one_g'),
+    [
+        ('pandas', ',timestamp,acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z,temperature', 'iso', 9.80665),
+        ('actipy', ',time,x,y,z,wx,wy,wz,temperature', 'iso', 1.0),
+        ('epoch', ',timestamp,X,Y,Z,rotX,rotY,rotZ,temperature', 's', 1.0),
+        (
+            'phone',
+            ',Time (ns),Acceleration x (m/s^2),Acceleration y (m/s^2),Acceleration z (m/s^2),'
+            'Gyroscope x (rad/s),Gyroscope y (rad/s),Gyroscope z (rad/s),temp [degC]',
+            'ns',
+            9.80665,
+        ),
+    ],
+)
+def test_a_table_is_read_by_its_headings(
+    tmp_path: Path, rng: np.random.Generator, kind: str, headings: str, unit: str, one_g: float
+) -> None:
+    path = tmp_path / 'log.csv'
+    accel = one_g * (UP + 0.002 * rng.standard_normal(UP.shape))
+    rate = 0.01 * rng.standard_normal(UP.shape)
+    rows = [
+        ','.join([str(k), at, *(f'{v:.6f}' for v in (*a, *w)), f'{20 + k / 100:.2f}'])
+        for k, (at, a, w) in enumerate(zip(times(kind), accel, rate, strict=True))
+    ]
+    path.write_text('\n'.join([headings, *rows]) + '\n')
+    columns = guess_columns(path)
+    assert columns.stamp.unit == unit
+    assert columns.accel.unit == ('g' if one_g == 1.0 else 'm/s^2')
+    # What is printed is the map, and read back the same.
+    (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(columns)))
+    assert load_column_map(tmp_path / 'map.yaml') == columns
+    log = table_log(path, columns)
+    assert log.stamp_ns.tolist() == (START_NS + STEP_NS * np.arange(N)).tolist()
+    np.testing.assert_allclose(log.accel, accel, atol=1e-6)
+    np.testing.assert_allclose(log.gyro, rate, atol=1e-6)
+    assert set(log.temperatures) == {'board'}
+    assert log.temperatures['board'].celsius[0] == 20.0
+
+
+def test_the_right_triad_and_thermometers_are_taken() -> None:
+    found = read_headings(
+        [
+            *('now[ms]', 'magx', 'magy', 'magz', 'linear_acc_x', 'linear_acc_y', 'linear_acc_z'),
+            *('acc_x [mg]', 'acc_y [mg]', 'acc_z [mg]', 'gx[deg/s]', 'gy[deg/s]', 'gz[deg/s]'),
+            *('gtemp', 'AHT_tmp[C]', 'BMP_temp[K]'),
+        ]
+    )
+    assert found is not None
+    assert (found.time, found.time_unit, found.accel_unit) == ('now[ms]', 'ms', 'mg')
+    assert found.accel == ('acc_x [mg]', 'acc_y [mg]', 'acc_z [mg]')
+    assert (found.gyro, found.gyro_unit) == (('gx[deg/s]', 'gy[deg/s]', 'gz[deg/s]'), 'deg/s')
+    assert found.thermometers == {
+        'board': ('gtemp', 'degC'),
+        'case': ('AHT_tmp[C]', 'degC'),
+        't2': ('BMP_temp[K]', 'K'),
+    }
+    assert read_headings(['ax', 'ay', 'az']) is None
+    assert read_headings(['time', 'magx', 'magy', 'magz']) is None
+
+
+def test_headings_that_name_nothing_are_listed(tmp_path: Path) -> None:
+    path = tmp_path / 'log.csv'
+    path.write_text('a,b,c\n1,2,3\n2,3,4\n')
+    with pytest.raises(RecordingError, match="name no time or no accelerometer: 'a', 'b', 'c'"):
+        guess_columns(path)
+
+
+def test_the_guessed_map_is_printed(tmp_path: Path, rng: np.random.Generator, cli: Cli) -> None:
+    accel = UP + 0.002 * rng.standard_normal(UP.shape)
+    rows = [f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f}' for k, (x, y, z) in enumerate(accel)]
+    (tmp_path / 'log.csv').write_text('\n'.join(['time (s),ax,ay,az', *rows]))
+    said = cli('convert', tmp_path / 'log.csv', '-o', tmp_path / 'bag').stdout
+    head, *lines = said.splitlines()
+    assert 'taken as this column map; edit it and give it as --columns if not so' in head
+    own = yaml.safe_load('\n'.join(line for line in lines[:2]))
+    assert own['stamp'] == {'column': 'time (s)', 'unit': 's'}
+    assert own['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}
+
+
+@pytest.mark.parametrize(('one_g', 'bits'), [(4096.0, 15), (524288.0, 23), (1e8, 31)])
+def test_words_of_24_and_32_bits_are_not_saturated(
+    rng: np.random.Generator, one_g: float, bits: int
+) -> None:
+    rest = Rest(rng, level=(0.0, 0.0, one_g), sd=0.002 * one_g)
+    rest.accel[:] = np.rint(rest.accel)
+    rest.accel[100] = 2.0**bits - 1.0  # one that is
+    bag = reduce_source(rest.source(), full_scale=32767.0)
+    assert (bag.n_saturated, len(bag.intervals)) == (1, 1)

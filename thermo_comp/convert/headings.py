@@ -1,0 +1,106 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what the headings of a table say: its time, its triads, its thermometers, and their units.
+
+A guess is printed as the column map that it is, for the user to keep or to edit.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+_UNIT = re.compile(r'[\[(]([^\])]*)[\])]')
+_TIME = re.compile(r'(^|_)(time|timestamp|stamp|now|date|datetime|epoch|elapsed|utc|t|ts)(_|$)')
+_TIMES = {'s': 's', 'sec': 's', 'seconds': 's', 'ms': 'ms', 'us': 'us', 'µs': 'us', 'ns': 'ns'}
+_ACCEL, _GYRO = re.compile('acc|force|^a$'), re.compile('gyr|omega|rot|rate|angular|^g$|^w$')
+# What has three axes and is neither.
+_OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|vel(?!ocity)')
+_TEMPERATURE = re.compile('temp|tmp|celsius|(^|_)t_?c($|_)')
+_OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
+_ACCELS = {'g': 'g', 'mg': 'mg', 'm/s^2': 'm/s^2', 'm/s2': 'm/s^2', 'm/s²': 'm/s^2'}
+_RATES = {'deg/s': 'deg/s', '°/s': 'deg/s', 'dps': 'deg/s', 'rad/s': 'rad/s'}
+_DEGREES = {'k': 'K', 'kelvin': 'K', 'f': 'degF', '°f': 'degF', 'degf': 'degF'}
+
+Columns = tuple[str, str, str]
+
+
+@dataclass(frozen=True)
+class Headings:
+    """What they name, with the units that they state; '' where they do not."""
+
+    time: str
+    time_unit: str
+    accel: Columns
+    accel_unit: str
+    gyro: Columns | None
+    gyro_unit: str
+    thermometers: dict[str, tuple[str, str]]  # by its name the column and the unit
+
+
+def read_headings(headings: Sequence[str]) -> Headings | None:
+    """Find the columns by their names; None where time or accelerometer are not among them."""
+    names = {_plain(one): one for one in reversed(headings)}
+    times = [one for name, one in names.items() if _TIME.search(name)]
+    triads = dict(_triads(names))
+    accel = next((key for key in triads if _ACCEL.search(key)), '' if '' in triads else None)
+    if not times or accel is None:
+        return None
+    gyro = next((key for key in triads if _GYRO.search(key)), None)
+    time, found = times[-1], triads[accel]
+    thermometers: dict[str, tuple[str, str]] = {}
+    for heading in headings:
+        if _TEMPERATURE.search(_plain(heading)):
+            is_outside = _OUTSIDE.search(_plain(heading)) and thermometers
+            usual = 'case' if is_outside or 'board' in thermometers else 'board'
+            name = usual if usual not in thermometers else f't{len(thermometers)}'
+            thermometers[name] = heading, _DEGREES.get(_unit(heading), 'degC')
+    return Headings(
+        time,
+        _TIMES.get(_unit(time) or _plain(time).rpartition('_')[2], ''),
+        found,
+        _ACCELS.get(_unit(found[0]), ''),
+        triads[gyro] if gyro is not None else None,
+        _RATES.get(_unit(triads[gyro][0]), '') if gyro is not None else '',
+        thermometers,
+    )
+
+
+def map_lines(columns: Any) -> Iterator[str]:
+    """Write a column map as its file has it."""
+    stamp, accel, gyro = columns.stamp, columns.accel, columns.gyro
+    yield f'stamp: {{column: {stamp.column!r}, unit: {stamp.unit}}}'
+    yield f'accel: {{columns: {list(accel.columns)}, unit: {accel.unit}, output: {accel.output}}}'
+    if gyro is not None:
+        yield f'gyro: {{columns: {list(gyro.columns)}, unit: {gyro.unit}}}'
+    for name in ('board', 'case'):
+        if (one := getattr(columns, name)) is not None:
+            yield f'{name}: {{column: {one.column!r}, unit: {one.unit}}}'
+    if columns.further:
+        yield 'further:'
+    for one in columns.further:
+        yield f'  - {{name: {one.name}, column: {one.column!r}, unit: {one.unit}}}'
+
+
+def _plain(heading: str) -> str:
+    """Bring a heading into small letters, words parted by underscores, without its unit."""
+    return re.sub(r'[^0-9a-z]+', '_', _UNIT.sub('', heading).strip().lower()).strip('_')
+
+
+def _unit(heading: str) -> str:
+    found = _UNIT.search(heading)
+    return found[1].strip().lower() if found else ''
+
+
+def _triads(names: dict[str, str]) -> Iterator[tuple[str, Columns]]:
+    """Find names that differ in one x, y, z; by what they have in common."""
+    for name in reversed(names):
+        for at in (match.start() for match in re.finditer('x', name)):
+            three = [f'{name[:at]}{axis}{name[at + 1 :]}' for axis in 'xyz']
+            key = f'{name[:at]}{name[at + 1 :]}'.replace('__', '_').strip('_')
+            if all(one in names for one in three) and not _OTHER.search(key):
+                x, y, z = (names[one] for one in three)
+                yield key, (x, y, z)

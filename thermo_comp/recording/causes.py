@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns why a recording is none of an accelerometer at rest, in the words of whoever made it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..unit.gravity import STANDARD_GRAVITY
+from .columns import Block
+from .stillness import Cells
+
+# Parts of the samples: what is counted once may be a glitch; what more than half are, all are.
+_SOME, _MOST = 0.01, 0.5
+# Readings at rest in parts of their unit's gravity: of gravity, and of none.
+_ABOUT_ONE, _NONE = (0.8, 1.25), 0.3
+
+
+class CauseCounter:
+    """Counts, block by block, what a sensor at rest does not send."""
+
+    def __init__(self) -> None:
+        self._n = self._n_zero = self._n_absent = 0
+        self._is_imu = False
+        self._stamps_ns: set[int] = set()
+
+    def add(self, block: Block) -> None:
+        """Take the next samples, in file order."""
+        imu = getattr(block, 'imu', None)
+        covariance = getattr(imu, 'linear_acceleration_covariance', None)
+        self._n += len(block.accel_stamp_ns)
+        self._n_zero += int(np.count_nonzero(~np.asarray(block.accel).any(axis=1)))
+        self._is_imu |= imu is not None
+        if covariance is not None:
+            self._n_absent += int(np.count_nonzero(covariance[:, 0] == -1.0))
+        if len(self._stamps_ns) < 2:  # whether there are two is all that is asked
+            self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
+
+    def cause(self, cells: Cells, still_sd: float) -> str:
+        """Say what the samples are instead; nothing where they may be an accelerometer's."""
+        if self._n_absent > _MOST * self._n:
+            return (
+                'its messages say that they hold no acceleration '
+                '(linear_acceleration_covariance[0] = -1): another topic of the driver has it'
+            )
+        if self._n > 1 and len(self._stamps_ns) == 1:
+            stamp_s = next(iter(self._stamps_ns)) * 1e-9
+            return f'all its samples are stamped {stamp_s:g} s: the driver does not stamp them'
+        if self._n_zero == self._n and self._n:
+            return 'all its samples are exactly zero: the sensor does not answer'
+        if self._n_zero > _SOME * self._n:
+            share = 100.0 * self._n_zero / self._n
+            return (
+                f'{share:.0f} % of its samples are exactly zero, between others: two sources on '
+                'one topic, or messages without an acceleration'
+            )
+        return self._unit_of(cells, still_sd) if self._is_imu else ''
+
+    def _unit_of(self, cells: Cells, still_sd: float) -> str:
+        """Say in which unit the quiet samples of an Imu must be, if not in m/s^2."""
+        scatter = cells.variance.max(axis=1, initial=0.0)
+        quiet = (cells.count > 1) & (scatter <= np.quantile(scatter, 0.5) if len(scatter) else 0)
+        if not quiet.any():
+            return ''
+        norm = float(np.median(np.linalg.norm(cells.mean[quiet], axis=1)))
+        sd = float(np.sqrt(np.median(scatter[quiet])))
+        for unit, one_g in (('g', 1.0), ('mg', 1000.0)):
+            if _ABOUT_ONE[0] < norm / one_g < _ABOUT_ONE[1] and sd < still_sd * one_g:
+                return (
+                    f'it reads {norm:.4g} at rest, where m/s^2 would read {STANDARD_GRAVITY:.2f}: '
+                    f'its samples are in {unit}, make them m/s^2 with thermo_comp convert'
+                )
+        if norm < _NONE * STANDARD_GRAVITY and sd < still_sd * STANDARD_GRAVITY:
+            return (
+                f'it reads {norm:.2g} m/s^2 at rest: gravity is taken off (a linear or free '
+                'acceleration), and the fit needs it: another topic of the driver has it'
+            )
+        return ''
