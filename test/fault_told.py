@@ -26,6 +26,7 @@ _BAD_FILE = (
 )
 _CALIBRATION_FILES = f'{_PROCESS}::test_calibration_files_that_go_bad'
 _DEFENCE, _RELOAD = 'test_node_defence.py', 'test_node_reload.py'
+_SOURCES = 'test_node_sources.py'
 
 TOLD = [
     Told(
@@ -159,7 +160,7 @@ TOLD = [
         'kill -9, another process a second later; the middleware knows the dead one for 20 s yet',
         'the output goes on within 2 s of its first sample; no sample of the other comes between',
         'WARN "2 publishers on /accel/counts, of which one sends"',
-        f'{_DEFENCE}::test_a_driver_that_was_killed_blinds_for_less_than_two_seconds',
+        f'{_SOURCES}::test_a_driver_that_was_killed_blinds_for_less_than_two_seconds',
     ),
     Told(
         'a calibration file of any magnitudes',
@@ -182,28 +183,28 @@ TOLD = [
         'another attitude under stamps in between',
         'nothing is published until one is left or sends alone, nor what came just after it',
         'ERROR "2 publishers on /accel/counts"',
-        f'{_DEFENCE}::test_samples_of_a_second_publisher_never_go_out',
+        f'{_SOURCES}::test_samples_of_a_second_publisher_never_go_out',
     ),
     Told(
         'a second publisher of a temperature',
         'half a degree more',
         'its topic is not used until one is left or sends alone: held, then lost',
         'ERROR "2 publishers on /temperature/board"',
-        f'{_DEFENCE}::test_readings_of_a_second_publisher_are_not_used',
+        f'{_SOURCES}::test_readings_of_a_second_publisher_are_not_used',
     ),
     Told(
         'a driver that cannot be heard',
         'best effort for a reliable subscription; a message of another type',
         'nothing comes in',
         'ERROR "no messages of a publisher on", with the policy or the type',
-        f'{_DEFENCE}::test_a_driver_that_cannot_be_heard_is_named',
+        f'{_SOURCES}::test_a_driver_that_cannot_be_heard_is_named',
     ),
     Told(
         'one temperature stamped a day ahead',
         'among good ones',
         'not used once the next one of its sensor has come',
         'WARN "temperatures are stamped" until then',
-        f'{_DEFENCE}::test_a_reading_far_ahead_is_forgotten',
+        f'{_SOURCES}::test_a_reading_far_ahead_is_forgotten',
     ),
     Told(
         'a change of calibration and parameters fails at any line',

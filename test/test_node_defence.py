@@ -6,7 +6,6 @@ What strangers on the network may ask of the node and send to it: it answers, an
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import signal
@@ -24,7 +23,6 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import (
@@ -36,26 +34,14 @@ from rcl_interfaces.srv import (
     SetParametersAtomically,
 )
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_helpers import (
-    DEEP,
-    SECOND_NS,
-    TIMEOUT,
-    Peer,
-    drive,
-    node_in_thread,
-    stamp_of,
-    stamped,
-    standing,
-)
-from sensor_msgs.msg import Imu, Temperature
+from ros_helpers import SECOND_NS, TIMEOUT, Peer, drive, node_in_thread, standing
+from sensor_msgs.msg import Imu
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
 from thermo_comp.ros.parameters import PARAMETERS_LIMIT, NodeConfig
 from thermo_comp.ros.reader import Reader, read_within
 from thermo_comp.ros.round_trip import NodeProcess
-from thermo_comp.ros.waitloop import Sources
 from thermo_comp.text import one_line
 from thermo_comp.unit.calibration_file import save_calibration
 
@@ -409,211 +395,3 @@ def test_what_param_dump_writes_param_load_sets(peer: Peer, unit: Path) -> None:
         loaded = SetParameters.Request(parameters=dumped)
         results = peer.call(SetParameters, 'thermo_comp/set_parameters', loaded).results
         assert [one.reason for one in results if not one.successful] == []
-
-
-def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> None:
-    # WHY: a second driver's samples, another attitude, went out as if they were the unit's.
-    with node_in_thread(*arguments(unit)) as node:
-        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
-        samples = Samples(peer, node)
-        samples.go_on()
-        other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', DEEP)
-        peer.poll(other.get_subscription_count, 'the second publisher')
-        for k in range(50):
-            samples.send(1)
-            strange = stamped(Vector3Stamped(), START_NS + samples.n_sent * CYCLE_NS - 5)
-            strange.vector.x, strange.vector.y = 2000.0 + k % 3, -2000.0 + k % 5
-            other.publish(strange)
-        status = status_with(peer, diagnostics, '2 publishers on /accel/counts')
-        assert status.level == DiagnosticStatus.ERROR
-        values = {one.key: one.value for one in status.values}
-        assert values['sample publishers'] == '2'
-        peer.node.destroy_publisher(other)
-        peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
-        # The first ones after it may still be of the other.
-        samples.send(20)
-        before = len(samples.heard)
-        peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
-        assert all(abs(imu.linear_acceleration.x) < 1.0 for imu in samples.heard)
-        assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
-
-
-#: A driver as a process of its own: 100 Hz, in real time, each sample with its name.
-DRIVER = """
-import sys, time, rclpy
-from geometry_msgs.msg import Vector3Stamped
-from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Temperature
-rclpy.init()
-node = rclpy.create_node('driver_' + sys.argv[1])
-samples = node.create_publisher(Vector3Stamped, 'accel/counts', QoSProfile(depth=5000))
-kinds = {n: node.create_publisher(Temperature, 'temperature/' + n, 10) for n in ('board', 'case')}
-while not samples.get_subscription_count():
-    time.sleep(0.01)
-k = 0
-while True:
-    now = time.time_ns()
-    message = Vector3Stamped()
-    message.header.frame_id = sys.argv[1]
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
-    message.vector.x, message.vector.y, message.vector.z = 30.0 + k % 3, -20.0 + k % 2, 2941.0
-    for one in kinds.values() if k % 10 == 0 else ():
-        reading = Temperature(header=message.header, temperature=20.0 + 1e-3 * (k % 7))
-        one.publish(reading)
-    samples.publish(message)
-    if not k:
-        print(now, flush=True)
-    k += 1
-    time.sleep(0.01)
-"""
-
-
-@contextlib.contextmanager
-def driver_process(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """Run a driver; give the time of its first sample [ns]. It is killed at the end."""
-    command = [sys.executable, '-c', DRIVER, name]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    try:
-        yield process, int(process.stdout.readline())
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
-
-
-def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer: Peer, unit: Path) -> None:
-    # WHY: for the 20 s of the dead one's lease nothing was published.
-    with node_in_thread(*arguments(unit)) as node:
-        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
-        heard = peer.listen(Imu, 'imu/data_raw')
-
-        def of(name: str) -> list[Imu]:
-            return [imu for imu in list(heard) if imu.header.frame_id == name]
-
-        with driver_process('first'):
-            peer.wait_for(lambda: len(of('first')) > 100, 'samples of the first driver')
-        killed = time.monotonic()
-        # It is the clock that is waited for: the respawn comes a second later.
-        peer.poll(lambda: time.monotonic() - killed > 1.0, 'a second')
-        with driver_process('second') as (_, began_ns):
-            peer.wait_for(lambda: of('second'), 'samples of the second driver')
-            assert node._relay.samples.count_publishers() == 2
-            assert (stamp_of(of('second')[0]) - began_ns) * 1e-9 < 2.0
-            text = '2 publishers on /accel/counts, of which one sends'
-            peer.wait_for(
-                lambda: any(
-                    text in one.status[0].message and one.status[0].level == DiagnosticStatus.WARN
-                    for one in diagnostics[-5:]
-                ),
-                'the warning alone',
-            )
-            peer.wait_for(lambda: len(of('second')) > 100, 'more of the second driver')
-        names = [imu.header.frame_id for imu in heard]
-        assert names == sorted(names)
-
-
-def numbered(begin: int, period_s: float, until_s: float, start_s: float = 0.0) -> Any:
-    """List a publisher's messages: when, its number."""
-    n = int((until_s - start_s) / period_s)
-    return [(start_s + k * period_s, begin + k) for k in range(n)]
-
-
-@pytest.mark.parametrize('offset', [-7, -1, 0, 1, 2, 1000])
-@pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
-def test_two_that_send_are_never_mixed(offset: int, period_s: float) -> None:
-    own = [(*one, 'own') for one in numbered(500, 0.01, 12.0)]
-    begins = 500 + 200 + offset  # as many as the other has sent by then, or nearly
-    other = [(*one, 'other') for one in numbered(begins, period_s, 8.0, start_s=2.003)]
-    sources, used = Sources(), []
-    for at_s, number, name in sorted(own + other):
-        n_known = 2 if at_s > 2.0 else 1
-        if not sources.of_one(n_known, [number], [round(at_s * 1e9)]):
-            used.append((at_s, name))
-    assert {name for _, name in used} == {'own'}
-    # The other one known, but not sending: this one alone, from a second after it was silent on.
-    assert sum(at_s < 2.0 for at_s, _ in used) >= 199
-    assert sum(at_s > 10.0 for at_s, _ in used) >= 199
-
-
-def test_without_numbers_two_publishers_are_two() -> None:
-    sources = Sources()
-    assert sources.of_one(1, [None] * 3, [0, 1, 2]) == 0
-    for k in range(5):
-        assert sources.of_one(2, [None] * 3, [k * SECOND_NS] * 3) == 3
-    assert sources.of_one(1, [None] * 3, [9 * SECOND_NS] * 3) == 3
-    assert sources.of_one(1, [None] * 3, [9 * SECOND_NS] * 3) == 0
-
-
-def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> None:
-    with node_in_thread(*arguments(unit)) as node:
-        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
-        samples = Samples(peer, node)
-        samples.go_on()
-        other = peer.node.create_publisher(Temperature, 'temperature/board', DEEP)
-        peer.poll(other.get_subscription_count, 'the second publisher')
-        for _ in range(10):
-            other.publish(
-                stamped(Temperature(temperature=20.5), START_NS + samples.n_sent * CYCLE_NS)
-            )
-            samples.send(10)
-        status = status_with(peer, diagnostics, '2 publishers on /temperature/board')
-        assert status.level == DiagnosticStatus.ERROR
-        board = node._compensator.thermal.tracker.board
-        assert board.temperature == pytest.approx(20.0, abs=1e-6)
-        assert board.stamp_ns < START_NS + 20 * CYCLE_NS
-
-
-def test_a_driver_that_cannot_be_heard_is_named(peer: Peer, unit: Path) -> None:
-    reliable = 'qos_overrides./accel/counts.subscription.reliability:=reliable'
-    with node_in_thread(*arguments(unit, reliable)):
-        heard = peer.listen(DiagnosticArray, '/diagnostics')
-        unheard = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-        peer.node.create_publisher(Vector3Stamped, 'accel/counts', unheard)
-        peer.node.create_publisher(Imu, 'temperature/case', DEEP)
-        status = status_with(peer, heard, 'no messages of a publisher on /accel/counts: ')
-        assert status.level == DiagnosticStatus.ERROR
-        assert 'est effort publisher and reliable subscription' in status.message
-        text = 'no messages of a publisher on /temperature/case: its type is sensor_msgs/msg/Imu'
-        status_with(peer, heard, text)
-
-
-def test_reports_more_often_than_samples_are_no_silence(peer: Peer, tmp_path: Path) -> None:
-    # WHY: with diagnostics_period below the sample interval each empty report was an ERROR.
-    from thermo_comp.unit.calibration import Unit
-
-    slow = tmp_path / 'slow.yaml'
-    # Its samples may be 1.5 s late: more than a busy machine keeps the driver waiting.
-    save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)
-    with node_in_thread(*arguments(slow, 'diagnostics_period:=0.01')) as node:
-        heard = peer.listen(DiagnosticArray, '/diagnostics')
-        driver = drive(peer, node)
-        imu = peer.listen(Imu, 'imu/data_raw')
-        peer.poll(node._relay.samples.count_publishers, 'the driver')
-        for k in range(5):
-            stamp_ns = START_NS + k * SECOND_NS
-            driver.temperatures(stamp_ns, 20.0, 20.0)
-            driver.counts(stamp_ns, *standing(k))
-            n = len(imu)
-            peer.wait_for(lambda n=n: len(imu) > n, 'the sample')
-            del heard[:]
-            peer.wait_for(lambda: len(heard) > 10, 'reports')
-            said = [array.status[0].message for array in heard[1:10]]
-            assert not any('no samples' in text for text in said), said
-        status_with(peer, heard, 'no samples are coming in')
-
-
-def test_a_reading_far_ahead_is_forgotten(peer: Peer, unit: Path) -> None:
-    # WHY: one reading a day ahead kept WARN until a sample of that day came.
-    with node_in_thread(*arguments(unit)) as node:
-        heard = peer.listen(DiagnosticArray, '/diagnostics')
-        samples = Samples(peer, node)
-        samples.go_on()
-        samples.driver.temperatures(START_NS + 86_400 * SECOND_NS, 25.0)
-        samples.n_sent += 1  # without the readings of every tenth sample
-        samples.send(5)
-        status_with(peer, heard, 's ahead of the samples')
-        samples.go_on()
-        peer.wait_for(
-            lambda: heard and 'ahead' not in heard[-1].status[0].message, 'the end of the warning'
-        )

@@ -1,25 +1,21 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The generators and the judge of benchmarks/strangers.py against closed forms."""
+"""The generators of benchmarks/strangers.py against closed forms."""
 
 from __future__ import annotations
 
-import json
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, regime_set
 from conftest import ROOT
 
 sys.path.insert(0, str(ROOT / 'benchmarks'))
 
 import strangers
 import strangers_cases as cases
-from strangers_baselines import Minutes, by_drift, by_norm, minutes
-from strangers_limits import LIMITS, Limit, Result, Score, best_baseline, misses, rows_of
-from strangers_recorded import blocks_of, part, rests_of
+from strangers_limits import Result
 from strangers_units import (
     BOARD,
     CASE,
@@ -39,8 +35,6 @@ from strangers_units import (
     rng_of,
     spread,
 )
-
-from thermo_comp.unit.calibration import Axes, AxisReference
 
 ZEROS = np.zeros((1, 3))
 LEVEL = np.array([0.0, 0.0, 1.0])
@@ -280,273 +274,3 @@ def test_the_bound_falls_with_noise_and_with_data() -> None:
     least = UG * given.density / np.sqrt(sum(len(bag.time_s) for bag in bags) * 2.0)
     assert (sd > least).all()
     assert (sd < 100.0 * least).all()
-
-
-def of_attitudes(given, board):
-    """Make means of minutes of a unit in all attitudes at some temperatures of the board."""
-    force = GRAVITY * np.repeat(ATTITUDES, len(board), axis=0)
-    at = np.tile(board, len(ATTITUDES))
-    parts = np.repeat(at[:, None], 3, axis=1)
-    samples = given.sensed(force) * given.scale_at(parts) + UG * given.bias_at(parts)
-    return Minutes(samples, at, force)
-
-
-def curved_unit():
-    """Make a unit that the cubic by hand describes."""
-    rng = rng_of('curved')
-    return unit(
-        bias=1500.0 * rng.standard_normal(3), gain=0.01 * rng.standard_normal(3),
-        skew=1e-3 * rng.standard_normal(3),
-        bias_curve=rng.standard_normal((3, 3)) * [[20.0], [1.0], [0.05]],
-        scale_curve=50.0 * rng.standard_normal((1, 3)),
-    )  # fmt: skip
-
-
-def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not() -> None:
-    given = curved_unit()
-    fit, held = (
-        of_attitudes(given, np.linspace(5, 35, 7)),
-        of_attitudes(given, np.array([8.0, 29])),
-    )
-    cubic, constants = (
-        strangers.error_of([by_norm([fit], order=order)(held)], [held], is_drift=False)
-        for order in (3, 0)
-    )
-    # What is left: products of two small terms that the cubic's form leaves out.
-    assert cubic.vector < 5.0
-    assert constants.vector > 50.0
-
-
-def test_constants_by_hand_keep_the_scale_of_few_attitudes() -> None:
-    # One attitude and much scatter: a scale that makes one force of everything fits best.
-    rng = rng_of('few')
-    samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
-    few = Minutes(samples, np.full(200, 20.0), np.full((200, 3), np.nan))
-    force = by_norm([few])(few)
-    assert force.std(axis=0) == pytest.approx(samples.std(axis=0), rel=0.4)
-
-
-def test_a_bias_at_the_reference_is_held_against_its_bound() -> None:
-    # A calibration in counts that knows the bias but for 1 count, 1 / 300 m/s^2, on x.
-    bias = np.array([0.1, -0.2, 0.3])
-    axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
-    bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
-    study = cases.Study('', (), {}, bound=bound)
-    # An sd of 2e-3 m/s^2 that the calibration claims beside its white noise.
-    claimed = axis_set(residual_sd_m_s2=2e-3)
-    known = regime_set(x=claimed, y=claimed, z=claimed)
-    found = strangers.bias_score(calibration(axes=axes, static=known, dynamic=known), study)
-    assert found.ratio == pytest.approx(1 / 0.6 / np.sqrt(3.0))
-    assert found.vector == pytest.approx(1 / 300.0 / UG)
-    assert found.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
-
-
-def test_a_cubic_by_hand_finds_a_pose_s_drift() -> None:
-    given = replace(curved_unit(), scale_curve=ZEROS)
-    minutes_ = [
-        of_attitudes(given, board) for board in (np.linspace(5, 35, 31), np.array([9.0, 22]))
-    ]
-    fit, held = (
-        Minutes(one.samples[: len(one.board) // 18], one.board[: len(one.board) // 18],
-                one.force[: len(one.board) // 18])
-        for one in minutes_
-    )  # fmt: skip
-    error = strangers.error_of([by_drift([fit], 1.0, order=3)(held)], [held], is_drift=True)
-    assert error.vector < 1e-6
-
-
-def test_minutes_are_means_of_whole_minutes() -> None:
-    time_s = np.arange(1.0, 151.0)
-    samples = np.repeat(time_s[:, None], 3, axis=1)
-    mean = minutes(Bag('', time_s, samples, {'board': (time_s, 2.0 * time_s)}))
-    assert mean.samples[:, 0].tolist() == [30.5, 90.5]
-    assert mean.board.tolist() == [61.0, 181.0]
-    assert np.isnan(mean.force).all()
-
-
-def test_a_ratio_is_1_where_errors_are_as_claimed() -> None:
-    rng = rng_of('ratio')
-    n = 20000
-    truth = np.broadcast_to(GRAVITY * LEVEL, (n, 3))
-    root = 20.0 * UG * np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.2, -0.3, 2.0]])
-    error = rng.standard_normal((n, 3)) @ root.T
-    claim = np.broadcast_to(root @ root.T, (n, 3, 3))
-    out = strangers.Corrected(truth + error, claim, np.zeros(3))
-    found = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
-    # 20000 windows tell an RMS to half a percent.
-    assert (found.ratio, found.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
-    assert found.claim == pytest.approx(found.vector, rel=0.02)
-
-
-def test_a_claim_of_a_minute_is_the_noise_of_its_mean() -> None:
-    # The calibration of the tests claims nothing but white noise and the rounding of counts.
-    samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
-    samples[::2] += 1.0
-    samples[1::2] -= 1.0
-    bag = Bag('', np.arange(1, 30001) * 0.01, samples, {})
-    out = strangers.corrected(calibration(), bag)
-    assert np.sqrt(np.diagonal(out.claim, axis1=1, axis2=2)) == pytest.approx(1e-4 / np.sqrt(60.0))
-    assert out.white == pytest.approx([1e-8 / 60.0] * 3)
-    assert out.force == pytest.approx(np.tile(GRAVITY * LEVEL, (5, 1)))
-
-
-def test_minutes_that_are_not_published_may_be_few() -> None:
-    truth = np.broadcast_to(GRAVITY * LEVEL, (100, 3))
-    force = truth + UG
-    claim = np.broadcast_to(UG**2 * np.eye(3), (100, 3, 3))
-    for n_missing, expected in ((1, 1.0), (3, np.inf)):
-        force[:n_missing] = np.nan
-        out = strangers.Corrected(force, claim, np.zeros(3))
-        found = strangers.score([out], [Minutes(truth, np.zeros(100), truth)], is_drift=False)
-        assert found.ratio == pytest.approx(expected)
-
-
-def test_a_row_says_what_it_misses_and_nothing_else() -> None:
-    baselines = {'cubic': Score(50.0, 100.0), 'constants': Score(40.0, 200.0)}
-
-    def missed(fit, title='ageing'):
-        [row] = rows_of([Result(title, 1, {'fit': fit, **baselines})])
-        assert (best_baseline(row, 'norm'), best_baseline(row, 'vector')) == (40.0, 100.0)
-        return misses(row, [row])
-
-    assert missed(Score(41.0, 104.0, 1.0, 1.4, 90.0)) == []
-    assert missed(Score(43.0, 104.0, 1.0, 1.4, 90.0)) == ['norm / best 1.07 > 1.05']
-    assert missed(Score(41.0, 104.0, 1.0, 1.6, 90.0)) == ['ratio 1.6 > 1.5']
-    assert missed(Score(30.0, 90.0, 1.0, 0.6, 90.0), 'turn-on 9') == ['ratio 0.6 < 0.7']
-    assert missed(Score(13.0, 90.0, 1.0, 1.0, 90.0), 'kink') == ['norm 13 > 12']
-
-
-def test_a_fit_that_refuses_its_bags_misses() -> None:
-    [row] = rows_of([Result('ageing', 1, {'cubic': Score(1.0, 1.0)}, refused='no rest')])
-    assert misses(row, [row]) == ['refused']
-
-
-def test_more_data_is_held_against_the_row_without_it() -> None:
-    rows = rows_of(
-        [
-            Result(
-                'third-node alone: its attitude', 1, {'fit': Score(20.0, 40.0, 1.0, 1.0, 40.0)}
-            ),
-            Result('third-node joint: its attitude', 1, {'fit': Score(9.0, 30.0, 1.0, 1.0, 40.0)}),
-        ]
-    )
-    assert misses(rows[0], rows) == []
-    assert misses(rows[1], rows) == ['vector / alone: its attitude 0.75 > 0.5']
-
-
-def test_units_of_a_row_join_by_their_mean_square() -> None:
-    [row] = rows_of(
-        [
-            Result('ageing', unit, {'fit': Score(norm, 1.0, 1.0, ratio, 1.0)}, fit_s=unit)
-            for unit, norm, ratio in ((1, 3.0, 0.5), (2, 4.0, 1.2))
-        ]
-    )
-    assert row.scores['fit'].norm == pytest.approx(np.sqrt(12.5))
-    assert (row.worst, row.fit_s) == (1.2, 1.5)
-
-
-@pytest.mark.parametrize('name', ['units', 'cases', 'baselines', 'limits'])
-def test_generators_and_judge_share_no_code_with_the_package(name: str) -> None:
-    source = (ROOT / 'benchmarks' / f'strangers_{name}.py').read_text(encoding='utf-8')
-    imports = [line for line in source.splitlines() if 'import ' in line]
-    assert imports
-    assert not [line for line in imports if 'thermo_comp' in line]
-
-
-def test_each_case_has_a_limit_and_each_limit_a_case() -> None:
-    names = (*strangers.RECORDED, *cases.CASES)
-    assert all(any(key.startswith(name) for key in LIMITS) for name in names)
-    assert all(any(key.startswith(name) for name in names) for key in LIMITS)
-    assert all(isinstance(limit, Limit) for limit in LIMITS.values())
-
-
-def carried_bag():
-    """Make a day at 1 Hz whose attitude changes after 5 h, and bumps for two minutes at 10 h."""
-    time_s = np.arange(1.0, 86401.0)
-    force = np.where((time_s > 18000.0)[:, None], GRAVITY * LEVEL, GRAVITY * ATTITUDES[0])
-    force[36000:36120] = 0.5
-    return Bag('day', time_s, force, {'board': (time_s, np.full(len(time_s), 20.0))})
-
-
-def test_rests_of_a_recording_are_its_long_stays() -> None:
-    rows = rests_of(carried_bag())
-    # Without the minute at both ends.
-    expected = [(60, 17940), (18060, 35940), (36180, 86340)]
-    assert [(rest.start, rest.stop) for rest in rows] == expected
-
-
-def test_blocks_go_by_the_clock_and_share_no_sample() -> None:
-    bag = carried_bag()
-    blocks = blocks_of(part(bag, slice(9000, 86400), 'rest'), 'rest')
-    assert list(blocks) == list(range(8))
-    times = np.concatenate([block.time_s for block in blocks.values()])
-    # The last sample would be a block of its own.
-    assert times.tolist() == bag.time_s[9000:-1].tolist()
-    assert all((block.time_s // 10800.0 == number).all() for number, block in blocks.items())
-
-
-def test_one_study_of_a_case_can_be_asked_for(capsys, monkeypatch) -> None:
-    ran = []
-    monkeypatch.setattr(
-        strangers, 'run', lambda _, unit, study, *__: ran.append((unit, study.label)) or []
-    )
-    monkeypatch.setattr(cases, 'record', lambda *_, name, **__: Bag(name, None, None, {}))
-    strangers.run_case('turn-on', '9 at 30 ug', 2, None, {})
-    assert ran == [(1, '9 at 30 ug'), (2, '9 at 30 ug')]
-
-
-def test_baselines_come_from_an_earlier_run(tmp_path, monkeypatch) -> None:
-    path = tmp_path / 'earlier.json'
-    scores = {'fit': asdict(Score(1.0, 2.0)), 'cubic': asdict(Score(3.0))}
-    unit = {'title': 'ageing', 'unit': 1, 'scores': scores}
-    path.write_text(json.dumps({'units': [unit]}))
-    earlier = strangers.baselines_in(path)
-    assert list(earlier) == [('ageing', 1)]
-    assert list(earlier['ageing', 1]) == ['cubic']
-    assert earlier['ageing', 1]['cubic'].norm == 3.0
-
-    def refused(study, prior, **options):
-        assert not options
-        raise ValueError('no rest')
-
-    monkeypatch.setattr(strangers, 'fitted', refused)
-    bag = Bag('', np.arange(1.0, 301.0), np.ones((300, 3)), {}, LEVEL)
-    study = cases.Study('', (bag,), {'': (bag,)})
-    [result] = strangers.run('ageing', 1, study, {}, earlier)
-    assert (result.refused, list(result.scores)) == ('no rest', ['cubic'])
-
-
-def test_only_a_study_that_asks_for_a_prior_gets_one(monkeypatch) -> None:
-    priors = []
-
-    def fitted(study, prior, **options):
-        priors.append((study.label, prior, len(options)))
-        return study.label
-
-    monkeypatch.setattr(strangers, 'fitted', fitted)
-    monkeypatch.setattr(strangers, 'chosen_by', str)
-    monkeypatch.setattr(strangers, 'scored', lambda *_: {'': Score()})
-    monkeypatch.setattr(strangers, 'by_hand', lambda _: {})
-    done: dict = {}
-    for label, prior_of in (('', ''), ('alone', ''), ('prior', 'alone')):
-        strangers.run(
-            'third-node', 1, cases.Study(label, (), {'': ()}, prior_of=prior_of), done, {}
-        )
-    fits = [(label, prior) for label, prior, n_options in priors if not n_options]
-    assert fits == [('', None), ('alone', None), ('prior', 'alone')]
-    assert [prior for *_, prior, n_options in priors if n_options] == [None] * 4
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'message'),
-    [
-        (['--cases', 'kinks'], "'kinks' is none of sample-bags"),
-        (['--cases', 'cats'], 'cats needs --cats FILE'),
-    ],
-)
-def test_a_wrong_case_is_told(arguments, message, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(sys, 'argv', ['strangers.py', *arguments])
-    with pytest.raises(SystemExit) as stop:
-        strangers.main()
-    assert stop.value.code == 2
-    assert message in capsys.readouterr().err

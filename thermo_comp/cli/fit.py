@@ -265,17 +265,17 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
             title='positions at rest',
         )
     out.table(
-        ('', 'model', 'positions', 'sections', 'norm'),
+        ('', 'positions', 'sections', 'norm', 'model'),
         [
             (
                 '*' if one.is_chosen else '~' if one.is_near else '',
-                ' + '.join(one.groups) or 'constants',
                 *(micro_g(folds.rms) for folds in one.score.kinds),
+                _named(one.groups),
             )
             for one in result.selected.trials
         ],
-        title='models on data left out, RMS in ug: drift of an axis on each position, and on each '
-        'section of the program, |f| - g on each position; *: chosen, ~: as good',
+        title='models on data left out, RMS in ug: drift of an axis on positions and on sections '
+        'of the program, |f| - g on positions; *: chosen, ~: as good; +: with the curve',
     )
     if calibration.evidence:
         out.table(
@@ -330,6 +330,13 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
         gyroscope=gyroscope and picked(gyroscope, rates) | {'residuals_rad_s': result.rates},
         **picked(result, 'positions least_known findings'),
     )
+
+
+def _named(groups: tuple[str, ...]) -> str:
+    """Name a model by its groups; all but the smallest have the curve."""
+    if len(groups) < 2 or groups[0] != 'curve':
+        return '+'.join(groups) or 'constants'
+    return ''.join(f'+{one}' for one in groups[1:])
 
 
 def _model(trial: 'Trial') -> dict[str, Any]:

@@ -56,10 +56,11 @@ class Whitener:
         #: Correlation times that the positions are long enough to show [s].
         span = float(interval.sum(axis=0).max())
         typical = float(np.median(interval[1:][self._is_there[1:]])) if n_steps > 1 else 1.0
-        times = [_SHORTEST_WINDOWS * typical]
-        while times[-1] * _TIME_STEP <= span / _SPANS:
-            times.append(times[-1] * _TIME_STEP)
-        self.times_s = times if n_steps > 1 else []
+        self.times_s: list[float] = []
+        time_s = _SHORTEST_WINDOWS * typical
+        while time_s <= span / _SPANS:
+            self.times_s.append(time_s)
+            time_s *= _TIME_STEP
 
     def shows(self, time_s: float) -> bool:
         """Whether the positions are long enough, and the windows short enough, for a time."""
