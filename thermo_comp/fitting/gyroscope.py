@@ -93,8 +93,9 @@ def add_gyroscope(
         offset_scale=_EARTH_SD,
     )
     selected = select(regression, state, prior, candidates)
-    claim = claim_of(regression, selected)
-    # Of the offsets the Earth's rate is no error of the gyroscope.
+    # Of the offsets, which every position shows, the Earth's rate is no error of the gyroscope.
+    shown = replace(selected, prior=replace(selected.prior, offset_scale=0.0))
+    claim = claim_of(regression, shown)
     turn_on = math.sqrt(max(claim.offset_sd**2 - _EARTH_SD**2, 0.0))
     triad = build_calibration(
         windows, regression, selected, replace(claim, offset_sd=turn_on), bags, calibration.unit

@@ -31,7 +31,7 @@ _RATIOS = 10.0 ** np.arange(-2.5, 3.6, 0.5)
 # Candidate correlation times: multiples of the shortest one, which is this many windows.
 _TIME_STEP, _SHORTEST_WINDOWS = 10.0**0.5, 3.0
 # A recording shows a correlation time that it holds this many times.
-_SPANS = 10.0
+_SPANS = 6.0
 # Twice the log likelihood that two further parameters must gain: 1 % of the chi-square.
 _LEAST_GAIN = 9.2
 
@@ -54,7 +54,7 @@ class Whitener:
         )
         self._interval = interval
         #: Correlation times that the positions are long enough to show [s].
-        span = float(interval.sum(axis=0).max())
+        span = float(np.median(interval.sum(axis=0)))
         typical = float(np.median(interval[1:][self._is_there[1:]])) if n_steps > 1 else 1.0
         self.times_s: list[float] = []
         time_s = _SHORTEST_WINDOWS * typical
