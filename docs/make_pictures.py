@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the drawings of the pages: the chamber test with its cyclogram, and the viewer's layout.
+Owns the drawings of the pages: the chamber test with its cyclogram, an afternoon at home, and the
+viewer's layout.
 
     python docs/make_pictures.py
 """
@@ -86,6 +87,32 @@ def draw_cyclogram(axes: Axes) -> None:
     axes.legend(loc='lower left', fontsize=7, frameon=False)
 
 
+def draw_afternoon(axes: Axes) -> None:
+    """Draw an afternoon at home: what the surroundings do, and the chip behind them."""
+    legs = [('desk', 22.0, 10.0), ('freezer', -15.0, 30.0), ('desk', 22.0, 40.0)]
+    legs += [('dryer', 45.0, 15.0), ('desk', 22.0, 30.0)]
+    minute = np.arange(0.0, sum(leg[2] for leg in legs), 0.1)
+    ends = np.cumsum([leg[2] for leg in legs])
+    outside = np.array([leg[1] for leg in legs])[np.searchsorted(ends, minute, 'right')]
+    chip = np.empty_like(minute)
+    chip[0] = outside[0]
+    for row in range(1, len(minute)):
+        chip[row] = chip[row - 1] + 0.1 / 9.0 * (outside[row] - chip[row - 1])
+    axes.plot(minute, outside, color=GREY, lw=1, label='surroundings')
+    axes.plot(minute, chip, color=BLUE, lw=2, label='the chip: what is measured')
+    begins = np.concatenate(([0.0], ends[:-1]))
+    names = {'desk': 'on the desk', 'freezer': 'in the freezer', 'dryer': 'hair dryer, from afar'}
+    for (name, _, long), begin in zip(legs, begins, strict=True):
+        axes.axvspan(
+            begin, begin + long, color='#F2F6F9' if name == 'desk' else '#DCE8F0', zorder=0
+        )
+        axes.text(begin + long / 2.0, 53.0, names[name], ha='center', fontsize=7)
+    axes.set_ylim(-20.0, 60.0)
+    axes.set_xlabel('minutes; nobody touches the unit meanwhile')
+    axes.set_ylabel('degC')
+    axes.legend(loc='lower right', fontsize=8, frameon=False)
+
+
 def series() -> dict[str, tuple[Any, Any]]:
     """Return what the layout's paths hold, of the held-out sample bag."""
     recording = tc.read(ROOT / 'bags' / 'held_out.mcap')
@@ -151,6 +178,9 @@ def main() -> None:
     draw_chamber(left)
     draw_cyclogram(right)
     figure.savefig(IMAGES / 'chamber_test.png', dpi=130, metadata={'Software': None})
+    figure = plt.figure(figsize=(9, 3.0), layout='constrained')
+    draw_afternoon(figure.subplots())
+    figure.savefig(IMAGES / 'afternoon.png', dpi=110, metadata={'Software': None})
     figure = plt.figure(figsize=(9, 5))
     draw_layout(figure)
     figure.savefig(IMAGES / 'viewer.png', dpi=110, metadata={'Software': None})

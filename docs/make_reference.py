@@ -150,6 +150,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a message of more than 1 kB (a `frame_id` without end) | dropped, counted |
 | a temperature stamped more than 5 s after the next one of its sensor | not used |
 | a stamp that repeats or goes back a little | dropped, counted |
+| a stamp more than 15 s (or ten cycles) ahead, which no reading and no second sample confirms | dropped, counted |
 | a stamp that goes back by more than a second | the estimators start anew, said once |
 
 Every fault with its test: [faults](faults.md).

@@ -286,6 +286,7 @@ def test_nothing_goes_out_before_a_temperature_or_long_after_one():
     assert compensator.process(1, 0.0, 0.0, 1.0) is None
     compensator.push('board', 2, 20.0)
     assert compensator.process(3, 0.0, 0.0, 1.0) is not None
+    assert compensator.process(10 * SECOND_NS, 0.0, 0.0, 1.0) is not None
     assert compensator.process(2 + 20 * SECOND_NS, 0.0, 0.0, 1.0) is not None
     assert compensator.status().is_board_stale
     assert compensator.process(3 + 20 * SECOND_NS, 0.0, 0.0, 1.0) is None
@@ -293,7 +294,7 @@ def test_nothing_goes_out_before_a_temperature_or_long_after_one():
     compensator.push('board', 30 * SECOND_NS, 20.0)
     assert compensator.process(30 * SECOND_NS, 0.0, 0.0, 1.0) is not None
     counters = compensator.counters
-    assert (counters.n_out, counters.n_no_temperature, counters.n_stale) == (3, 1, 1)
+    assert (counters.n_out, counters.n_no_temperature, counters.n_stale) == (4, 1, 1)
 
 
 def test_bad_samples_are_dropped_and_counted():
@@ -308,6 +309,37 @@ def test_bad_samples_are_dropped_and_counted():
     # Three exact zeros are a dead wire.
     assert counters.n_stuck == 1
     assert counters.n_in == 6
+
+
+@pytest.mark.parametrize(
+    'run', [lambda *given: stream(*given)[1], lambda *given: batch(*given).index.tolist()]
+)
+def test_a_stamp_that_leaps_ahead_needs_a_second_one(run):
+    # WHY: one stamp 20 s ahead made all samples after it late, and the memory began anew.
+    leap, step = 20 * SECOND_NS, SECOND_NS // 100
+    usual = np.arange(1, 6) * step
+    for stamps, kept in (
+        (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
+        (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),  # a true gap
+        # Two damaged ones, apart; and one more that goes back from the leap.
+        (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
+        (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
+    ):
+        compensator = Compensator(thermal_calibration())
+        samples = [('accel', int(at), (1.0, 2.0, 3.0 + k)) for k, at in enumerate(stamps)]
+        assert run(compensator, [('board', 0, 20.0), *samples]) == kept
+        assert compensator.counters.n_out_of_order == len(stamps) - len(kept)
+        assert compensator.counters.n_time_jumps == 0
+
+
+@pytest.mark.parametrize('is_read', [False, True])
+def test_a_reading_that_is_stamped_there_confirms_a_leap(is_read):
+    compensator = Compensator(thermal_calibration())
+    compensator.push('board', 0, 20.0)
+    assert compensator.process(1, 1.0, 2.0, 3.0) is not None
+    if is_read:
+        compensator.push('board', 19 * SECOND_NS, 20.0)
+    assert (compensator.process(20 * SECOND_NS, 2.0, 3.0, 4.0) is not None) == is_read
 
 
 def test_time_that_jumps_back_starts_anew():

@@ -67,7 +67,7 @@ def process_block(
             arrivals += zip(*(column.tolist() for column in own), strict=True)
     arrivals.sort(key=itemgetter(0, 1))
     arrivals.reverse()
-    runs = _runs(compensator.last_ns, stamps)
+    runs = _runs(compensator, stamps, arrivals)
     compensator.counters.n_out_of_order += len(stamps) - sum(map(len, runs))
     parts = []
     for number, run in enumerate(runs):
@@ -88,18 +88,29 @@ def process_block(
     return CompensatedBlock(**columns)
 
 
-def _runs(last_ns: int, stamps: Stamps) -> list[Ints]:
+def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list[Ints]:
     """Find the samples that are in order, in runs between which time jumps back."""
-    if not len(stamps) or (stamps[0] > last_ns and (stamps[1:] > stamps[:-1]).all()):
+    before_ns, leap_ns = compensator.last_ns, compensator.leap_ns
+    steps = np.diff(stamps, prepend=stamps[:1] if before_ns == EVER_NS else before_ns)
+    is_plain = compensator.leapt_ns is None and (steps[before_ns == EVER_NS :] > 0).all()
+    if is_plain and int(np.max(steps, initial=0)) <= leap_ns:
+        latest_ns = max((one[3] for one in arrivals), default=EVER_NS)
+        compensator.reading_ns = max(compensator.reading_ns, latest_ns)
         return [np.arange(len(stamps))]
     runs: list[list[int]] = [[]]
+    last_ns, waiting = before_ns, arrivals[:]
     for number, stamp_ns in enumerate(stamps.tolist()):
+        while waiting and waiting[-1][0] <= number:
+            compensator.reading_ns = max(compensator.reading_ns, waiting.pop()[3])
         if stamp_ns <= last_ns - TIME_JUMP_NS:
             runs.append([])
-        elif stamp_ns <= last_ns:
+            compensator.reading_ns = EVER_NS
+        elif stamp_ns <= last_ns or compensator.is_leap(stamp_ns):
             continue
         runs[-1].append(number)
-        last_ns = stamp_ns
+        compensator.last_ns = last_ns = stamp_ns
+    compensator.last_ns = before_ns
+    compensator.reading_ns = max(compensator.reading_ns, *(one[3] for one in waiting), EVER_NS)
     return [np.array(run, dtype=np.int64) for run in runs]
 
 

@@ -28,6 +28,10 @@ from .status import CompensatorConfig, Counters, GravityResidual
 
 #: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
 TIME_JUMP_NS: Final = 1_000_000_000
+#: A stamp further ahead of the last one than this, or than so many cycles, is believed when a
+#: reading, or a second sample, is stamped there, too: one damaged stamp would cost the memory.
+LEAP_NS: Final = 15_000_000_000
+LEAP_CYCLES: Final = 10.0
 #: The board temperature is called stale beyond this many of its usual intervals.
 STALE_INTERVALS: Final = 5.0
 SHORTEST_STALE_S: Final = 0.5  # ... but never sooner than this [s]
@@ -86,6 +90,9 @@ class Compensator:
         self.thermal = ThermalSide(model, self.config, self.counters)
         self._use(model.calibration)
         self.last_ns = self.event_ns = EVER_NS
+        #: The stamp of a sample that leapt ahead, until the next one tells.
+        self.leapt_ns: int | None = None
+        self.reading_ns = EVER_NS  # the latest stamp of a reading
         #: Of the present segment, as `Correction.line` gives it; empty where no rate is corrected.
         self.rate_line: list[float] = []
 
@@ -93,6 +100,7 @@ class Compensator:
         self.calibration = calibration
         self._full_scale = self._limit = calibration.unit.full_scale
         self.gravity = self._gravity_check()
+        self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
 
     def _gravity_check(self) -> GravityCheck:
         return GravityCheck(
@@ -104,6 +112,7 @@ class Compensator:
         """Queue a reading [degC] of ``'board'`` or another of the calibration's thermometers."""
         self.thermal.push(name, stamp_ns, celsius)
         self.event_ns = min(self.event_ns, stamp_ns)
+        self.reading_ns = max(self.reading_ns, stamp_ns)
 
     def process(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
         """
@@ -161,7 +170,8 @@ class Compensator:
         """Correct the first sample after an event, which serves the checks, too."""
         if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
-        elif stamp_ns <= self.last_ns:
+            self.reading_ns = EVER_NS
+        elif stamp_ns <= self.last_ns or self.is_leap(stamp_ns):
             self.counters.n_out_of_order += 1
             return None
         thermal = self.thermal
@@ -203,6 +213,17 @@ class Compensator:
         if row is not None and self.gravity.wants(stamp_ns):
             self.gravity.add(stamp_ns, row[:3], row[3:], correction.noise_trace)
         return None if self.is_refusing else row
+
+    def is_leap(self, stamp_ns: int) -> bool:
+        """Tell whether a rising stamp is too far ahead to be believed of one sample."""
+        leapt_ns, self.leapt_ns = self.leapt_ns, None
+        near_ns = stamp_ns - self.leap_ns
+        is_far = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
+        if is_far and (leapt_ns is None or stamp_ns <= leapt_ns):
+            self.leapt_ns = stamp_ns
+            self.event_ns = EVER_NS  # the next sample comes by here, too
+            return True
+        return False
 
     def jump_back(self, stamp_ns: int) -> None:
         """Begin anew at a sample before which time has jumped back: a bag that loops."""
