@@ -296,7 +296,8 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     out.table(
         ('section', 'windows', *steps.values(), 'left out'),
         _steps(result.residuals, (*steps, 'left_out'), micro_g),
-        title='|f| - g at rest, RMS in ug; left out: on data that took no part in the fit',
+        title='|f| - g at rest, RMS in ug; left out: on data that took no part in the fit, the '
+        'drift of an axis where other positions do not determine |f|',
     )
     if gyroscope is not None:
         out.table(

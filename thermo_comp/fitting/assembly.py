@@ -82,6 +82,8 @@ def build_calibration(
     slow = _slow_error(prior, claim).tolist()
     earlier = (None, None) if known is None else known.regime_sets()
     lacks = lack_of_fit(windows, regression, selected, claim) if regression.gravity else ((), ())
+    # Of some positions only the drift is judged: that is no ``|f| - g`` to state in the file.
+    is_norm = bool(np.isfinite(selected.score.norms.square).all())
     regimes = []
     for family, one, lack in zip(model.sets.families, earlier, lacks, strict=True):
         x, y, z = (_blank(family, sd) for sd in slow)
@@ -134,7 +136,7 @@ def build_calibration(
                     raw_rms_m_s2=row.raw.rms,
                     rms_m_s2=row.fitted.rms,
                     max_m_s2=row.fitted.peak,
-                    left_out_rms_m_s2=row.left_out.rms if row.left_out.n else None,
+                    left_out_rms_m_s2=row.left_out.rms if is_norm and row.left_out.n else None,
                 )
                 for row in residuals
                 if row.fitted.n

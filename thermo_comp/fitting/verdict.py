@@ -323,7 +323,7 @@ def judge_result(
     raw, fitted = overall.raw.rms / MICRO_G, overall.fitted.rms / MICRO_G
     others = ''
     if overall.left_out.n:
-        others = f'{overall.left_out.rms / MICRO_G:.1f} ug on positions left out, '
+        others = f'{overall.left_out.rms / MICRO_G:.1f} ug on data left out, '
     text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
     if has_temperature and slow / MICRO_G > max(0.3 * raw, 0.5 * fitted):
         why = ': temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
