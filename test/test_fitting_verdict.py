@@ -170,7 +170,7 @@ def judged(raw: float, fitted: float, slow: float, left_out: float | None = None
 def test_what_the_fit_left_is_said() -> None:
     good = judged(100.0, 1.0, 0.2, 1.5)
     assert set(good) == {'residual'}
-    assert '100.0 ug RMS raw, 1.5 ug on positions left out, 1.0 ug' in good['residual'].message
+    assert '100.0 ug RMS raw, 1.5 ug on data left out, 1.0 ug' in good['residual'].message
     # Where no position can be spared, there is no such number.
     assert 'left out' not in judged(100.0, 1.0, 0.2)['residual'].message
 

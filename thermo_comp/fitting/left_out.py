@@ -93,8 +93,8 @@ class Score:
     norms: ``|f| - g`` of left-out positions whose norm the others determine
     force: corrected windows, each position by the others, NaN where its norm is not determined,
         shape (n, 3)
-    drift: drift of each window by the others, or where there is one position, by the other
-        sections, shape (n, 3)
+    drift: drift of each window by the other positions, or where these do not determine it, by the
+        other sections, shape (n, 3)
     """
 
     positions: Folds
@@ -135,18 +135,18 @@ def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Scor
         own = regression.force(moved, rows)
         weight = share[rows]
         level = np.average(own, axis=0, weights=weight)
-        drift[rows] = own - level
+        away = own - level
         is_told = _is_drift_determined(regression, posterior, prior, covariance, rows)
         if rows.stop - rows.start >= _FEWEST_WINDOWS and is_told:
-            square = np.mean(drift[rows] ** 2, axis=1)
+            drift[rows] = away
+            square = np.mean(away**2, axis=1)
             squares[p] = np.average(square, weights=weight)
         if _is_norm_determined(regression, posterior, prior, tangent.derivatives, covariance, p):
             force[rows] = own
             error = np.linalg.norm(own, axis=1) - regression.gravity
             norms[p] = np.average(error**2, weights=weight)
     by_section, section_drift = _sections(regression, posterior, prior, edges, share)
-    if n_positions == 1:
-        drift = section_drift
+    drift = np.where(np.isfinite(drift), drift, section_drift)
     return Score(Folds(squares, counts), by_section, Folds(norms, counts), force, drift)
 
 
