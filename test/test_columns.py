@@ -159,9 +159,3 @@ def test_lags_of_a_neighbour_in_a_ramp():
 def test_refusals(keys, message):
     with pytest.raises(ValueError, match=message):
         Column(**{'group': 'now', 'kind': 'now', **keys})
-
-
-def test_the_third_order_is_asked_for_last():
-    last = {(one.kind, one.power) for one in bank() if one.reach_s == math.inf}
-    assert last == {('board', 2), ('square', 1), ('cube', 0)}
-    assert all(one.reach_s == one.tau_s for one in bank() if one.reach_s < math.inf)

@@ -394,56 +394,6 @@ def test_readings_of_a_long_time_without_samples_all_count(n_before, ahead_s):
     assert block.counters.n_board_rejected == block.counters.n_case_rejected == 0
 
 
-def test_switch_makes_no_step():
-    # The sets differ by 5 counts = 1.7 mg: at the longest over 300 s, at 100 Hz 0.057 ug a sample.
-    unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
-    compensator = Compensator(
-        unit, CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
-    )
-    outputs = []
-    for k in range(200_000):
-        stamp = k * 10_000_000
-        if k % 100 == 0:
-            ramp = max(k / 100.0 - 1200.0, 0.0) / 60.0
-            compensator.push('board', stamp, 20.0 + 0.3 * ramp)
-            compensator.push('case', stamp, 20.0 + ramp)
-        outputs.append(compensator.process(stamp, 0.0, 0.0, 1.0)[0])
-    steps = np.abs(np.diff(outputs))
-    assert outputs[0] == 0.0
-    assert outputs[-1] == pytest.approx(-5.0 / 300.0)
-    assert steps.max() <= 5.0 / 300.0 / 30000.0 * 1.001
-
-
-@pytest.mark.parametrize(
-    ('delta', 'given_s', 'expected_s'),
-    # 0.3 counts / 300 = 1e-3 m/s^2 = 102 ug
-    [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
-)
-def test_sets_that_differ_take_longer(delta, given_s, expected_s):
-    unit = calibration(dynamic=regime_set(axis_set(delta=delta)))
-    compensator = Compensator(unit, CompensatorConfig(transition_time_s=given_s))
-    assert compensator.thermal.tracker.config.transition_time_s == pytest.approx(expected_s)
-
-
-def test_swap_takes_effect_between_two_samples():
-    compensator = Compensator(calibration())
-    warm(compensator, until_s=5)
-    before = compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0)
-    compensator.swap(calibration(axes=Axes(*[AxisReference(150.0, 0.0)] * 3)))
-    after = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
-    assert (before[0], after[0]) == (1.0, 2.0)
-
-
-def test_swap_to_another_detector_loses_no_sample():
-    compensator = Compensator(calibration())
-    warm(compensator, until_s=5)
-    assert compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0) is not None
-    compensator.swap(rich_calibration())
-    row = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
-    assert row is not None
-    assert not compensator.status().is_settled
-
-
 def test_flush_lets_the_regime_go_on_without_samples():
     compensator = Compensator(calibration())
     warm(compensator, until_s=1500)

@@ -279,14 +279,14 @@ class TestColumnMap:
                 None,
                 'two thermometers of one',
             ),
-            ({'stamp': {'column': 't'}}, 'stamp.unit', 'ns where there is a column'),
+            ({'stamp': {'column': 't'}}, 'stamp.unit', 'iso where there is a column'),
             ({'stamp': {}}, 'stamp', 'give either `column` and `unit`, or `rate_hz`'),
             ({'stamp': {'column': 't', 'unit': 's', 'rate_hz': 1.0}}, 'stamp', 'give either'),
             ({'stamp': {'rate_hz': 0.0}}, 'stamp.rate_hz', 'greater than 0'),
             (
                 {'stamp': {'column': 't', 'unit': 'min'}},
                 'stamp.unit',
-                "'s', 'ms', 'us' or 'ns', got 'min'",
+                "'s', 'ms', 'us', 'ns' or 'iso', got 'min'",
             ),
             ({'stamp': {'column': 1.5, 'unit': 's'}}, 'stamp.column', 'integer or text, got 1.5'),
             (
