@@ -30,6 +30,9 @@ STEEPEST = np.array([5e-3, 2e-4])
 _FLATTEST = 1e-6
 # Widths of the paper's sets, which stay whatever they gain, over the steepest: as good as free.
 _FREE = 10.0
+# Few attitudes leave a line of constants open, along which what a model misses would drag them
+# far: there the constants stay this much nearer to the first guess; the claim has the whole prior.
+_HELD = 0.05
 # P attitudes show 3 P drifts; a unit has 6, bias and scale of each axis, a support 2 P: with fewer
 # attitudes than 6 a tilt could be any drift of the unit.
 _DIRECTIONS_FOR_TILTS = 6
@@ -87,8 +90,12 @@ def regress(
     if options.model == 'golovach':
         prior = replace(prior, column_sd=candidates.typical)
         return regression, fit_all(regression, state, prior, candidates), None
-    selected = select(regression, state, prior, candidates, tell)
-    return regression, selected, candidates.typical
+    is_open = len(distinct_directions(up)) < POSITIONS_NEEDED
+    near = _HELD if is_open else 1.0
+    held = replace(prior, bias_sd=near * prior.bias_sd, scale_sd=near * prior.scale_sd)
+    selected = select(regression, state, held, candidates, tell)
+    wide = replace(selected.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
+    return regression, replace(selected, prior=wide), candidates.typical
 
 
 def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> float:
