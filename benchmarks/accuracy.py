@@ -26,7 +26,7 @@ from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.priors import population
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.recording.columns import Block, Readings
+from thermo_comp.recording.blocks import Block, Readings
 from thermo_comp.simulation.campaign import plan
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import SimulatedRun, arrays

@@ -15,7 +15,7 @@ import pyarrow as pa
 import zstandard
 from pyarrow import parquet
 
-from thermo_comp.convert.columns import ColumnMap, table_log
+from thermo_comp.convert.column_map import ColumnMap, table_log
 from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import open_recording

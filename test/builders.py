@@ -19,8 +19,8 @@ from thermo_comp.unit.calibration import (
     parameter_layout,
 )
 from thermo_comp.unit.functions import Polynomial
-from thermo_comp.unit.gyroscope import Gyroscope, RateCurve, RateSet, RateTerm
 from thermo_comp.unit.posterior import posterior_of
+from thermo_comp.unit.rate_bias import Gyroscope, RateCurve, RateSet, RateTerm
 
 GRAVITY = 9.80665
 SECOND_NS = 1_000_000_000

@@ -20,7 +20,7 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from thermo_comp.recording.columns import Block
+from thermo_comp.recording.blocks import Block
 
 VECTOR = 'geometry_msgs/msg/Vector3Stamped'
 IMU = 'sensor_msgs/msg/Imu'

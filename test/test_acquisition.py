@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermo_comp.fitting.acquisition import Acquisition
-from thermo_comp.recording.columns import Block, Readings
+from thermo_comp.cli.acquisition import Acquisition
+from thermo_comp.recording.blocks import Block, Readings
 
 START_NS = 10**18
 RATE = 50.0

@@ -13,7 +13,7 @@ import yaml
 from builders import calibration
 from conftest import Cli
 
-from thermo_comp.convert.columns import ColumnMap, load_column_map, table_log
+from thermo_comp.convert.column_map import ColumnMap, load_column_map, table_log
 from thermo_comp.convert.log import Readings, thin, write_log
 from thermo_comp.errors import RecordingError, ThermoCompError
 from thermo_comp.recording.reader import read_recording

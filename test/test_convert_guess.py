@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.convert.columns import guess_columns, spoken_columns, table_log
+from thermo_comp.convert.column_map import guess_columns, spoken_columns, table_log
 from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording

@@ -13,7 +13,7 @@ import yaml
 from conftest import Cli
 from position_helpers import Rest
 
-from thermo_comp.convert.columns import guess_columns, load_column_map, table_log
+from thermo_comp.convert.column_map import guess_columns, load_column_map, table_log
 from thermo_comp.convert.headings import map_lines, read_headings
 from thermo_comp.convert.log import NO_STAMP
 from thermo_comp.convert.table import exact_ns

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermo_comp.convert.columns import ColumnMap, table_log
+from thermo_comp.convert.column_map import ColumnMap, table_log
 from thermo_comp.convert.log import NO_STAMP, write_log
 from thermo_comp.convert.table import Format, Stamp, exact_ns, layout, read_parquet, read_text
 from thermo_comp.errors import RecordingError

@@ -21,8 +21,8 @@ from thermo_comp.convert.tools import TOOLS
 from thermo_comp.errors import CalibrationError
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
 from thermo_comp.unit.functions import CubicSpline, Polynomial
-from thermo_comp.unit.gyroscope import Gyroscope, RateCurve, RateSet
 from thermo_comp.unit.prediction import bias_and_scale, ramp_states
+from thermo_comp.unit.rate_bias import Gyroscope, RateCurve, RateSet
 from thermo_comp.unit.rate_triad import rate_triad
 
 ONE = Polynomial((1.0,))

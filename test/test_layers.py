@@ -31,7 +31,7 @@ LAYERS = {
     'recording': 2,
     'fitting': 3,
     'replay': 3,
-    'arrays': 4,
+    'api': 4,
     'judging': 4,
     'convert': 4,
     'report': 5,

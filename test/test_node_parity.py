@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.online.status import STAMPED_TOPIC
-from thermo_comp.recording.columns import Block, ImuColumns
+from thermo_comp.recording.blocks import Block, ImuColumns
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter

@@ -45,7 +45,7 @@ def part_of(path, begin=None, end=None, **options):
 @pytest.mark.parametrize('n_messages', [8192, 100])
 @pytest.mark.parametrize(('begin', 'end'), [(20.0, 50.0), (20.0, None), (None, 50.0)])
 def test_what_is_inside_is_there_and_nothing_else(bag, begin, end, n_messages, monkeypatch):
-    monkeypatch.setattr('thermo_comp.recording.columns.BLOCK_MESSAGES', n_messages)
+    monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', n_messages)
     blocks, since = part_of(bag, begin, end, raw=True)
     whole = read_recording(bag, require=()).columns
     time = (whole.accel_stamp_ns - START_NS) * 1e-9

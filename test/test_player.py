@@ -30,7 +30,7 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
 from thermo_comp.errors import OutputError, RecordingError, ThermoCompError
-from thermo_comp.recording.columns import ImuColumns
+from thermo_comp.recording.blocks import ImuColumns
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording.columns import LONGEST_PAUSE_NS, Block
+from thermo_comp.recording.blocks import LONGEST_PAUSE_NS, Block
 from thermo_comp.recording.overview import survey_recording
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.writer import BagWriter

@@ -24,7 +24,7 @@ from mcap.reader import make_reader
 from recording_helpers import assert_columns, regular_messages, write_mcap, write_rosbag2
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording.columns import Recording
+from thermo_comp.recording.blocks import Recording
 from thermo_comp.recording.reader import inspect_recording, read_recording
 from thermo_comp.recording.writer import BagWriter
 

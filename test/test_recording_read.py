@@ -33,7 +33,7 @@ from recording_helpers import (
 )
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording.columns import Recording
+from thermo_comp.recording.blocks import Recording
 from thermo_comp.recording.reader import inspect_recording, open_recording, read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
@@ -404,7 +404,7 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path: Path) ->
 
 
 def test_reading_twice_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('thermo_comp.recording.columns.BLOCK_MESSAGES', 100)
+    monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 100)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:
@@ -417,7 +417,7 @@ def test_reading_twice_gives_the_same(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_blocks_have_about_one_size(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_messages: int
 ) -> None:
-    monkeypatch.setattr('thermo_comp.recording.columns.BLOCK_MESSAGES', n_messages)
+    monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', n_messages)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:

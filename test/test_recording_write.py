@@ -28,7 +28,7 @@ from rosbags.rosbag2 import Reader as Reader2
 
 from thermo_comp.errors import OutputError, RecordingError
 from thermo_comp.online.status import STAMPED_TYPE, stamped_flag
-from thermo_comp.recording.columns import ImuColumns
+from thermo_comp.recording.blocks import ImuColumns
 from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.writer import BagWriter
 

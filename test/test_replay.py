@@ -21,7 +21,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from thermo_comp.errors import CalibrationError, OutputError, RecordingError
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.recording.columns import Block, ImuColumns
+from thermo_comp.recording.blocks import Block, ImuColumns
 from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
@@ -267,7 +267,7 @@ def test_memory_does_not_grow_with_the_bag(
 ) -> None:
     # Many blocks in the short bag, too; and a unit that converts at this rate, or all samples
     # would be held back.
-    monkeypatch.setattr('thermo_comp.recording.columns.BLOCK_MESSAGES', 1 << 13)
+    monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 13)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)
     calibration = dataclasses.replace(calibration, unit=unit)

@@ -13,9 +13,9 @@ from position_helpers import GRAVITY, MG, Rest
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.data_checks import describe
 from thermo_comp.fitting.jumps import find_jumps
 from thermo_comp.fitting.reduction import reduce_source
-from thermo_comp.fitting.verdict import describe
 from thermo_comp.simulation.campaign import positions
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',))

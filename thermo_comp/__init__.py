@@ -47,7 +47,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .arrays import Columns, Corrected, Temperature, correct, fit, read
+    from .api import Columns, Corrected, Temperature, correct, fit, read
     from .errors import ThermoCompError
     from .online.compensator import Compensator
     from .online.status import CompensatorConfig
@@ -86,7 +86,7 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    module, _, own = _HOMES.get(name, 'arrays').partition(':')
+    module, _, own = _HOMES.get(name, 'api').partition(':')
     value = getattr(import_module(f'.{module}', __name__), own or name)
     globals()[name] = value
     return value

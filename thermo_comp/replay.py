@@ -28,7 +28,7 @@ from .files import shown_name
 from .online.batch import CompensatedBlock, process_block
 from .online.compensator import HELD, SWAPPED, Compensator
 from .online.status import STAMPED_TOPIC, STAMPED_TYPE, CompensatorConfig, Counters, stamped_flag
-from .recording.columns import Block, ImuColumns, Messages, RecordingInfo, Role
+from .recording.blocks import Block, ImuColumns, Messages, RecordingInfo, Role
 from .recording.reader import RecordingReader, open_recording
 from .recording.topics import TEMPERATURE, Topics
 from .recording.writer import TABLES, BagWriter, WriteRows, table_writer

@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from thermo_comp.convert.columns import Accel, ColumnMap, load_column_map, table_log
+from thermo_comp.convert.column_map import Accel, ColumnMap, load_column_map, table_log
 from thermo_comp.convert.log import write_log
 from thermo_comp.convert.table import Stamp
 

@@ -21,7 +21,7 @@ from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
 from . import bags, convert, fit, judge, output, record, simulate
-from .options import expanded, option
+from .shared_options import expanded, option
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: Any = typer.BadParameter.__mro__[2]

@@ -11,9 +11,9 @@ import typer
 from ..files import bag_kind, check_output
 from ..online.status import DROPPED, CompensatorConfig
 from ..text import counted
-from . import options
-from .options import argument, option
+from . import shared_options as options
 from .output import Output, micro_g, picked
+from .shared_options import argument, option
 
 _BAG = argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
 _AS_THE_NODE = 'As the parameter of the node, in s.'

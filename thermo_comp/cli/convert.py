@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from ..errors import CalibrationError
 from ..files import CALIBRATION, PARAMETERS, bag_kind, check_output, read_bounded, write_atomically
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
-from . import options
-from .options import argument, option
+from . import shared_options as options
 from .output import Output, picked
+from .shared_options import argument, option
 
 if TYPE_CHECKING:
     from ..convert.log import ForeignLog
@@ -155,7 +155,7 @@ def as_bags(
 
 def _read(out: Output, path: Path, **given: Any) -> 'ForeignLog':
     """Read a table, log or bag, which its name tells; refuse options that it has no use for."""
-    from ..convert import autopilot, bag, columns
+    from ..convert import autopilot, bag, column_map
     from ..convert.headings import map_lines
 
     kind = _kind_of(path)
@@ -176,18 +176,18 @@ def _read(out: Output, path: Path, **given: Any) -> 'ForeignLog':
     if chart is not None and rate_hz is not None:
         raise options.usage('--rate-hz: a column map says that')
     if chart is not None:
-        return columns.table_log(path, columns.load_column_map(chart))
+        return column_map.table_log(path, column_map.load_column_map(chart))
     if path.suffix.lower() in ('.parquet', '.pq'):
         raise options.usage('a Parquet table needs --columns MAP')
-    guessed = columns.guess_columns(path, rate_hz)
+    guessed = column_map.guess_columns(path, rate_hz)
     if guessed.format is None:  # told by its headings
         out.line(f'{path}: taken as this column map; edit it and give it as --columns if not so')
         for line in map_lines(guessed):
             out.line(f'  {line}')
     else:
-        taken = columns.spoken_columns(guessed)
+        taken = column_map.spoken_columns(guessed)
         out.line(f'{path}: taken as {taken}; --columns says otherwise')
-    return columns.table_log(path, guessed)
+    return column_map.table_log(path, guessed)
 
 
 def export(

@@ -11,10 +11,10 @@ import typer
 
 from ..files import CALIBRATION, PAGE, check_output
 from ..text import counted, one_line
-from . import options
+from . import shared_options as options
 from .convert import as_bags
-from .options import argument, option
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
+from .shared_options import argument, option
 
 if TYPE_CHECKING:
     from ..fitting import FitResult

@@ -11,9 +11,9 @@ from typing import Any
 
 from ..errors import ThermoCompError
 from ..files import CSV, PAGE, check_output, shown_name
-from . import options
-from .options import argument, option
+from . import shared_options as options
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
+from .shared_options import argument, option
 
 
 def evaluate(

@@ -17,13 +17,13 @@ import typer
 from ..errors import RecordingError, ThermoCompError
 from ..text import counted
 from ..unit.gravity import STANDARD_GRAVITY, spoken
-from . import options
-from .options import argument, option
+from . import shared_options as options
 from .output import Cell, Output, micro, picked
+from .shared_options import argument, option
 
 if TYPE_CHECKING:
-    from ..fitting.acquisition import Account, Position
     from ..typing import Floats
+    from .acquisition import Account, Position
 
 _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
 
@@ -58,10 +58,10 @@ def record(
       thermo_comp record --positions 18 --soak 45min -o bags/unit43
       thermo_comp record held_out.mcap --positions 1 --soak 1h -o bags/unit44
     """
-    from ..fitting.acquisition import Acquisition
     from ..recording.growing import PositionBags, growing_blocks, numbered_bags
     from ..recording.reader import open_recording
     from ..ros.process import SignalWatch
+    from .acquisition import Acquisition
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)
     _tell_leftovers(out, output, finish)

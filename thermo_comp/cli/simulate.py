@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from ..errors import ThermoCompError
 from ..files import bag_kind, check_output
 from ..unit.gravity import STANDARD_GRAVITY
-from . import options
+from . import shared_options as options
 from .judge import tell_sections
-from .options import option
 from .output import Output, picked
+from .shared_options import option
 
 if TYPE_CHECKING:
     from ..recording.writer import BagWriter
@@ -142,7 +142,7 @@ def _write(
     """Write a run by blocks, from its first temperatures on, as a recorder would; count them."""
     import numpy as np
 
-    from ..recording.columns import ImuColumns
+    from ..recording.blocks import ImuColumns
     from ..recording.topics import Topics
 
     topics = Topics()
@@ -186,7 +186,7 @@ def demo(
     options.require_ros()
     # Before the first import of ROS: on this machine only.
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    from ..arrays import fit
+    from ..api import fit
     from ..judging.evaluation import evaluate
     from ..recording.reader import inspect_recording
     from ..report.evidence import evidence_of_bags

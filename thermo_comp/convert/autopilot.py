@@ -35,7 +35,7 @@ import numpy.typing as npt
 
 from ..errors import RecordingError
 from ..files import open_regular
-from ..recording.columns import Readings
+from ..recording.blocks import Readings
 from ..typing import Floats, Ints
 from .log import NO_STAMP, SLOW_HZ, ForeignLog, find_stillness, library, thin
 

@@ -22,8 +22,8 @@ from ..unit import calibration as unit
 from ..unit.calibration import Calibration
 from ..unit.functions import Polynomial
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
-from ..unit.gyroscope import MILLIDEGREE, Gyroscope, RateCurve, RateSet
 from ..unit.prediction import bias_and_scale, ramp_states
+from ..unit.rate_bias import MILLIDEGREE, Gyroscope, RateCurve, RateSet
 from ..unit.rate_triad import rate_triad
 from .tools import TOOLS, Content, Tool, ql, turned
 

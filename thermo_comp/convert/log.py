@@ -18,11 +18,11 @@ from typing import Any, Literal
 import numpy as np
 
 from .. import __version__
-from ..arrays import said_anew
+from ..api import said_anew
 from ..errors import RecordingError
 from ..files import shown_name
 from ..fitting.sources import digest
-from ..recording.columns import ImuColumns, Readings
+from ..recording.blocks import ImuColumns, Readings
 from ..recording.overview import KELVINS
 from ..recording.stillness import CellAccumulator
 from ..recording.topics import Topics

@@ -33,6 +33,7 @@ from ..unit.functions import TemperatureFunction
 from ..unit.posterior import posterior_of
 from .bayes_factors import group_evidence
 from .claim import Claim
+from .data_checks import Finding
 from .equations import as_vector
 from .evidence import ResidualRow
 from .lack_of_fit import lack_of_fit
@@ -40,7 +41,6 @@ from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Selected
 from .unknowns import Layout, Prior, State
-from .verdict import Finding
 from .windows import Sets, ThermalWindows
 
 # Edges are widened by this part of the span, so that the run that was fitted is inside them.

@@ -14,13 +14,13 @@ import numpy as np
 from ..errors import FitError
 from ..typing import Floats
 from .coverage import distinct_directions
+from .data_checks import POSITIONS_NEEDED
 from .options import FitOptions
 from .priors import informative_priors, with_calibration
 from .regression import Regression
 from .selection import Candidates, Selected, fit_all, select
 from .start import ConstantCalibration, constant_calibration, position_means, within_positions
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior
-from .verdict import POSITIONS_NEEDED
 from .windows import CURVE, ThermalWindows
 
 #: Nothing is steeper than a cheap sensor's data sheet: bias [m/s^2 per K] (500 ug/K), relative

@@ -23,11 +23,12 @@ from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
 from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
-from . import verdict
+from . import data_checks
 from .assembly import build_calibration
 from .beginning import first_guess, regress
 from .claim import claim_of
 from .coverage import LeastKnown, least_known, rough_centre
+from .data_checks import Finding, enforce
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
@@ -37,7 +38,6 @@ from .selection import Selected, is_better
 from .sensors import gradients_at_rest, learn_detector
 from .sources import FitSource
 from .start import position_means
-from .verdict import Finding, enforce
 from .windows import FEWEST_WINDOWS, SET, Model, ThermalWindows, thermal_windows
 
 Progress = Callable[[float], None]
@@ -189,8 +189,8 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         name = bags[seen.index(False)].source.name
         raise FitError(f'{name}: no board temperature, which the other bags have')
     serial = check_serial([bag.source for bag in bags], options)
-    findings = enforce(verdict.judge_prior(serial, options.prior), options)
-    findings += enforce(verdict.judge_bags(bags, options), options)
+    findings = enforce(data_checks.judge_prior(serial, options.prior), options)
+    findings += enforce(data_checks.judge_bags(bags, options), options)
     known = options.prior
     detector = options.detector or (known.detector if known else learn_detector(bags))
     tell(0.55)
@@ -211,7 +211,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     up = start.force(position_means(windows.data))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     has_case = all(len(bag.case.value) for bag in bags)
-    findings += enforce(verdict.judge_windows(windows, up, has_case), options)
+    findings += enforce(data_checks.judge_windows(windows, up, has_case), options)
     tell(0.7)
     regression, selected, typical = regress(windows, start, up, options, tell)
     asks = has_case and known is None and options.detector is None
@@ -226,9 +226,9 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     state = selected.posterior.state
     K = state.kappa * start.scale
     constants, raw = (K, state.bias, state.misalignment), residuals[-1].raw.rms
-    found_none = verdict.judge_constants(windows, up, constants, raw, options)
+    found_none = data_checks.judge_constants(windows, up, constants, raw, options)
     findings += enforce(found_none, options)
-    findings += verdict.judge_result(
+    findings += data_checks.judge_result(
         K, residuals, claim.offset_sd, options, windows.has_temperature
     )
     try:
@@ -247,7 +247,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     except ValueError as error:
         raise FitError(f'these data give no calibration that can be used: {error}') from error
     least = least_known(calibration, selected.posterior.state.up)
-    unseen = list(verdict.judge_coverage(least))
+    unseen = list(data_checks.judge_coverage(least))
     findings += unseen
     calibration = with_notes(calibration, [f'{one.name}: {one.message}' for one in unseen])
     return FitResult(

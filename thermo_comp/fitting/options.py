@@ -88,7 +88,7 @@ class FitOptions:
     detector: thermometer and detector settings; None learns them from the bags
     min_rest_s: length of the shortest rest; None chooses, see `reduction`
     still_sd: largest scatter of the samples at rest [m/s^2]
-    allow: names of refusals that the user overrides, see `verdict`
+    allow: names of refusals that the user overrides, see `data_checks`
     """
 
     gravity: float

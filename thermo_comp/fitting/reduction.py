@@ -22,8 +22,8 @@ import numpy as np
 
 from ..errors import FitError
 from ..recording import stillness
+from ..recording.blocks import RecordingInfo
 from ..recording.causes import CauseCounter
-from ..recording.columns import RecordingInfo
 from ..recording.stillness import CellAccumulator, Cells
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..typing import Floats, Ints

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from ..errors import FitError
 from ..files import shown_name
-from ..recording.columns import Block, Input, RecordingInfo, Role
+from ..recording.blocks import Block, Input, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics, is_called, shown
 from ..typing import Floats

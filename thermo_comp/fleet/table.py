@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import ThermoCompError
 from ..files import CSV, PARQUET, write_atomically
 from ..fitting import FitResult
-from ..fitting.verdict import can_tell_misalignment
+from ..fitting.data_checks import can_tell_misalignment
 from ..judging.judgement import Judgement
 from ..judging.verdicts import Verdict
 from ..text import one_line

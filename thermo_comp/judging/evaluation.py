@@ -16,7 +16,7 @@ from ..errors import RecordingError
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sources import digest, recording_source
-from ..recording.columns import Role
+from ..recording.blocks import Role
 from ..recording.stillness import STILL_SD
 from ..recording.topics import Topics
 from ..replay import check_unit, needed_roles, topics_for

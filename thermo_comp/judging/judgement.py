@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..fitting.coverage import distinct_directions, norm_columns
+from ..fitting.data_checks import POSITIONS_NEEDED
 from ..fitting.start import within_positions
-from ..fitting.verdict import POSITIONS_NEEDED
 from ..online.compensator import SWAPPED
 from ..text import counted
 from ..typing import Floats

@@ -13,9 +13,9 @@ import numpy as np
 from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction
-from ..unit.gyroscope import MILLIDEGREE
 from ..unit.metrics import residual_statistics
 from ..unit.prediction import SlowUncertainty
+from ..unit.rate_bias import MILLIDEGREE
 from ..unit.rate_triad import rate_triad
 from .windows import Windows, means_by
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..unit.gravity import STANDARD_GRAVITY
-from .columns import Block
+from .blocks import Block
 from .stillness import Cells
 
 # Parts of the samples: what is counted once may be a glitch; what more than half are, all are.

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Bytes, Ints
-from .columns import Messages, gather, number_at
+from .blocks import Messages, gather, number_at
 
 PREFIX = struct.Struct('<BQ')  # opcode and length in front of each record
 HEAD_BYTES = 160  # enough of a chunk's record to hold its head

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..typing import Floats, Ints
-from .columns import NO_STAMP_NS, Messages, gather, number_at
+from .blocks import NO_STAMP_NS, Messages, gather, number_at
 
 _STEP = re.compile(r'([A-Za-z]\w*)(?:\[([0-9]{1,6})\])?')
 _KINDS = {

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..errors import OutputError, RecordingError
 from ..files import MCAP, check_output
-from .columns import Block, RecordingInfo, Role
+from .blocks import Block, RecordingInfo, Role
 from .reader import open_recording
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics
 from .writer import BagWriter

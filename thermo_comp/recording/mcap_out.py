@@ -27,8 +27,8 @@ from mcap.opcode import Opcode
 
 from .. import __version__
 from ..errors import RecordingError
+from .blocks import Messages, join_messages, scatter
 from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
-from .columns import Messages, join_messages, scatter
 from .fields import typestore
 from .mcap_file import MAGIC, METADATA_NAME
 from .topics import REGIME_TOPICS

@@ -14,8 +14,8 @@ import numpy as np
 
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..thermal.thermometer import COLDEST, HOTTEST
+from .blocks import Readings, RecordingInfo
 from .causes import CauseCounter
-from .columns import Readings, RecordingInfo
 from .fields import temperature_fields
 from .reader import RecordingReader, open_recording
 from .stillness import STILL_SD, CellAccumulator, still_intervals, why_restless

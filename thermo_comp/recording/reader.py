@@ -22,9 +22,23 @@ from typing import Any
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..plain_yaml import PlainYamlError, load_plain_yaml
-from . import columns
+from .blocks import (
+    NO_STAMP_NS,
+    ROLES,
+    BagFile,
+    Block,
+    Messages,
+    Recording,
+    RecordingInfo,
+    Role,
+    Topic,
+    clocks_apart,
+    gathered,
+    joined,
+    with_stamps,
+    without_jumps,
+)
 from .chunks import MAX_CHUNK_BYTES, expand, inflate, inflate_ros1_chunk, translated
-from .columns import ROLES, Block, Messages, RecordingInfo, Role, Topic
 from .fields import Field, definitions_of
 from .mcap_file import McapFile
 from .topics import WHOLE, Selected, Topics, select_topics, shown
@@ -146,10 +160,10 @@ class RecordingReader(ExitStack):
                 yield from found
 
         n_read = dict.fromkeys(self.topics, 0)
-        last_ns = columns.NO_STAMP_NS
-        for gathered in columns.gathered(decoded()):
-            block, last_ns = columns.with_stamps(gathered, last_ns)
-            self.apart = self.apart or columns.clocks_apart(block)
+        last_ns = NO_STAMP_NS
+        for each in gathered(decoded()):
+            block, last_ns = with_stamps(each, last_ns)
+            self.apart = self.apart or clocks_apart(block)
             for role in n_read:
                 n_read[role] += len(block.log_ns[role])
             if block.n_messages:
@@ -188,8 +202,8 @@ class RecordingReader(ExitStack):
     def blocks_on_one_clock(self) -> Iterator[Block]:
         """Read the bag for whoever walks its time: without the jumps of its clock."""
         if self._part.is_stamped:
-            return columns.without_jumps(self.blocks(), self.info.path)
-        return self._cut(columns.without_jumps(self._blocks(), self.info.path))
+            return without_jumps(self.blocks(), self.info.path)
+        return self._cut(without_jumps(self._blocks(), self.info.path))
 
     def _cut(self, blocks: Iterator[Block]) -> Iterator[Block]:
         """Leave out what is outside the part; RecordingError where no sample is left."""
@@ -224,11 +238,11 @@ open_recording = RecordingReader
 
 def read_recording(
     path: str | Path, topics: Topics | None = None, *, require: Collection[Role] = ROLES
-) -> columns.Recording:
+) -> Recording:
     """Read a whole bag into memory; as `open_recording`, and RecordingError for damaged data."""
     with open_recording(path, topics, require=require) as reader:
         blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), (), ROLES)
-        return columns.Recording(reader.info, columns.joined(blocks))
+        return Recording(reader.info, joined(blocks))
 
 
 def inspect_recording(path: str | Path, topics: Topics | None = None) -> RecordingInfo:
@@ -325,7 +339,7 @@ def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
     return f'{shown(topic)}: {n_read} of the {n_promised} messages promised are there'
 
 
-class ForeignFile(columns.BagFile):
+class ForeignFile(BagFile):
     """
     A file that is not plain MCAP (sqlite3, ROS 1), read by `rosbags`, and decoded many messages
     at a time; `is_packed` where each message is compressed by itself.

@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple, cast
 from ..errors import RecordingError, ThermoCompError
 from ..plain_yaml import read_plain_yaml
 from ..text import one_line
-from .columns import Input, Role
+from .blocks import Input, Role
 
 VECTOR3_STAMPED = 'geometry_msgs/msg/Vector3Stamped'
 IMU = 'sensor_msgs/msg/Imu'

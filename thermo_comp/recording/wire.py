@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..errors import RecordingError
 from ..typing import Bytes, Floats, Ints
-from .columns import ROLES, Block, ImuColumns, Messages, Readings, Role, Topic, gather, number_at
+from .blocks import ROLES, Block, ImuColumns, Messages, Readings, Role, Topic, gather, number_at
 from .fields import Field, typestore
 from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, shown
 

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import OutputError, RecordingError
 from ..files import CSV, PARQUET, Draft, Kind, bag_kind, drafted
 from ..typing import Ints
-from .columns import ImuColumns, Messages
+from .blocks import ImuColumns, Messages
 from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
 from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
 from .wire import N_NUMBERS, encode_stamped

@@ -13,9 +13,9 @@ import numpy as np
 
 from ..fitting import FitResult, ResidualRow
 from ..fitting.coverage import LeastKnown, least_known
+from ..fitting.data_checks import Finding
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector
-from ..fitting.verdict import Finding
 from ..judging.evaluation import Epoch, history_of, judge_bags
 from ..judging.judgement import Judgement
 from ..judging.verdicts import Verdict

@@ -17,8 +17,8 @@ from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
-from ..unit.gyroscope import MILLIDEGREE
 from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states, sd_of_states, step_states
+from ..unit.rate_bias import MILLIDEGREE
 from ..unit.rate_triad import rate_triad
 from . import style
 from .evidence import CHOSEN, Evidence, given

@@ -16,7 +16,7 @@ from typing import Any
 from ..errors import ThermoCompError
 from ..fitting import ReducedBag
 from ..judging.evaluation import open_bags
-from ..recording.columns import RecordingInfo
+from ..recording.blocks import RecordingInfo
 from ..recording.topics import Topics
 from ..unit.calibration_file import load_calibration
 from .evidence import Evidence, evidence_of_bags

@@ -18,7 +18,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Temperature
 
 from ..errors import ThermoCompError
-from ..recording.columns import NO_STAMP_NS
+from ..recording.blocks import NO_STAMP_NS
 from ..recording.topics import PLAIN, split_field
 
 _STEP = re.compile(r'([A-Za-z]\w*)|\[([0-9]{1,6})\]|\.')

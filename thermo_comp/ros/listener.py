@@ -27,7 +27,7 @@ from std_msgs.msg import Bool
 
 from ..errors import ThermoCompError
 from ..online.status import STAMPED_TOPIC
-from ..recording.columns import NO_STAMP_NS, Messages, Role, Topic, with_stamps
+from ..recording.blocks import NO_STAMP_NS, Messages, Role, Topic, with_stamps
 from ..recording.growing import News
 from ..recording.topics import (
     IMU,

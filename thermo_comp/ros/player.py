@@ -30,7 +30,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
 from ..errors import ThermoCompError
-from ..recording.columns import Block, RecordingInfo, Role
+from ..recording.blocks import Block, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics
 from .relay import INPUTS

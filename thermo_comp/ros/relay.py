@@ -35,7 +35,7 @@ from ..errors import ThermoCompError
 from ..online.compensator import Compensator
 from ..online.segments import Model
 from ..online.status import STAMPED_TOPIC, stamped_flag
-from ..recording.columns import NO_STAMP_NS
+from ..recording.blocks import NO_STAMP_NS
 from ..recording.topics import TWINS, split_field
 from .fields import LiveField, live_field
 from .parameters import NodeConfig, named_topics

@@ -24,7 +24,7 @@ from rclpy.node import Node
 
 from ..errors import ThermoCompError
 from ..online.status import STAMPED_TOPIC
-from ..recording.columns import ROLES
+from ..recording.blocks import ROLES
 from ..unit.calibration_file import load_calibration
 from .listener import OUTPUTS, Recorder
 from .node import NODE_NAME

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..typing import Bools, Floats, Ints
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
-from ..unit.gyroscope import MILLIDEGREE
+from ..unit.rate_bias import MILLIDEGREE
 from .campaign import Cyclogram, Position
 from .drift import PartHistory, drift_of
 from .network import ThermalResponse

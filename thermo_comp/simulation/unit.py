@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..typing import Floats, Ints
 from ..unit.gravity import EARTH_RATE, MICRO_G
-from ..unit.gyroscope import MILLIDEGREE
+from ..unit.rate_bias import MILLIDEGREE
 from .drift import ZERO, Effect, PartHistory, Triple, drift_of, triple
 from .network import ThermalNetwork, ThermalResponse
 

@@ -31,8 +31,8 @@ from ..text import LONGEST_SERIAL, valid_serial
 from ..thermal.settings import DetectorSettings, ThermometerSettings
 from .columns import Column
 from .functions import TemperatureFunction, check_reference
-from .gyroscope import LARGEST_RATE, Gyroscope
 from .posterior import ParameterLayout, Posterior, lay_out
+from .rate_bias import LARGEST_RATE, Gyroscope
 from .reach import FULL_SCALES, LARGEST_RELATIVE_SCALE, Reach, Term, check_posterior
 from .schema import Vector, check_ranges
 

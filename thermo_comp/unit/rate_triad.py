@@ -11,8 +11,8 @@ import numpy as np
 from . import calibration as unit
 from .calibration import Calibration, RegimeSet, parameter_layout
 from .functions import Polynomial
-from .gyroscope import LARGEST_RATE, NIL, Gyroscope, RateCurve, RateSet, RateTerm
 from .posterior import Posterior
+from .rate_bias import LARGEST_RATE, NIL, Gyroscope, RateCurve, RateSet, RateTerm
 
 
 def rate_triad(calibration: Calibration) -> Calibration:

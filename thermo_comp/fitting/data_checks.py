@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the verdict: whether the bags can carry a calibration, with numbers and advice.
+Owns the checks of the data: whether the bags can carry a calibration, with numbers and advice.
 
 Only contradictions are refused: of what is missing the posterior says what it costs. A refusal
 stops the fit unless the user allows it by name; advice goes into the result.

@@ -23,7 +23,7 @@ from .files import shown_name
 from .online.batch import process_block
 from .online.compensator import Compensator
 from .online.status import CompensatorConfig, Counters
-from .recording.columns import Block, Readings
+from .recording.blocks import Block, Readings
 from .recording.topics import Topics
 from .typing import Bools, Floats, Ints
 from .unit.calibration import Calibration

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..recording.columns import Block, Readings
+from ..fitting import coverage
+from ..recording.blocks import Block, Readings
 from ..recording.overview import ThermometerSurvey, survey_thermometer, thermal_findings
 from ..recording.stillness import CellAccumulator, Cells, still_intervals
 from ..typing import Floats, Ints
-from . import coverage
 
 # What is still for so long, or for a soak that is shorter, is a rest [s].
 _REST_S = 10.0

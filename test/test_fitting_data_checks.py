@@ -13,7 +13,7 @@ from fitting_truth import Truth, table_of
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, ResidualRow
-from thermo_comp.fitting.verdict import (
+from thermo_comp.fitting.data_checks import (
     Finding,
     can_tell_misalignment,
     distinct_directions,

@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..plain_yaml import read_plain_yaml
 from ..quantities import Bounds
-from ..recording.columns import Readings
+from ..recording.blocks import Readings
 from ..recording.topics import is_thermometer
 from ..typing import Floats
 from ..unit.schema import Positive, SchemaError, build
