@@ -39,8 +39,7 @@ CALIBRATION_HEAD = """\
 
 One file = one unit = one object, in YAML, written by `thermo_comp fit`. An annotated example is
 `config/calibration.example.yaml`, the JSON Schema
-`config/calibration.schema.json`; this page is made from it. Files of version 1 are read as well: the
-terms of their sets become columns of the response, `during` one regime; what is written is version 2.
+`config/calibration.schema.json`; this page is made from it.
 
 The reader refuses, with the file, the key, the value and what was expected: unknown or missing
 keys, texts where numbers belong, NaN and infinity, ranges that do not rise, functions that are not

@@ -117,6 +117,7 @@ TEXT = dump_calibration(RICH)
     [
         ('format_version: 2', 'format_version: 3', 'format_version', 'newer'),
         ('format_version: 2', 'format_version: 0', 'format_version', 'must be 2, got 0'),
+        ('format_version: 2', 'format_version: 1\nmemory: 3', 'format_version', 'again'),
         ('format_version: 2', 'format_version: true', 'format_version', 'integer, got True'),
         ('format_version: 2', 'format_version: 2.0', 'format_version', 'integer, got 2.0'),
         ('format_version: 2', '', 'format_version', 'missing'),

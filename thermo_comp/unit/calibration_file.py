@@ -19,7 +19,6 @@ from ..files import CALIBRATION, read_bounded, write_atomically
 from ..plain_yaml import PlainYamlError, is_plain_text, load_plain_yaml
 from .calibration import FORMAT_VERSION, Calibration
 from .schema import SchemaError, build, fields_of, plain
-from .version_1 import read_version_1
 
 #: With the whole bank of columns and one thermometer beside the board a calibration takes some
 #: 900 kB, nearly all of it the posterior; this is enough for two of them.
@@ -54,17 +53,14 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
     missing = [key for key in fields_of(Calibration)[1] if key not in data]
     rule = f'not a calibration: the key `{missing[0]}` is missing' if missing else None
     version = data.get('format_version')
-    if type(version) is int and version > FORMAT_VERSION:
-        raise CalibrationError(
-            f'this file is of version {version}, newer than the {FORMAT_VERSION} that this '
-            'release reads; update thermo_comp',
-            path,
-            'format_version',
-            rule,
-        )
+    # Before the keys are looked at: those of another version would be called unknown.
+    if type(version) is int and version != FORMAT_VERSION:
+        advice = 'a newer release wrote it; update thermo_comp'
+        if version < FORMAT_VERSION:
+            advice = 'fit the bags again'
+        message = f'`format_version` must be {FORMAT_VERSION}, got {version}: {advice}'
+        raise CalibrationError(message, path, 'format_version', rule)
     try:
-        if type(version) is int and version == 1:
-            return read_version_1(data)
         return build(Calibration, data)
     except SchemaError as error:
         raise CalibrationError(error.message, path, error.key or None, rule) from error
