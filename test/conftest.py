@@ -71,7 +71,7 @@ _LONG = (
     *('test_report_figures', 'test_stillness', 'test_cli_errors', 'test_recording_walk'),
     *('test_fault_files', 'test_allow', 'test_faults', 'test_cli', 'test_degenerate'),
     *('test_layers', 'test_rests', 'test_compensator', 'test_sample_checks', 'test_report'),
-    *('test_judging', 'test_report_live', 'test_one_position', 'test_recording_promises'),
+    *('test_judging', 'test_report_browser', 'test_one_position', 'test_recording_promises'),
     *('test_fitting_regression', 'test_recording_read', 'test_fault_process'),
     *('test_node_reload', 'test_ins', 'test_middleware', 'test_regime', 'test_least_known'),
     *('test_one_judge', 'test_fleet_run', 'test_plausibility', 'test_fleet_summary'),

@@ -193,11 +193,11 @@ class Desk:
             pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
             # Nobody listens here, whom it would wait for.
             arguments[1:1] = ['--wait', '0.5']
-        if arguments[0] == 'view' or arguments[:2] == ['record', '--positions']:
-            return self._view(arguments, here)
+        if arguments[:2] == ['record', '--positions']:
+            return self._interrupted(arguments, here)
         return (cli or self._cli)(*arguments, cwd=here)
 
-    def _view(self, arguments: list[str], here: Path) -> subprocess.CompletedProcess[str]:
+    def _interrupted(self, arguments: list[str], here: Path) -> subprocess.CompletedProcess[str]:
         """Start a command that serves until Ctrl-C, and press Ctrl-C once it says where."""
         process = subprocess.Popen(
             [sys.executable, '-m', 'thermo_comp', *arguments],

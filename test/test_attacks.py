@@ -11,8 +11,6 @@ import signal
 import subprocess
 import sys
 import threading
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,15 +18,14 @@ from typing import Any
 import numpy as np
 import pytest
 from builders import calibration
-from conftest import ROOT, Cli
+from conftest import Cli
+from fleet_helpers import write_unit
 
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
 START_NS = 1_767_225_600_000_000_000
-FIT = sorted((ROOT / 'bags' / 'fit').glob('*.mcap'))
-HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
 
 ros = pytest.mark.skipif(
     not __import__('importlib.util').util.find_spec('rclpy'), reason='rclpy is not installed'
@@ -227,11 +224,9 @@ def test_a_full_disk_under_convert_and_fleet(small_disk: Path, tmp_path: Path, c
     finished = cli('convert', table, '--columns', columns, '-o', small_disk / 'log', code=None)
     assert finished.returncode == 1, finished.stderr
     assert 'No space left on device' in finished.stderr
-    fleet = tmp_path / 'fleet' / 'unit1'
-    fleet.mkdir(parents=True)
-    for bag in FIT[:3]:
-        (fleet / bag.name).symlink_to(bag)
-    options = ('--gravity', '9.80665', '--workers', '1', '-o', small_disk / 'out')
+    write_unit(tmp_path / 'fleet' / 'unit1', 1, 2)
+    options = ('--gravity', '9.80665', '--model', 'golovach', '--workers', '1')
+    options = (*options, '-o', small_disk / 'out')
     (small_disk / 'filler').write_bytes(bytes(60_000))
     finished = cli('fleet', 'fit', tmp_path / 'fleet', *options, code=None)
     assert finished.returncode == 1, finished.stderr
@@ -324,28 +319,3 @@ def test_crafted_logs_are_refused_in_a_line_or_read(kind: str, tmp_path: Path) -
             said.append(str(error))
     assert n_read < 150
     assert not any('\n' in text for text in said)
-
-
-def test_paths_that_climb_are_no_door(tmp_path: Path, cli: Cli) -> None:
-    from thermo_comp.report.live import LiveReport, LiveServer
-
-    fleet = tmp_path / 'fleet'
-    for unit in ('one', '..two', 'three..'):
-        (fleet / unit).mkdir(parents=True)
-        for bag in FIT[:2]:
-            (fleet / unit / bag.name).symlink_to(bag)
-    (tmp_path / 'secret.txt').write_text('secret')
-    options = ('--gravity', '9.80665', '--workers', '1', '-o', tmp_path / 'out')
-    cli('fleet', 'fit', fleet / '..' / 'fleet', *options, code=None)
-    made = {one.relative_to(tmp_path).parts[0] for one in tmp_path.rglob('*.yaml')}
-    assert made == {'out'}
-    unit = tmp_path / 'unit.yaml'
-    save_calibration(calibration(), unit)
-    with LiveServer(LiveReport(unit, [HELD_OUT])) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        for path in ('../secret.txt', '%2e%2e/secret.txt', '/etc/passwd', '..\\x', 'a/../../etc'):
-            with pytest.raises(urllib.error.HTTPError, match='404'):
-                urllib.request.urlopen(f'{server.url}{path}', timeout=30)  # noqa: S310
-        server.shutdown()
-        thread.join()

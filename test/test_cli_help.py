@@ -41,13 +41,13 @@ OF_ITS_OWN = {
     for name in COMMANDS
     if name != 'demo'
 }
-# Of each command that prints figures and ends by itself: what serves a page or listens does not;
+# Of each command that prints figures and ends by itself: what listens does not;
 # play, report and fit have theirs in test_cli, test_cli_errors and test_docs.
 WITH_JSON = list(
     {
         one.split()[1]: one
         for one in EXAMPLES
-        if one.split()[1] not in ('view', 'play', 'report')
+        if one.split()[1] not in ('play', 'report')
         and 'record --positions' not in one
         and 'bags/unit42/*' not in one
     }.values()
@@ -98,7 +98,7 @@ def test_commands_that_print_figures_have_json() -> None:
     lacking = {
         name for name, one in COMMANDS.items() if not any('--json' in p.opts for p in one.params)
     }
-    assert lacking <= {'view', 'play'}
+    assert lacking <= {'play'}
 
 
 def test_every_option_says_what_it_is_for() -> None:

@@ -115,6 +115,17 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(
     assert {name for name, known in found.items() if known} == {'A/good'}
 
 
+def test_paths_that_climb_are_no_door(client: Any, tmp_path: Path) -> None:
+    fleet = tmp_path / 'fleet'
+    for seed, name in enumerate(('one', '..two', 'three..')):
+        write_unit(fleet / name, seed, 2)
+    result = fit_fleet(str(fleet / '..' / 'fleet'), tmp_path / 'out', OPTIONS, client=client)
+    # A folder whose name begins with a dot is hidden.
+    assert [row['name'] for row in result.rows] == ['one', 'three..']
+    made = {one.relative_to(tmp_path).parts[:2] for one in tmp_path.rglob('*.yaml')}
+    assert made == {('out', 'units')}
+
+
 def test_bags_that_cannot_be_read_any_more_take_no_result_away(
     client: Any, tmp_path: Path
 ) -> None:

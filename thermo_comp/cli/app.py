@@ -56,7 +56,7 @@ def _top(
 
 for _command in (
     *(record.record, fit.fit, fit.prior, judge.evaluate, bags.replay, bags.play, bags.info),
-    *(judge.report, judge.view, convert.convert, convert.export, convert.import_),
+    *(judge.report, convert.convert, convert.export, convert.import_),
     *(simulate.simulate, simulate.demo),
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))

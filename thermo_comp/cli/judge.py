@@ -1,15 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``evaluate``, ``report``, ``view``: what a calibration leaves of |f|, as table and page."""
+"""Owns ``evaluate`` and ``report``: what a calibration leaves of |f|, as table and page."""
 
-import sys
-import webbrowser
 from collections.abc import Callable, Mapping
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from ..errors import ThermoCompError
 from ..files import CSV, PAGE, check_output, shown_name
 from . import shared_options as options
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
@@ -187,54 +184,3 @@ def report(
         history=drifts_of(evidence.history),
         **(judgement.facts() if judgement else {}),
     )
-
-
-def view(
-    calibration: Path = argument('Calibration of the unit (YAML).', metavar='YAML'),
-    bags: list[Path] | None = options.JUDGED_BAGS,
-    port: int = option('Port on this machine; 0 takes any free one.', 8042, min=0, max=65535),
-    browser: bool = option('Open it in the default browser, too.', False, '--browser'),
-    gravity: float | None = options.place,
-    serial: str | None = options.SERIAL,
-    topics: Any = options.reading,
-    quiet: bool = options.QUIET,
-) -> None:
-    """
-    Look at a calibration in the browser while you work on it.
-
-    Serves the certificate on this machine only, until Ctrl-C. The page
-    reloads itself whenever the calibration or a bag changes, as when fit
-    runs again.
-
-    Example:
-      thermo_comp view unit42.yaml held_out.mcap
-    """
-    from ..report.live import LiveReport, LiveServer
-
-    for path in (calibration, *(bags or [])):
-        if not path.exists():
-            raise ThermoCompError(f'{path}: no such file or directory')
-    out = Output(quiet=quiet)
-    live = LiveReport(
-        calibration,
-        bags or [],
-        topics=topics,
-        read=lambda info: out.told([(info.path, info.chosen, info.truncated)]),
-        gravity=gravity,
-        serial=serial,
-    )
-    try:
-        server = LiveServer(live, port)
-    except OSError as failure:
-        raise ThermoCompError(
-            f'port {port}: {failure.strerror}; give another one with --port'
-        ) from failure
-    with server:
-        try:
-            out.line(f'{server.url}  (Ctrl-C ends it)')
-            sys.stdout.flush()  # whoever reads this through a pipe waits for the address
-            if browser:
-                webbrowser.open(server.url)
-            server.serve_forever()
-        except KeyboardInterrupt:
-            out.note('ended')

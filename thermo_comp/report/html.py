@@ -7,7 +7,6 @@ from __future__ import annotations
 import datetime as dt
 import math
 import re
-import secrets
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,15 +23,11 @@ _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-
 _LONGEST_MARGIN = 90
 
 
-def render(template: str, *, script: str = '', **context: Any) -> str:
-    """Fill a template that extends ``page.html``; a viewer's script runs by a nonce of its own."""
-    nonce, policy = secrets.token_urlsafe(16), _POLICY
-    if script:
-        policy += f"; script-src 'nonce-{nonce}'; connect-src 'self'"
+def render(template: str, **context: Any) -> str:
+    """Fill a template that extends ``page.html``."""
     now = f'{dt.datetime.now(dt.timezone.utc):%Y-%m-%d %H:%M}'
     known = {'margin': '', 'is_simulated': False, 'now': now, 'version': __version__, **context}
-    found = _templates().get_template(template)
-    return found.render(known, policy=policy, script=script, nonce=nonce)
+    return _templates().get_template(template).render(known, policy=_POLICY)
 
 
 @cache

@@ -67,10 +67,8 @@ def render_report(
     info: CertificateInfo | None = None,
     *,
     figures: Sequence[tuple[ReportFigure, str]] | None = None,
-    script: str = '',
-    notice: str = '',
 ) -> str:
-    """Make the page; of a viewer come figures that are drawn already, script and notice."""
+    """Make the page, with these figures instead of all that the evidence allows."""
     if figures is None:
         figures = drawn_figures(figures_of(evidence))
     info = info or CertificateInfo()
@@ -80,11 +78,9 @@ def render_report(
     rungs = [*evidence.residuals, *([LEFT_OUT] if evidence.left_out else [])]
     return render(
         'certificate.html',
-        script=script,
         title=f'{evidence.serial}: {title}',
         heading=title,
         margin=f'{title} {info.number}, unit {evidence.serial}'.replace(' ,', ','),
-        notice=notice,
         is_simulated=evidence.is_simulated,
         info=info,
         evidence=evidence,
