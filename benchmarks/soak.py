@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
 CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
 COUNTS = struct.Struct('<4siII7s5x3d')
@@ -304,9 +304,10 @@ def main() -> int:
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
     import rclpy
+    from node_process import NodeProcess
     from rclpy.context import Context
 
-    from thermo_comp.ros.round_trip import NodeProcess, lossless
+    from thermo_comp.ros.player import lossless
 
     context = Context()
     rclpy.init(args=[], context=context)

@@ -23,6 +23,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from fault_rig import CONFIG, STANDS_S, START_NS, Event, counts_of, force_at, seconds_of
 from geometry_msgs.msg import Vector3Stamped
+from node_process import NodeProcess
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
@@ -33,7 +34,7 @@ from rclpy.serialization import deserialize_message
 from ros_helpers import Peer
 from sensor_msgs.msg import Imu, Temperature
 
-from thermo_comp.ros.round_trip import NodeProcess, lossless
+from thermo_comp.ros.player import lossless
 from thermo_comp.ros.waitloop import WaitLoop
 
 #: Longest wait for anything [s]; only a broken bench ever waits as long.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import rclpy
@@ -22,7 +22,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
 
-from thermo_comp.ros.node import CompensationNode
+from thermo_comp.ros.node import CompensationNode, node_in_thread  # noqa: F401 - for the tests
 
 SECOND_NS = 1_000_000_000
 #: Longest wait for anything on DDS [s]; only a broken test ever waits as long.
@@ -189,23 +189,3 @@ def drive(
     driver = Driver(peer, kind, topic, qos)
     peer.join(node)
     return driver
-
-
-@contextlib.contextmanager
-def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
-    """Run the real node in a thread of this process, in a context of its own."""
-    context = Context()
-    rclpy.init(args=['--ros-args', *ros_args], context=context)
-    try:
-        node = CompensationNode(context)
-        thread = threading.Thread(target=node.run, daemon=True)
-        thread.start()
-        try:
-            yield node
-        finally:
-            node.stop()
-            thread.join(TIMEOUT)
-            assert not thread.is_alive()
-            node.close()
-    finally:
-        context.try_shutdown()

@@ -425,7 +425,7 @@ class TestFreezer:
 
     def test_it_plays_into_the_node(self, path: Path, tmp_path: Path) -> None:
         pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-        from thermo_comp.ros.round_trip import round_trip
+        from thermo_comp.cli.demo import through_the_node
 
         columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
         # The last three minutes: at rest in the cold, then handled.
@@ -439,11 +439,8 @@ class TestFreezer:
             axes=Axes(reference, reference, reference),
         )
         save_calibration(unit, tmp_path / 'unit.yaml')
-        played, recorded = round_trip(
-            tmp_path / 'bag',
-            tmp_path / 'unit.yaml',
-            tmp_path / 'live.mcap',
-            node_args=['-p', 'input:=imu'],
+        played, recorded = through_the_node(
+            tmp_path / 'bag', tmp_path / 'unit.yaml', tmp_path / 'live.mcap', '-p', 'input:=imu'
         )
         offline = replay(tmp_path / 'bag', unit, tmp_path / 'offline.mcap')
         # Every row is a message, and every message goes out or is counted with its reason.

@@ -20,11 +20,12 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import calibration
+from node_process import NodeProcess
 from ros_helpers import Driver, Peer, stamp_of, standing
 from sensor_msgs.msg import Imu
 
+from thermo_comp.ros.player import lossless
 from thermo_comp.ros.process import LOCAL_PROFILE, PROFILE, VARIABLE, use_profile
-from thermo_comp.ros.round_trip import NodeProcess, lossless
 from thermo_comp.unit.calibration_file import save_calibration
 
 CYCLE_NS = 10_000_000

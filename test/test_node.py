@@ -25,7 +25,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.ros.round_trip import lossless
+from thermo_comp.ros.player import lossless
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.unit.calibration import Calibration, Unit
 from thermo_comp.unit.calibration_file import save_calibration

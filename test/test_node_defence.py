@@ -23,6 +23,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from node_process import NodeProcess
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import (
@@ -41,7 +42,6 @@ from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
 from thermo_comp.ros.parameters import PARAMETERS_LIMIT, NodeConfig
 from thermo_comp.ros.reader import Reader, read_within
-from thermo_comp.ros.round_trip import NodeProcess
 from thermo_comp.text import one_line
 from thermo_comp.unit.calibration_file import save_calibration
 

@@ -17,14 +17,13 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 from builders import rich_calibration
 from rosbags.highlevel import AnyReader
 
-from thermo_comp.errors import ThermoCompError
+from thermo_comp.cli.demo import through_the_node
 from thermo_comp.online.status import STAMPED_TOPIC
 from thermo_comp.recording.blocks import Block, ImuColumns
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, replay
-from thermo_comp.ros.round_trip import round_trip
 from thermo_comp.unit.calibration import Calibration, Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
@@ -117,7 +116,7 @@ def assert_same(live: Path, offline: Path) -> None:
 def run(calibration: Calibration, bag: Path, folder: Path, *node_args: str, **keys: str) -> int:
     save_calibration(calibration, folder / 'unit.yaml')
     live, offline = folder / 'live.mcap', folder / 'offline.mcap'
-    played, recorded = round_trip(bag, folder / 'unit.yaml', live, node_args=node_args)
+    played, recorded = through_the_node(bag, folder / 'unit.yaml', live, *node_args)
     result = replay(bag, calibration, offline, **keys)
     assert not played.unheard
     assert not played.lossy
@@ -163,11 +162,3 @@ def test_imu_in_another_frame(tmp_path: Path) -> None:
     assert moved[is_rate].min() > 1e-3
     claimed = found.imu.angular_velocity_covariance[is_rate].reshape(-1, 3, 3)
     assert (np.linalg.eigvalsh(claimed) > 0.0).all()
-
-
-def test_a_node_that_does_not_start_is_reported_in_its_own_words(tmp_path: Path) -> None:
-    save_calibration(rich_calibration(), tmp_path / 'unit.yaml')
-    args = ['-p', 'serial:=T-2']
-    with pytest.raises(ThermoCompError, match=r"unit\.serial: must be 'T-2'"):
-        round_trip('bag', tmp_path / 'unit.yaml', tmp_path / 'out.mcap', node_args=args)
-    assert not (tmp_path / 'out.mcap').exists()

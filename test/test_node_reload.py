@@ -18,6 +18,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 import rclpy
 from builders import axis_set, calibration, regime_set
+from node_process import NodeProcess
 from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
 from rclpy.parameter import Parameter
@@ -26,7 +27,7 @@ from sensor_msgs.msg import Imu
 
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.ros.node import CompensationNode
-from thermo_comp.ros.round_trip import NodeProcess, lossless
+from thermo_comp.ros.player import lossless
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import dump_calibration, save_calibration

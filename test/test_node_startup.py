@@ -15,11 +15,11 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import calibration
+from node_process import NodeProcess
 from ros_helpers import TIMEOUT, Driver, Peer, node_in_thread, standing
 from sensor_msgs.msg import Imu
 
 from thermo_comp.ros.node import main
-from thermo_comp.ros.round_trip import NodeProcess
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 

@@ -20,7 +20,7 @@ import typer
 from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
-from . import bags, convert, fit, judge, output, record, simulate
+from . import bags, convert, demo, fit, judge, output, record, simulate
 from .shared_options import expanded, option
 
 # The base of every mistake in a command line; typer gives its children names, but not itself.
@@ -57,7 +57,7 @@ def _top(
 for _command in (
     *(record.record, fit.fit, fit.prior, judge.evaluate, bags.replay, bags.play, bags.info),
     *(judge.report, convert.convert, convert.export, convert.import_),
-    *(simulate.simulate, simulate.demo),
+    *(simulate.simulate, demo.demo),
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))
 _fleet = typer.Typer(name='fleet', help='Fit many units, and see what they tell together.')

@@ -1,20 +1,16 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``simulate``, bags of a test with known truth; ``demo``, the main job on sample bags."""
+"""Owns ``simulate``: bags of a test with known truth."""
 
 import json
-import os
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from ..errors import ThermoCompError
 from ..files import bag_kind, check_output
 from ..unit.gravity import STANDARD_GRAVITY
 from . import shared_options as options
-from .judge import tell_sections
 from .output import Output, picked
 from .shared_options import option
 
@@ -22,12 +18,6 @@ if TYPE_CHECKING:
     from ..recording.writer import BagWriter
     from ..simulation.run import SimulatedRun
     from ..simulation.unit import UnitModel
-    from ..unit.calibration import Calibration
-
-_OUTPUT = 'imu/data_raw'
-# Groups of the fit by column headings: a curve for all regimes; that and its difference in the
-# dynamic regime; all that the evidence wants, which is what the node runs.
-_MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
 
 
 def simulate(
@@ -165,114 +155,3 @@ def _write(
             writer.write_counts(topics.counts, stamp_ns, counts, 'imu_link')
         writer.flush()
         yield {'counts': len(stamp_ns), 'board': len(run.board), 'case': len(run.case)}
-
-
-def demo(
-    bags: Path | None = option('Folder of the sample bags.', metavar='DIR'),
-    output: Path = option(
-        'Folder for what the demo makes.', Path('out'), '--out', '-o', metavar='DIR'
-    ),
-    out: Output = options.out,
-) -> None:
-    """
-    Run the main job on the sample bags, end to end.
-
-    The bag that the fit has not seen goes through the real path: player,
-    DDS, the node in a process of its own, DDS, recorder.
-
-    Example:
-      thermo_comp demo --out out
-    """
-    options.require_ros()
-    # Before the first import of ROS: on this machine only.
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    from ..api import fit
-    from ..judging.evaluation import evaluate
-    from ..recording.reader import inspect_recording
-    from ..report.evidence import evidence_of_bags
-    from ..report.page import write_report
-    from ..ros.round_trip import round_trip
-    from ..unit.calibration_file import save_calibration
-
-    # Where the user says, here, or in the source tree.
-    places = [bags] if bags else [Path('bags'), Path(__file__).parents[2] / 'bags']
-    folder = next((one for one in places if (one / 'held_out.mcap').is_file()), None)
-    if folder is None:
-        raise ThermoCompError(
-            f'no sample bags in {places[0]}: run it in a clone of the repository, or give --bags'
-        )
-    output.mkdir(parents=True, exist_ok=True)
-    held_out, recorded, unit = folder / 'held_out.mcap', output / 'out.mcap', output / 'unit.yaml'
-    fit_bags = sorted((folder / 'fit').glob('*.mcap'))
-
-    calibrations = {}
-    with out.progress('fitting', total=len(_MODELS)) as done:
-        for name, groups in _MODELS.items():
-            calibrations[name] = fit(fit_bags, gravity=STANDARD_GRAVITY, groups=groups)
-            done(len(calibrations))
-    save_calibration(calibrations['node'], unit)
-    out.line(f'fitted {unit} from {len(fit_bags)} bags of {folder / "fit"}')
-    info = inspect_recording(held_out)
-    bag_s = (info.end_ns - info.start_ns) * 1e-9
-    with out.progress('playing') as done:
-        # Two hours in eight seconds.
-        played, n_recorded = round_trip(
-            held_out, unit, recorded, rate=1e3, overwrite=recorded.exists(), progress=done
-        )
-    (n_in,) = (n for name, n in played.n_messages.items() if name.endswith('accel/counts'))
-    n_out, wall_s = n_recorded[_OUTPUT], played.duration_s
-    out.line(
-        f'played {held_out} through the node: {bag_s / 60.0:.0f} min in {wall_s:.1f} s, '
-        f'{bag_s / wall_s:.0f} times real time'
-    )
-    out.line(
-        f'messages in {n_in}, messages out {n_out}; '
-        f'regime flags {n_recorded["regime/dynamic"]}; recorded {recorded}'
-    )
-    is_same = _equals_offline(recorded, held_out, calibrations['node'])
-    out.line(f'node = offline replay, bit for bit: {"yes" if is_same else "NO"}')
-    models = [(name, calibrations[name]) for name in reversed(_MODELS)]
-    result = evaluate([held_out], models, gravity=STANDARD_GRAVITY)
-    out.line()
-    judged = result.judgements
-    tell_sections(out, judged)
-    out.line('one set: one cubic for all; two sets: another one in the dynamic regime, as in the')
-    out.line('paper; node: two sets and the thermal response that the evidence wants')
-    page, figures = output / 'report.html', output / 'figures'
-    with out.progress('drawing', total=None):
-        node = calibrations['node']
-        evidence = evidence_of_bags(result.bags, node, gravity=STANDARD_GRAVITY)
-        write_report(evidence, page, figures=figures)
-    figure = next(figures.glob('*gravity.png'))
-    out.line()
-    out.line(f'figure {figure}, certificate {page}')
-    out.end(
-        messages_in=n_in,
-        messages_out=n_out,
-        is_equal_to_offline=is_same,
-        bag_s=bag_s,
-        wall_s=wall_s,
-        judgements={name: one.facts() for name, one in judged.items()},
-        recorded=recorded,
-        figure=figure,
-    )
-    if not is_same or n_out != n_in:
-        raise ThermoCompError('the node lost messages or differs from the offline replay')
-
-
-def _equals_offline(recorded: Path, bag: Path, calibration: 'Calibration') -> bool:
-    """Compare the node's recorded output with the offline run, bit for bit."""
-    import numpy as np
-
-    from ..recording.reader import read_recording
-    from ..recording.topics import Topics
-    from ..replay import replay
-
-    def columns(path: Path) -> tuple[Any, ...]:
-        found = read_recording(path, Topics(imu=_OUTPUT, input='imu'), require=['accel']).columns
-        beside = found.imu and found.imu.linear_acceleration_covariance
-        return found.accel_stamp_ns, found.accel, beside
-
-    with TemporaryDirectory(prefix='thermo_comp-') as folder:
-        offline = columns(replay(bag, calibration, Path(folder) / 'offline.mcap').output)
-    return all(map(np.array_equal, columns(recorded), offline))

@@ -21,7 +21,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
 
@@ -146,12 +145,6 @@ class Recorder(_Listener):
     def has_publishers(self) -> bool:
         """Whether every topic has a publisher."""
         return all(one.count_publishers() for one in self._heard.values())
-
-    def newest(self, name: str) -> Any:
-        """Return the newest message of a topic; None before any."""
-        came = (messages[-1] for own, messages, _ in reversed(self._came) if own == name)
-        data = next(came, None)
-        return None if data is None else deserialize_message(data, self._topics[name])
 
 
 def _stamps(messages: list[bytes]) -> Ints:

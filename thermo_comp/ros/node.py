@@ -12,7 +12,9 @@ from __future__ import annotations
 import gc
 import os
 import sys
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 
 import rclpy
@@ -92,6 +94,11 @@ class CompensationNode:
     def run(self) -> None:
         """Serve until shutdown or a signal."""
         self._loop.run(self._relay.on_data)
+
+    def counts(self) -> tuple[int, int, int]:
+        """Give how many samples came in and went out, and how many flags went out."""
+        counters, traffic = self._compensator.counters, self._relay.traffic
+        return counters.n_in, counters.n_out - traffic.n_unpublished, traffic.n_flags
 
     def stop(self) -> None:
         """Make `run` return; callable from any thread."""
@@ -189,6 +196,25 @@ class CompensationNode:
         loaded = self._relay.running.loaded
         serial = loaded.calibration.unit.serial
         self._log.info(f'unit {serial}: {loaded.path} ({loaded.sha256[:12]})')
+
+
+@contextmanager
+def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
+    """Run the node in a thread of this process, in a context of its own."""
+    context = rclpy.context.Context()
+    rclpy.init(args=['--ros-args', *ros_args], context=context)
+    try:
+        node = CompensationNode(context)
+        thread = threading.Thread(target=node.run, daemon=True)
+        thread.start()
+        try:
+            yield node
+        finally:
+            node.stop()
+            thread.join()
+            node.close()
+    finally:
+        context.try_shutdown()
 
 
 def main(args: list[str] | None = None) -> int:

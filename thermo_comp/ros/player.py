@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -30,7 +30,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
 from ..errors import ThermoCompError
-from ..recording.blocks import Block, RecordingInfo, Role
+from ..online.status import STAMPED_TOPIC
+from ..recording.blocks import ROLES, Block, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics
 from .relay import INPUTS
@@ -109,16 +110,14 @@ class Player:
         self._clock = node.create_publisher(Clock, '/clock', 1)
         self._next_clock = 0.0
 
-    def unheard(self, awaited: Collection[Role] | None = None) -> list[str]:
-        """Name the topics, of all or of some roles, that have no subscriber."""
+    def unheard(self) -> list[str]:
+        """Name the topics that have no subscriber."""
         return [
-            one.topic_name
-            for role, one in self._publishers.items()
-            if not one.get_subscription_count() and (awaited is None or role in awaited)
+            one.topic_name for one in self._publishers.values() if not one.get_subscription_count()
         ]
 
     def run(
-        self, progress: Callable[[float], None], throttle: Callable[[int], None] = lambda _: None
+        self, progress: Callable[[float], None], throttle: Callable[[int], object] = lambda _: None
     ) -> PlayReport:
         """Send the bag; `throttle` is told the samples sent after each window, and may block."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
@@ -176,6 +175,19 @@ class Player:
         if not wait_until(is_done, PATIENCE, ACKNOWLEDGEMENT_NAP):
             name = publisher.topic_name
             raise ThermoCompError(f'{name}: a subscriber took nothing for {PATIENCE:g} s')
+
+
+def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> list[str]:
+    """Give the ROS arguments under which a node loses nothing, at the price of latency."""
+    inputs = ['accel/counts', 'imu/uncompensated', *(f'temperature/{n}' for n in thermometers)]
+    overrides = [
+        *(f'{topic}.subscription.reliability:=reliable' for topic in inputs),
+        *(f'{topic}.subscription.history:=keep_all' for topic in inputs),
+        'imu/data_raw.publisher.history:=keep_all',
+        'regime/dynamic.publisher.depth:=1000',
+        f'{STAMPED_TOPIC}.publisher.depth:=1000',
+    ]
+    return [word for one in overrides for word in ('-p', f'qos_overrides.{namespace}/{one}')]
 
 
 def _in_order(block: Block) -> list[tuple[float, int, Role, bytes]]:

@@ -1,0 +1,58 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns the node as a process of its own, for tests and benchmarks."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+_STOPPING_S = 10.0  # how long the node may take to end [s]
+
+
+class NodeProcess:
+    """The node as a process of its own, for as long as the context lasts."""
+
+    def __init__(self, *ros_args: str) -> None:
+        self._ros_args = ros_args
+
+    def __enter__(self) -> NodeProcess:
+        self._log = tempfile.TemporaryFile()
+        command = [sys.executable, '-m', 'thermo_comp.ros.node', '--ros-args', *self._ros_args]
+        # The very package that runs here, wherever it lies.
+        paths = [str(Path(__file__).resolve().parents[1]), os.environ.get('PYTHONPATH', '')]
+        environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, paths))}
+        self.process = subprocess.Popen(
+            command, stdout=self._log, stderr=self._log, env=environment
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the process as a launch system does."""
+        self.stop()
+        self._log.close()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the process still runs."""
+        return self.process.poll() is None
+
+    @property
+    def said(self) -> str:
+        """What it has written to its standard output and error."""
+        # Without moving the place where it writes.
+        return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors='replace').strip()
+
+    def stop(self, number: int = signal.SIGTERM) -> int:
+        """Send a signal, wait for the end, return the exit code."""
+        # Popen sends nothing to a process that has ended.
+        self.process.send_signal(number)
+        try:
+            return self.process.wait(timeout=_STOPPING_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            return self.process.wait()
