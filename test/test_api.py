@@ -15,6 +15,7 @@ from readme_helpers import FENCES
 from test_layers import loaded_after
 
 import thermo_comp as tc
+from thermo_comp.convert.readers import read_log
 from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics
@@ -231,6 +232,21 @@ def test_the_lines_of_the_readme_run(
     names: dict[str, tc.Corrected] = {}
     exec(snippet, names)  # noqa: S102 - our own page
     assert names['out'].specific_force.shape == (15407, 3)
+
+
+def test_a_table_is_read_as_the_command_reads_it(tmp_path: Path) -> None:
+    table = tmp_path / 'log.csv'
+    rows = [
+        f'{k / 50},{0.01 * (k % 3)},0.02,{9.8 + 0.01 * (k % 2)},{20 + k // 100}'
+        for k in range(300)
+    ]
+    table.write_text('\n'.join(['time_s,ax,ay,az,temperature_c', *rows]))
+    found = tc.read(table)
+    np.testing.assert_allclose(np.diff(found.time_s), 0.02, atol=1e-9)
+    np.testing.assert_allclose(found.counts[1], [0.01, 0.02, 9.81], rtol=1e-12)
+    assert found.temperatures['board'][1].tolist() == [20.0, 21.0, 22.0]
+    with pytest.raises(ValueError, match='a table needs no `imu`; it has `columns`, `rate_hz`'):
+        read_log(table, imu=1)
 
 
 def test_a_further_thermometer_goes_in_by_its_name(arrays: dict[str, np.ndarray]) -> None:

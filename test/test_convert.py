@@ -14,7 +14,7 @@ from builders import calibration
 from conftest import Cli
 
 from thermo_comp.convert.column_map import ColumnMap, load_column_map, table_log
-from thermo_comp.convert.log import Readings, thin, write_log
+from thermo_comp.convert.log import Readings, write_log
 from thermo_comp.errors import RecordingError, ThermoCompError
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.replay import replay
@@ -234,7 +234,7 @@ def test_a_table_of_words_is_refused(tmp_path: Path) -> None:
 class TestThinning:
     def kept(self, values: list[float], step_s: int = 1) -> list[int]:
         stamps = np.arange(len(values), dtype=np.int64) * step_s * 10**9
-        return (thin(Readings(stamps, np.array(values))).stamp_ns // 10**9).tolist()
+        return (Readings(stamps, np.array(values)).thinned().stamp_ns // 10**9).tolist()
 
     def test_a_change_or_ten_seconds_without_one(self) -> None:
         assert self.kept([1, 1, 2, 2, 2, 1]) == [0, 2, 5]
@@ -246,7 +246,7 @@ class TestThinning:
 
     def test_a_clock_that_starts_anew_is_worth_a_message(self) -> None:
         readings = Readings(np.array([5, 6, 1, 2]) * 10**9, np.full(4, 20.0))
-        assert (thin(readings).stamp_ns // 10**9).tolist() == [5, 1]
+        assert (readings.thinned().stamp_ns // 10**9).tolist() == [5, 1]
 
 
 class TestColumnMap:

@@ -9,7 +9,6 @@ will do: lists, columns of pandas, arrays of xarray.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -34,8 +33,6 @@ Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
 #: `Columns.start_ns` is a multiple of this, so that times count from a whole minute.
 _MINUTE_NS = 60_000_000_000
 _LONGEST_S = 4e9  # farther from their origin than this times are not in seconds [s]
-#: A thermometer that stands still is heard again after this, so that nobody takes it for lost.
-_REPEAT_NS = 10_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,12 +150,13 @@ def correct(
 
 def read(path: str | Path, topics: Topics | None = None) -> Columns:
     """
-    Read a bag into arrays.
+    Read a bag, a table or a PX4 or ArduPilot log into arrays.
 
     Parameters
     ----------
     path : str or Path
-        A rosbag2 folder, ``*.mcap``, ``*.db3`` or a ROS 1 ``*.bag``.
+        A rosbag2 folder, ``*.mcap``, ``*.db3`` or a ROS 1 ``*.bag``; a table of numbers whose
+        columns can be guessed; a PX4 ``*.ulg`` or ArduPilot ``*.bin``.
     topics : recording.topics.Topics or None, optional
         Names of the topics, where they are not the usual ones.
 
@@ -170,12 +168,14 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
     Raises
     ------
     RecordingError
-        If the bag cannot be read, or holds no samples.
+        If the file cannot be read, or holds no samples.
 
     """
+    from .convert.readers import as_bags
     from .recording.reader import read_recording
 
-    recording = read_recording(path, topics, require=['accel'])
+    with as_bags([Path(path)]) as (bag,):
+        recording = read_recording(bag, topics, require=['accel'])
     block = recording.columns
     readings = {name: one for name, one in block.temperatures.items() if len(one[0])}
     stamps = [block.accel_stamp_ns, *(one[0] for one in readings.values())]
@@ -210,7 +210,8 @@ def fit(
     Parameters
     ----------
     recordings : str, Path or Columns, or sequence of them
-        The bags, or arrays with the temperatures ``'board'``, ``'case'`` and any more.
+        The bags, tables or logs; or arrays with the temperatures ``'board'``, ``'case'`` and any
+        more.
     gravity : float
         Local gravity [m/s^2].
     **options
@@ -227,28 +228,29 @@ def fit(
     ValueError
         If an option is out of its range, or arrays do not fit together.
     RecordingError
-        If a bag cannot be read.
+        If a file cannot be read.
     FitError
         If the data cannot carry a fit, or gravity is none of the Earth's.
 
     """
+    from .convert.readers import as_bags
     from .fitting import FitOptions, FitSource
     from .fitting import fit as run
     from .fitting.sources import fit_sources
 
     items = [recordings] if isinstance(recordings, (str, Path, Columns)) else list(recordings)
-    paths = [item for item in items if not isinstance(item, Columns)]
-    sources, kind = fit_sources(paths)
-    if paths:
-        options.setdefault('input', 'counts' if kind == 'counts' else 'm/s^2')
-    for one in items:
-        if isinstance(one, Columns):
-            # What a fit reads of a thermometer that is not there.
-            nothing: Temperature = ([], [])
-            readings = {'board': nothing, 'case': nothing, **one.temperatures}
-            block = _block(one.time_s, one.counts, readings, one.start_ns)
-            sources.append(FitSource(one.name, partial(list, [block]), serial=one.serial))
-    return run(sources, FitOptions(gravity=gravity, **options)).calibration
+    with as_bags([Path(item) for item in items if not isinstance(item, Columns)]) as paths:
+        sources, kind = fit_sources(paths)
+        if paths:
+            options.setdefault('input', 'counts' if kind == 'counts' else 'm/s^2')
+        for one in items:
+            if isinstance(one, Columns):
+                # What a fit reads of a thermometer that is not there.
+                nothing: Temperature = ([], [])
+                readings = {'board': nothing, 'case': nothing, **one.temperatures}
+                block = _block(one.time_s, one.counts, readings, one.start_ns)
+                sources.append(FitSource(one.name, partial(list, [block]), serial=one.serial))
+        return run(sources, FitOptions(gravity=gravity, **options)).calibration
 
 
 def _block(
@@ -323,19 +325,4 @@ def _readings(name: str, value: Temperature, stamps: Ints, is_date: bool) -> tup
             f'`{name}` must have a value for each of the {len(stamps)} times, or be a pair '
             f'(time_s, value), got {values.shape}'
         )
-    read = said_anew(stamps, values)
-    return stamps[read], values[read]
-
-
-def said_anew(stamp_ns: Ints, celsius: Floats) -> Ints:
-    """Find which rows of a temperature column are readings: finite, and new or ten seconds old."""
-    # What is filled up to the rate of other columns would look like one that stands still.
-    kept: list[int] = []
-    last_ns, last = 0, math.nan
-    for row, (now_ns, value) in enumerate(zip(stamp_ns.tolist(), celsius.tolist(), strict=True)):
-        # A stamp before the last one is a restart of the clock, and worth a reading.
-        is_new = value != last or now_ns - last_ns >= _REPEAT_NS or now_ns < last_ns
-        if is_new and math.isfinite(value):
-            kept.append(row)
-            last_ns, last = now_ns, value
-    return np.array(kept, dtype=np.int64)
+    return Readings(stamps, values).thinned()[:2]

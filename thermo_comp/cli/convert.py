@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns ``convert``, others' logs into bags; ``export``, ``import``, a calibration to and fro."""
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ..errors import CalibrationError
 from ..files import CALIBRATION, PARAMETERS, bag_kind, check_output, read_bounded, write_atomically
@@ -20,12 +20,6 @@ if TYPE_CHECKING:
 
 Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
-#: What may be said of each kind of input.
-_OPTIONS = {
-    'table': ('columns', 'rate_hz'),
-    'log': ('imu', 'baro', 'allow_compensated'),
-    'bag': ('topic', 'unit'),
-}
 #: What rows of a log have in common, by the findings of its conversion.
 _FINDINGS = {
     'short_rows': 'rows left out, too short',
@@ -71,6 +65,7 @@ def convert(
       thermo_comp convert flight.ulg --imu 1 -o unit43
     """
     from ..convert.log import SLOW_HZ, write_log
+    from ..convert.readers import read_log
 
     inputs = [log] if columns is None else [log, columns]
     check_output(output, bag_kind(output), overwrite=force, others=inputs)
@@ -84,7 +79,10 @@ def convert(
         'unit': None if unit == 'm/s^2' else unit,
     }
     with out.progress('converting') as done:
-        report = write_log(_read(out, log, **given), output, force, done)
+        with flags_named():
+            read = read_log(log, **given)
+        tell_guess(out, read)
+        report = write_log(read, output, force, done)
     found, further = report.log, dict(report.messages)
     usual = {f'{name}_messages': further.pop(name) for name in ('accel', 'board', 'case')}
     accel = 'accel/counts' if found.input == 'counts' else 'imu/uncompensated'
@@ -126,68 +124,32 @@ def convert(
     )
 
 
-def _kind_of(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if path.is_dir() or suffix in ('.mcap', '.db3', '.bag'):
-        return 'bag'
-    return 'log' if suffix in ('.ulg', '.bin') else 'table'
-
-
 @contextmanager
-def as_bags(
-    out: Output, paths: Sequence[Path], columns: Path | None, rate_hz: float | None
-) -> Iterator[list[Path]]:
-    """Let tables and logs take part as bags, for as long as it lasts."""
-    from ..convert.log import write_log
-
-    others = [path for path in paths if path.is_file() and _kind_of(path) != 'bag']
-    if (columns or rate_hz) and not others:
-        raise options.usage('--columns and --rate-hz are for tables, and there is none')
-    with TemporaryDirectory(prefix='thermo_comp-') as folder:
-        bags = {}
-        for number, path in enumerate(others):
-            bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
-            log = _read(out, path, columns=columns, rate_hz=rate_hz)
-            out.told([(path, log.chosen, None)])
-            write_log(log, bags[path])
-        yield [bags.get(path, path) for path in paths]
+def flags_named() -> Iterator[None]:
+    """Take a ValueError of the block for a mistake in the command line, its `names` for flags."""
+    with options.usage_of():
+        try:
+            yield
+        except ValueError as mistake:
+            flag = re.sub(r'`(\w+)`', lambda one: f'--{one[1].replace("_", "-")}', str(mistake))
+            raise ValueError(flag) from mistake
 
 
-def _read(out: Output, path: Path, **given: Any) -> 'ForeignLog':
-    """Read a table, log or bag, which its name tells; refuse options that it has no use for."""
-    from ..convert import autopilot, bag, column_map
+def tell_guess(out: Output, log: 'ForeignLog') -> None:
+    """Say what the columns of a table were taken for, where nobody did."""
+    from ..convert.column_map import spoken_columns
     from ..convert.headings import map_lines
 
-    kind = _kind_of(path)
-    said = {name: value for name, value in given.items() if value is not None}
-    flags = {name: f'--{name.replace("_", "-")}' for name in (*_OPTIONS[kind], *said)}
-    for name in said:
-        if name not in _OPTIONS[kind]:
-            has = ', '.join(flags[one] for one in _OPTIONS[kind])
-            raise options.usage(f'a {kind} needs no {flags[name]}; it has {has}')
-    if kind == 'bag':
-        names = said.pop('topic', {})
-        if not names.keys() <= {'imu', 'board', 'case'}:
-            raise options.usage('--topic: of a bag, imu, board and case are converted')
-        return bag.bag_log(path, **names, **said)
-    if kind == 'log':
-        return autopilot.read_autopilot(path, **said)
-    chart, rate_hz = said.get('columns'), said.get('rate_hz')
-    if chart is not None and rate_hz is not None:
-        raise options.usage('--rate-hz: a column map says that')
-    if chart is not None:
-        return column_map.table_log(path, column_map.load_column_map(chart))
-    if path.suffix.lower() in ('.parquet', '.pq'):
-        raise options.usage('a Parquet table needs --columns MAP')
-    guessed = column_map.guess_columns(path, rate_hz)
-    if guessed.format is None:  # told by its headings
-        out.line(f'{path}: taken as this column map; edit it and give it as --columns if not so')
-        for line in map_lines(guessed):
+    if log.guessed is None:
+        return
+    if log.guessed.format is None:  # told by its headings
+        out.line(
+            f'{log.path}: taken as this column map; edit it and give it as --columns if not so'
+        )
+        for line in map_lines(log.guessed):
             out.line(f'  {line}')
     else:
-        taken = column_map.spoken_columns(guessed)
-        out.line(f'{path}: taken as {taken}; --columns says otherwise')
-    return column_map.table_log(path, guessed)
+        out.line(f'{log.path}: taken as {spoken_columns(log.guessed)}; --columns says otherwise')
 
 
 def export(

@@ -12,11 +12,12 @@ import typer
 from ..files import CALIBRATION, PAGE, check_output
 from ..text import counted, one_line
 from . import shared_options as options
-from .convert import as_bags
+from .convert import flags_named, tell_guess
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
 from .shared_options import argument, option
 
 if TYPE_CHECKING:
+    from ..convert.log import ForeignLog
     from ..fitting import FitResult
     from ..fitting.selection import Trial
 
@@ -72,6 +73,7 @@ def fit(
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
       thermo_comp fit tumble.txt -o unit42.yaml --gravity 9.8154
     """
+    from ..convert.readers import as_bags
     from ..fitting import FitOptions
     from ..fitting import fit as run
     from ..fitting.sources import fit_sources
@@ -83,8 +85,14 @@ def fit(
         check_output(report, PAGE, overwrite=force, others=[*inputs, output])
     if certificate_info is not None and report is None:
         raise options.usage('--certificate-info fills the page of --report: give that, too')
-    # Until the command ends.
-    bags = context.with_resource(as_bags(out, bags, columns, rate_hz))
+
+    def tell(log: 'ForeignLog') -> None:
+        tell_guess(out, log)
+        out.told([(log.path, log.chosen, None)])
+
+    with flags_named():
+        # Until the command ends.
+        bags = context.with_resource(as_bags(bags, tell, columns=columns, rate_hz=rate_hz))
     sources, kind = fit_sources(bags, topics)
     info = None
     if certificate_info is not None:

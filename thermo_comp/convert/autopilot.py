@@ -37,7 +37,7 @@ from ..errors import RecordingError
 from ..files import open_regular
 from ..recording.blocks import Readings
 from ..typing import Floats, Ints
-from .log import NO_STAMP, SLOW_HZ, ForeignLog, find_stillness, library, thin
+from .log import NO_STAMP, SLOW_HZ, ForeignLog, find_stillness, library
 
 T = TypeVar('T')
 
@@ -99,7 +99,8 @@ def read_autopilot(
     found = [_reported(one) for one in rows.temperatures.values()]
     if heard or baro is not None:
         found.append(_instance(heard, baro, 'barometer', path))
-    named = zip(('board', 'case'), (thin(one) for one in found if len(one.celsius)), strict=False)
+    thinned = (one.thinned() for one in found if len(one.celsius))
+    named = zip(('board', 'case'), thinned, strict=False)
     return replace(rows, temperatures=dict(named))
 
 

@@ -26,7 +26,7 @@ from ..recording.topics import is_thermometer
 from ..typing import Floats
 from ..unit.schema import Positive, SchemaError, build
 from .headings import read_headings
-from .log import NO_STAMP, ForeignLog, Unit, believed_unit, find_stillness, thin
+from .log import NO_STAMP, ForeignLog, Unit, believed_unit, find_stillness
 from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, read_parquet, read_text
 
 Triple = tuple[Column, Column, Column]
@@ -156,7 +156,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
         raw = one.degc_per_count or 0.0, one.degc_at_zero or 0.0
         slope, offset = _CELSIUS.get(one.unit, raw)
         celsius = table.values[one.column][known] * slope + offset
-        temperatures[name] = thin(Readings(stamp_ns[known], celsius))
+        temperatures[name] = Readings(stamp_ns[known], celsius).thinned()
     rate = None
     if gyro is not None:
         rate = np.column_stack([table.values[name] for name in gyro.columns])

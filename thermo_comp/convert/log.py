@@ -18,7 +18,6 @@ from typing import Any, Literal
 import numpy as np
 
 from .. import __version__
-from ..api import said_anew
 from ..errors import RecordingError
 from ..files import shown_name
 from ..fitting.sources import digest
@@ -74,6 +73,7 @@ class ForeignLog:
     metadata: Mapping[str, str] = field(default_factory=dict)
     missing: str | None = None  # what of it could not be read
     chosen: str | None = None  # topics that were taken without being named
+    guessed: Any = None  # its column map, where nobody gave one
     hint: str = ''  # how its recorder would have logged more
 
 
@@ -118,11 +118,6 @@ def library(module: str, extra: str, what: str, path: Path) -> Any:
         raise RecordingError(
             f"{what} needs {package}: pip install 'thermo_comp[{extra}]'", path=path
         ) from failure
-
-
-def thin(readings: Readings) -> Readings:
-    """Keep the finite readings that say something new: a change, or ten seconds without one."""
-    return readings.take(said_anew(readings.stamp_ns, readings.celsius))
 
 
 def write_log(

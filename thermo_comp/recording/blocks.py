@@ -10,6 +10,7 @@ A column is a numpy array with one row per message. All times are integer nanose
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -37,6 +38,8 @@ LONGEST_PAUSE_NS = 3600 * 10**9  # what a longer jump of the stamps becomes [ns]
 _MOST_JUMPS = 100
 # Of one clock are not so many readings that are stamped so far apart in the median [s].
 _FEWEST_READINGS, _APART_S = 10, 10.0
+#: A thermometer that stands still is heard again after this, so that nobody takes it for lost.
+_REPEAT_NS = 10_000_000_000
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
@@ -226,6 +229,20 @@ class Readings(NamedTuple):
     def take(self, which: Ints | Bools | slice) -> Readings:
         """Choose some of them, of no block."""
         return Readings(self.stamp_ns[which], self.celsius[which])
+
+    def thinned(self) -> Readings:
+        """Keep the finite ones that say something new: a change, or ten seconds without one."""
+        # What is filled up to the rate of other columns would look like one that stands still.
+        kept: list[int] = []
+        last_ns, last = 0, math.nan
+        rows = zip(self.stamp_ns.tolist(), self.celsius.tolist(), strict=True)
+        for row, (now_ns, value) in enumerate(rows):
+            # A stamp before the last one is a restart of the clock, and worth a reading.
+            is_new = value != last or now_ns - last_ns >= _REPEAT_NS or now_ns < last_ns
+            if is_new and math.isfinite(value):
+                kept.append(row)
+                last_ns, last = now_ns, value
+        return self.take(np.array(kept, dtype=np.int64))
 
 
 @dataclass(frozen=True, slots=True)
