@@ -250,7 +250,7 @@ def kill(folder: Path, n_units: int, model: str) -> int:
     try:
         with connected(None, 2) as client:
 
-            def tell(n: int, total: int, _row: Row) -> None:
+            def tell(n: int, total: int, _row: Row | None) -> None:
                 if n in (total // 4, total // 2):
                     killed.append(max(client.run(os.getpid).values()))
                     os.kill(killed[-1], signal.SIGKILL)

@@ -78,7 +78,10 @@ class TestUsage:
                 r'`temperature_timeout_s` must be positive',
             ),
             (('fit', 'a', '-o', 'b'), r'give --gravity, or --latitude and --height'),
-            (('fit', 'a', '-o', 'b', '--reference-temperature', 'nan'), r'reference-temperature'),
+            (
+                ('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', 'nan'),
+                r'--reference-temperature: must be at least -273.15, got nan',
+            ),
             (('play', 'a', '--rate', 'inf'), r'--rate must be finite; 0 is as fast as it is'),
             (('fit', 'a', '-o', 'b', '--latitude', '60'), r'--latitude and --height'),
             (('evaluate', 'a', '-c', 'b', '--window', '0'), r"'--window': .* greater than"),
@@ -98,6 +101,18 @@ class TestUsage:
                 r'--plan is a whole test: leave out --profile and --positions',
             ),
             (('simulate', '-o', 'a', '--positions', '0'), r"Invalid value for '--positions'"),
+            (
+                ('simulate', '-o', 'a', '--positions=2.5'),
+                r"--positions: expected a whole number, got '2\.5'",
+            ),
+            (
+                ('fit', 'a', '-o', 'b', '--gravity', '9.8,1'),
+                r"--gravity: expected a number with a point, as 9\.8154, got '9\.8,1'",
+            ),
+            (
+                ('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', '1e4'),
+                r'--reference-temperature: must be less than 1000, got 10000',
+            ),
             (('convert', 'a.parquet', '-o', 'b'), r'--columns'),
             (('fit', 'a.mcap', '-o', 'b', '--gravity', '9.8', '--rate-hz', '9'), r'for tables'),
         ],

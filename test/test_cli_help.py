@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from conftest import Cli, Once, parsed
 from desk_helpers import Desk
+from typer import rich_utils
 from typer.main import get_command
 
 from thermo_comp.cli.app import app
@@ -99,6 +100,16 @@ def test_commands_that_print_figures_have_json() -> None:
         name for name, one in COMMANDS.items() if not any('--json' in p.opts for p in one.params)
     }
     assert lacking <= {'play'}
+
+
+@pytest.mark.parametrize('name', COMMANDS)
+def test_help_cuts_no_name(name: str, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    # WHY: a terminal of 80 columns showed `--reference-tempera…`, which nobody can type.
+    monkeypatch.setattr(rich_utils, 'MAX_WIDTH', 80)
+    said = cli(*name.split(), '--help').stdout
+    assert '…' not in said
+    for parameter in COMMANDS[name].params:
+        assert all(option in said for option in parameter.opts if option.startswith('-')), said
 
 
 def test_every_option_says_what_it_is_for() -> None:

@@ -71,7 +71,9 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(
     out = tmp_path / 'out'
     told: list[str] = []
 
-    def tell(_n: int, _total: int, row: Row) -> None:
+    def tell(_n: int, _total: int, row: Row | None) -> None:
+        if row is None:
+            return
         # Both workers are in the middle of a unit when the first one has come back.
         if not told:
             os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
@@ -162,8 +164,9 @@ def test_an_interrupted_run_goes_on_where_it_was(client: Any, tmp_path: Path) ->
     for seed in range(3):
         write_unit(fleet / 'A' / f'u{seed}', seed, 1)
 
-    def stop(_n: int, _total: int, _row: object) -> None:
-        raise KeyboardInterrupt
+    def stop(_n: int, _total: int, row: object) -> None:
+        if row is not None:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         fit_fleet(str(fleet), out, OPTIONS, client=client, tell=stop)
@@ -203,7 +206,13 @@ def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path: Path) -> None:
     # As a terminal does, to all of them.
     os.killpg(process.pid, signal.SIGINT)
     said, _ = process.communicate(timeout=60)
-    assert (process.returncode, said) == (130, '')
+    assert process.returncode == 130
+    said = said.splitlines()
+    # Whether Dask had a worker already is chance.
+    assert said in (
+        [f'thermo_comp: interrupted: {state}, kept in out; the same command does the others']
+        for state in ('no test has begun', '0 of 1 test done')
+    )
 
 
 class TestScheduler:
@@ -310,7 +319,7 @@ def test_a_unit_without_a_calibration_leaves_exit_code_1(
     assert command(*arguments) == 1
     said = capsys.readouterr()
     assert '- u: the board temperature leads the case' in said.out
-    assert '0 of 1 tests calibrated, 0 of them in this run' in said.out
+    assert '0 of 1 test calibrated; 0 tests done in this run, 1 in an earlier one' in said.out
     assert said.err == ''
     assert command(*arguments, '--with-prior') == 1
     said = '- fitted without a prior: 0 units whose own bags tell all of them, need 3'

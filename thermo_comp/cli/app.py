@@ -16,6 +16,7 @@ import sys
 from typing import Any
 
 import typer
+from typer import rich_utils
 
 from .. import __version__
 from ..errors import ThermoCompError
@@ -26,8 +27,14 @@ from .shared_options import expanded, option
 # The base of every mistake in a command line; typer gives its children names, but not itself.
 _UsageMistake: Any = typer.BadParameter.__mro__[2]
 
+#: How typer says that the value of an option is no number: the option's names, the kind of number.
+_NO_NUMBER = re.compile(r"'(-[\w-]+)'(?: / '(-[\w-]+)')?: .*\b(?:a )?valid (number|float|integer)")
+
 #: How 0.1 spelt `--topic`.
 _OLD_TOPIC = re.compile(r'--(counts|imu|board|case)-topic(?:=(.*))?')
+
+# The bounds of a number on a line of their own: beside its name they cut the longest option names.
+rich_utils.RANGE_STRING = '\n[{}]'
 
 app = typer.Typer(
     name='thermo_comp',
@@ -87,7 +94,7 @@ def run(arguments: list[str]) -> int:
         context = getattr(mistake, 'ctx', None)
         command = 'thermo_comp' if context is None else context.command_path
         if said := mistake.format_message():  # nothing where typer has printed the help
-            output.error(f'{said} (see: {command} --help)')
+            output.error(f'{_plain(said, arguments)} (see: {command} --help)')
         return int(mistake.exit_code)
     except typer.Abort:
         return 1
@@ -109,6 +116,22 @@ def run(arguments: list[str]) -> int:
     except Exception as failure:  # noqa: BLE001 - the last line of defence
         return _unexpected(failure)
     return code if isinstance(code, int) else 0
+
+
+def _plain(message: str, arguments: list[str]) -> str:
+    """Say what typer says of a value in this program's words, with the value."""
+    message = message.replace('Value error, ', '').replace('Input should be', 'must be')
+    option = _NO_NUMBER.search(message)
+    if option is None:
+        return message
+    given = [
+        word.partition('=')[2] or following
+        for word, following in zip(arguments, [*arguments[1:], ''], strict=True)
+        if word.partition('=')[0] in (option[1], option[2])
+    ]
+    said = ', '.join(map(repr, given))
+    wanted = 'a whole number' if option[3] == 'integer' else 'a number with a point, as 9.8154'
+    return f'{option[1]}: expected {wanted}, got {said}'
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:

@@ -43,7 +43,9 @@ def convert(
     rate_hz: float | None = options.TABLE_RATE,
     imu: int | None = option('IMU of a log, counted from 0.'),
     baro: int | None = option('Barometer of a log, for the case temperature.'),
-    allow_compensated: bool = option('Take a log that INS_TCAL or TC_A has corrected.', False),
+    allow_compensated: bool = option(
+        'Take a log that INS_TCAL or TC_A has corrected.', False, '--allow-compensated'
+    ),
     names: dict[str, str] = options.names,
     unit: Literal['m/s^2', 'g', 'mg'] = option('What the Imu topic of a bag is in.', 'm/s^2'),
     force: bool = options.FORCE,

@@ -3,7 +3,7 @@
 """Owns ``fit``, bags to a calibration; ``prior``, calibrations to their type's; ``fleet fit``."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -36,15 +36,16 @@ def fit(
         'The same of the dynamic set, by itself.', metavar='CURVE'
     ),
     groups: str | None = option('Groups that may take part, by commas.', metavar='A,B'),
-    force_groups: str = option('Groups that stay whatever they earn.', '', metavar='A,B'),
+    force_groups: str = option('Groups kept regardless of the evidence.', '', metavar='A,B'),
     prior: Path | None = option(
         'Calibration to begin with: of the type, or an old one.', metavar='YAML'
     ),
     ageing_bias: str | None = option(
-        "What the biases may have changed by since the prior's: 50ug; else what the bags show."
+        'Assumed bias change (1 sd) since the prior calibration, as 50ug; default: estimated from '
+        'the bags.'
     ),
     ageing_scale: float = option(
-        'What the scale may have changed by since, in ppm.', 0.0, metavar='PPM'
+        'Assumed scale change (1 sd) since the prior calibration, in ppm.', 0.0, metavar='PPM'
     ),
     report: Path | None = option('Certificate to write (HTML).', metavar='HTML'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
@@ -158,10 +159,13 @@ def fleet_fit(
     output: Path = option('Folder of the results; goes on where it was.', ..., '--output', '-o'),
     settings: dict[str, Any] = options.fitting,
     scheduler: str | None = option(
-        'Dask scheduler (tcp://HOST:PORT), instead of this machine alone.'
+        'Address of a running Dask scheduler, as tcp://host:8786; default: this machine alone.',
+        metavar='URL',
     ),
     workers: int | None = option('Processes on this machine; all processors.', min=1),
-    certificates: bool = option('Write a certificate for each unit.', True),
+    no_certificates: bool = option(
+        'Write no certificates, which halves the work.', False, '--no-certificates'
+    ),
     with_prior: bool = option(
         'Fit the units that lack data again with what the others share.', False, '--with-prior'
     ),
@@ -190,19 +194,32 @@ def fleet_fit(
     from ..fleet.work import FleetOptions
 
     with options.usage_of():
-        wanted = FleetOptions(fit=FitOptions(**settings), topics=topics, certificates=certificates)
-    before = [row for path in earlier or () for row in read_parquet(path)]
-    with out.progress('fitting') as done:
-        result = fit_fleet(
-            folder,
-            output,
-            wanted,
-            with_prior=with_prior,
-            scheduler=scheduler,
-            n_workers=workers,
-            earlier=before,
-            tell=lambda n, total, _row: done(n / total),
+        wanted = FleetOptions(
+            fit=FitOptions(**settings), topics=topics, certificates=not no_certificates
         )
+    before = [row for path in earlier or () for row in read_parquet(path)]
+    state = 'no test has begun'
+    with out.progress('fitting') as show:
+
+        def tell(n: int, total: int, _row: object) -> None:
+            nonlocal state
+            state = f'{n} of {counted(total, "test")} done'
+            show(n / total)
+
+        try:
+            result = fit_fleet(
+                folder,
+                output,
+                wanted,
+                with_prior=with_prior,
+                scheduler=scheduler,
+                n_workers=workers,
+                earlier=before,
+                tell=tell,
+            )
+        except KeyboardInterrupt:
+            out.note(f'interrupted: {state}, kept in {output}; the same command does the others')
+            raise
     summary = result.summary
     out.table(
         ('test', 'serial', 'verdict', 'static ug', 'dynamic ug', 'bags'),
@@ -218,7 +235,8 @@ def fleet_fit(
     )
     out.told((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
-        said = (row['problem'], row['left_out'], row['n_torn'] and row['reservations'])
+        # Of a test with a calibration the reservations name the bags left out, too.
+        said = (row['problem'], row['reservations'] or row['left_out'])
         out.points(f'{row["name"]}: {one}' for one in said if one)
     out.points(
         f'{one.name}: {one.label} {one.value:.4g} {one.unit}, median {one.middle:.4g}: '
@@ -236,8 +254,9 @@ def fleet_fit(
     elif with_prior:
         out.line(f'- fitted without a prior: {result.no_prior}')
     out.line(
-        f'{result.page}: {result.n_fitted} of {len(result.rows)} tests calibrated, '
-        f'{result.n_done} of them in this run'
+        f'{result.page}: {result.n_fitted} of {counted(len(result.rows), "test")} calibrated; '
+        f'{counted(result.n_done, "test")} done in this run, '
+        f'{len(result.rows) - result.n_done} in an earlier one'
     )
     out.end(
         int(not result.is_whole),
@@ -251,6 +270,9 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verbose: bool) -> None:
+    import numpy as np
+
+    from ..fitting.coverage import distinct_directions
     from ..unit.gravity import spoken
 
     calibration = result.calibration
@@ -272,19 +294,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
             ],
             title='positions at rest',
         )
-    out.table(
-        ('', 'positions', 'sections', 'norm', 'model'),
-        [
-            (
-                '*' if one.is_chosen else '~' if one.is_near else '',
-                *(micro_g(folds.rms) for folds in one.score.kinds),
-                _named(one.groups),
-            )
-            for one in result.selected.trials
-        ],
-        title='models on data left out, RMS in ug: drift of an axis on positions and on sections '
-        'of the program, |f| - g on positions; *: chosen, ~: as good; +: with the curve',
-    )
+    _say_models(out, result.selected.trials)
     if calibration.evidence:
         out.table(
             ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
@@ -295,7 +305,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
                 )
                 for one in calibration.evidence
             ],
-            title='what the data need; log evidence: how much it falls without the group',
+            title='groups kept; log evidence: its loss if the group is removed',
         )
     white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
     walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
@@ -304,9 +314,18 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     out.table(
         ('section', 'windows', *steps.values(), 'left out'),
         _steps(result.residuals, (*steps, 'left_out'), micro_g),
-        title='|f| - g at rest, RMS in ug; left out: on data that took no part in the fit, the '
-        'drift of an axis where other positions do not determine |f|',
+        title='|f| - g at rest, RMS in ug',
     )
+    n_positions = len(distinct_directions(np.array([one.up for one in result.positions])))
+    if not left_out.n:
+        out.line('left out: no error, as the fit needs all of the data')
+    elif n_positions == 1:
+        out.line('left out: drift of an axis in parts of the program that took no part in the fit')
+    else:
+        out.line(
+            'left out: on data that took no part in the fit; drift of an axis where the other '
+            'positions do not determine |f|'
+        )
     if gyroscope is not None:
         out.table(
             ('section', 'windows', 'raw', 'fitted', 'left out'),
@@ -321,7 +340,9 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
             f'walk {walk} mdeg/s/sqrt(h)'
         )
     out.points(one.message for one in result.findings if one.level != 'good')
-    headline = counted(len(result.positions), 'position')
+    headline = counted(n_positions, 'position')
+    if len(result.positions) > n_positions:
+        headline += f' ({counted(len(result.positions), "rest")})'
     if left_out.n:
         headline += f', {spoken(left_out.rms)} RMS on data left out'
     out.line(f'{output}: unit {calibration.unit.serial}, {model}, {headline}')
@@ -339,6 +360,35 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
         gyroscope=gyroscope and picked(gyroscope, rates) | {'residuals_rad_s': result.rates},
         **picked(result, 'positions least_known findings'),
     )
+
+
+def _say_models(out: Output, trials: Sequence['Trial']) -> None:
+    """Print what each model leaves on data left out of its fit, and what the columns mean."""
+    columns = {
+        'positions': 'drift of an axis in a position left out',
+        'sections': 'drift of an axis in a part of the program left out',
+        'norm': '|f| - g in a position left out',
+    }
+    left = [[micro_g(folds.rms) for folds in one.score.kinds] for one in trials]
+    kept = [k for k in range(len(columns)) if any(row[k] for row in left)]
+    if not kept or len(trials) < 2:
+        return
+    names = [list(columns)[k] for k in kept]
+    out.table(
+        ('', *names, 'model'),
+        [
+            (
+                '*' if one.is_chosen else '~' if one.is_near else '',
+                *(row[k] for k in kept),
+                _named(one.groups),
+            )
+            for one, row in zip(trials, left, strict=True)
+        ],
+        title='models compared on data left out of the fit, RMS in ug',
+    )
+    for name in names:
+        out.line(f'{name}: {columns[name]}')
+    out.line('*: chosen, ~: as good within the noise; +: groups beside the curve')
 
 
 def _named(groups: tuple[str, ...]) -> str:

@@ -19,9 +19,20 @@ from typing import Any, Literal
 import typer
 
 from ..errors import ThermoCompError
+from ..quantities import QUANTITIES
 from ..text import valid_serial
 from ..unit.gravity import parse_acceleration
 from .output import Output
+
+# The value of an option in `--help`, by its type: short, so that a terminal of 80 columns has room
+# for the longest name.
+_VALUES: dict[Any, str] = {
+    bool: ' ',
+    **dict.fromkeys((int, int | None), 'N'),
+    **dict.fromkeys((float, float | None), 'X'),
+    **dict.fromkeys((str, str | None, list[str] | None), 'TEXT'),
+    **dict.fromkeys((Path, Path | None, list[Path], list[Path] | None), 'PATH'),
+}
 
 usage = typer.BadParameter  # a mistake in the command line, to be raised: exit code 2
 
@@ -54,6 +65,9 @@ def expanded(command: Callable[..., Any]) -> Any:
             values[name] = make(**{key: values.pop(key) for key in keys})
         return command(**values)
 
+    for one in options:
+        if isinstance(one.default, typer.models.OptionInfo) and one.default.metavar is None:
+            one.default.metavar = _VALUES.get(one.annotation)
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in options}
     return run
@@ -76,19 +90,31 @@ def check_serial(serial: str | None) -> str | None:
     return serial
 
 
+def check_rate(rate_hz: float | None) -> float | None:
+    """Refuse a sampling rate above 1 MHz, beyond that of any accelerometer."""
+    if rate_hz is not None and rate_hz > 1e6:
+        raise usage(f'expected at most 1e6 Hz, got {rate_hz:g}')
+    return rate_hz
+
+
 FORCE = option('Overwrite one of the same kind.', False, '--force', '-f')
 QUIET = option('Print nothing but errors.', False, '--quiet', '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
 JUDGED_BAGS = argument('Bags to judge it on.', None, metavar='[BAG]...')
 CERTIFICATE_INFO = option('What the laboratory states: number, customer, ... (YAML).')
-TABLE_RATE = option('Samples per second of a table without times.', min=0.01, max=1e6)
+TABLE_RATE = option('Samples per second of a table without times.', min=0.01, callback=check_rate)
 SERIAL = option(
     "Serial of the unit, instead of the bag's; '' accepts any calibration.", callback=check_serial
 )
 OFFSET = option(
     'What raw words read without a force, as 32768; found out by itself if it can.', metavar='WORD'
 )
-INPUT = option('What is read from the bag.', 'auto', '--input')
+INPUT = option(
+    'What is read from the bag: counts, imu, or auto (the input that it has).',
+    'auto',
+    '--input',
+    metavar='KIND',
+)
 Input = Literal['auto', 'counts', 'imu']
 
 
@@ -208,11 +234,15 @@ def judging(
 def fitting(
     where: dict[str, float] = site,
     model: Literal['response', 'golovach'] = option(
-        "The thermal response, or the paper's two sets alone.", 'response'
+        "response: two sets and thermal response; golovach: the paper's two sets alone.",
+        'response',
+        metavar='MODEL',
     ),
-    full_scale: float | None = option('Magnitude of a saturated sample, in input units.'),
+    full_scale: float | None = option(
+        'Magnitude of a saturated sample, in the unit of the input.', metavar='VALUE'
+    ),
     reference_temperature: float = option(
-        'Reference temperature in degC.', 20.0, min=-273.15, max=1000.0
+        'Temperature at which the constants are stated, in degC.', 20.0, metavar='DEGC'
     ),
     min_rest_s: float | None = option(
         'Shortest rest used, in s; else 3, or less where short ones tell more.',
@@ -231,6 +261,8 @@ def fitting(
 ) -> dict[str, Any]:
     """Give keywords of FitOptions."""
     given = locals()
+    if fault := QUANTITIES['temperature'].fault(reference_temperature):
+        raise usage(f'--reference-temperature: {fault}, got {reference_temperature:g}')
     return (
         {name: value for name, value in given.items() if name != 'where'}
         | where

@@ -41,7 +41,7 @@ class FleetResult:
 
     rows: tuple[Row, ...]
     summary: Summary
-    n_done: int  # fits of this run
+    n_done: int  # tests that this run fitted, or tried to
     parquet: Path
     csv: Path
     page: Path
@@ -69,9 +69,14 @@ def fit_fleet(
     n_workers: int | None = None,
     client: Any = None,
     earlier: Sequence[Row] = (),
-    tell: Callable[[int, int, Row], None] = lambda *_: None,
+    tell: Callable[[int, int, Row | None], None] = lambda *_: None,
 ) -> FleetResult:
-    """Fit all units whose results are not there yet; ThermoCompError, OutputError if it cannot."""
+    """
+    Fit all units whose results are not there yet; ThermoCompError, OutputError if it cannot.
+
+    `tell` is called with the number of tests whose result is there and the number of all tests:
+    before the first fit, with None, and after each, with its row.
+    """
     for name in ('distributed', 'fsspec', 'pyarrow'):
         if find_spec(name) is None:
             raise ThermoCompError(
@@ -80,19 +85,20 @@ def fit_fleet(
     storage = Storage(url)
     units = find_units(storage)
     results = Results(Path(output))
-    n_done = 0
+    done: set[str] = set()
     with ExitStack() as stack:
 
         def fitted(some: Sequence[FoundUnit], how: FleetOptions) -> dict[str, Row]:
-            nonlocal client, n_done
+            nonlocal client
             rows = {one.name: row for one in some if (row := results.look_up(one, how))}
             missing = [unit for unit in some if unit.name not in rows]
             if missing and client is None:
                 most = min(n_workers or os.cpu_count() or 1, len(some))
                 client = stack.enter_context(connected(scheduler, most))
-            n_done += len(missing)
+            tell(len(rows), len(some), None)
             for unit, outcome in run(client, storage.address, missing, how) if missing else ():
                 rows[unit.name] = results.store(unit, how, outcome)
+                done.add(unit.name)
                 tell(len(rows), len(some), rows[unit.name])
             return rows
 
@@ -116,7 +122,7 @@ def fit_fleet(
     content = render_fleet(ordered, summary, results.certificate_of).encode()
     files.write_atomically(page, content, files.PAGE)
     prior_path = None if prior is None else results.folder / PRIOR
-    return FleetResult(ordered, summary, n_done, parquet, csv, page, prior_path, no_prior)
+    return FleetResult(ordered, summary, len(done), parquet, csv, page, prior_path, no_prior)
 
 
 def _speaks(row: Row) -> bool:
