@@ -17,19 +17,16 @@ from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.judging.evaluation import open_bags
-from thermo_comp.report.certificate import (
-    CertificateInfo,
-    budget,
-    combined,
-    conformity_rule,
-    load_certificate_info,
-    results,
-)
+from thermo_comp.judging.verdicts import Verdict
+from thermo_comp.report.certificate import budget, combined, conformity, over_temperature, results
 from thermo_comp.report.evidence import evidence_of_bags
 from thermo_comp.report.html import rounded
 from thermo_comp.report.page import render_report
+from thermo_comp.report.statements import CertificateInfo, load_certificate_info
+from thermo_comp.report.states import table_temperatures
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.prediction import in_a_soak
 
 pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
@@ -37,13 +34,14 @@ LAB = """
 number: 2026-017
 laboratory: {name: Inertial Lab, address: 1 Street, accreditation: L-1}
 customer: {name: A Customer}
+place: Room 2, Exampleton
 operator: A. Person
-unit: {maker: ACME, model: TRI-3, serial: thermostatted-0001}
+unit: {maker: ACME, model: TRI-3, serial: thermostatted-0001, condition: undamaged}
 instruments:
   - {name: chamber, model: CX, serial: '4711', traceability: certificate 3 of 2025}
 gravity: {standard_uncertainty_m_s2: 2.0e-5, source: absolute gravimeter}
 thermometers: {standard_uncertainty_k: 0.05}
-dates: {test: 2026-03-01, issue: 2026-03-31, due: 2027-03-31}
+dates: {receipt: 2026-02-20, test: 2026-03-01, issue: 2026-03-31, due: 2027-03-31}
 conditions: (23 ± 1) °C
 signatory: B. Person
 """
@@ -88,6 +86,7 @@ def test_what_a_laboratory_states_is_printed_and_the_rest_is_blank(tmp_path):
         *('2026-017', 'Inertial Lab', '1 Street', 'L-1', 'A Customer', 'A. Person', 'ACME'),
         *('TRI-3', 'certificate 3 of 2025', '2e-05 m/s²', 'absolute gravimeter', '2026-03-01'),
         *('2026-03-31', '2027-03-31', '(23 ± 1) °C', 'B. Person', 'thermostatted-0001'),
+        *('Room 2, Exampleton', 'undamaged', '2026-02-20'),
     ):
         assert text in page, text
     # The address of the customer, and the place of the signature.
@@ -106,12 +105,13 @@ def test_what_a_laboratory_states_is_printed_and_the_rest_is_blank(tmp_path):
             'Date of test',
             'Conditions',
         ),
-        *('>Instruments', 'Local gravity', '>Method', '>Results', '>Uncertainty budget'),
-        *('>Statement of conformity', '>Range of validity', 'Authorised by'),
+        *('>Instruments', 'Local gravity', '>Method', '>Results', '>Results over temperature'),
+        *('>Uncertainty budget', '>Statement of conformity', '>Range of validity'),
+        *('reproduced in full only', 'Authorised by', '>End of the certificate'),
     ]
     places = [page.index(text) for text in order]
     assert places == sorted(places)
-    assert render_report(evidence(), figures=[]).count('class="blank"') == 18
+    assert render_report(evidence(), figures=[]).count('class="blank"') == 21
 
 
 @pytest.mark.parametrize(
@@ -191,6 +191,58 @@ def test_residual_beyond_the_claim_is_repeatability():
     assert whole == pytest.approx(1e-3)
 
 
+def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
+    # WHY: 0.00037 was printed for a scale factor whose gravity nobody had vouched for.
+    rows = {one.quantity: one for one in results(evidence(), CertificateInfo(), ())}
+    assert rows['scale factor x'].expanded == '–'
+    assert rows['bias x'].expanded != '–'
+    page = render_report(evidence(), figures=[])
+    assert 'U of the scale factors and of |f| − g is withheld' in page
+    assert 'combined, without gravity' in page
+    info = load_certificate_info(lab(tmp_path))
+    assert 'withheld' not in render_report(evidence(), figures=[], info=info)
+    # What the fit was told is in the covariance: it is known, and not counted twice.
+    told = replace(evidence(), gravity_sd=2e-5)
+    assert 'withheld' not in render_report(told, figures=[])
+    assert {one.name: one.standard for one in budget(told, info)}['gravity'] == 0.0
+
+
+def test_table_over_temperature(tmp_path):
+    info = load_certificate_info(lab(tmp_path))
+    tables = over_temperature(evidence(), info)
+    assert [one.axis for one in tables] == ['x', 'y', 'z']
+    calibration = fitted().calibration
+    for k, table in enumerate(tables):
+        assert len({row.program for row in table.rows}) == 3
+        for row in table.rows:
+            if row.program != 'soak':
+                continue
+            at = float(row.temperature.replace('−', '-'))
+            bias, sd, scale, scale_sd = in_a_soak(calibration, at)
+            said = [float(cell.replace('−', '-')) for cell in row[2:]]
+            # Half a digit of two, and half a tenth of a kelvin of the ends of the range.
+            slack = 0.06 * abs(table.bias_slope) + 0.06 * said[1]
+            assert said[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)
+            assert said[1] == pytest.approx(2.0 * sd[k] / MICRO_G, rel=0.06)
+            *_, scale_0, _ = in_a_soak(calibration)
+            slack = 0.06 * abs(table.scale_slope) + 0.06 * said[4]
+            assert said[3] == pytest.approx(1e6 * (scale[k] / scale_0[k] - 1.0), abs=slack)
+            gravity = 2e-5 / calibration.gravity_m_s2
+            assert said[4] == pytest.approx(2e6 * math.hypot(scale_sd[k], gravity), rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ('ends', 'found'),
+    [
+        ((-20.2, 61.3), [-20.2, 0.0, 20.0, 40.0, 61.3]),
+        ((14.9, 30.1), [14.9, 20.0, 25.0, 30.1]),
+        ((20.0, 20.5), [20.0, 20.5]),
+    ],
+)
+def test_temperatures_of_the_table_are_round(ends, found):
+    assert table_temperatures(*ends).tolist() == found
+
+
 def test_gravity_in_doubt_is_the_scale_factors_doubt(tmp_path):
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
     rows = {one.quantity: one for one in results(evidence(), info, ())}
@@ -203,11 +255,17 @@ def test_gravity_in_doubt_is_the_scale_factors_doubt(tmp_path):
     )
 
 
-def test_rule_of_conformity_names_the_limit():
+def test_conformity_is_stated_to_a_limit_alone():
     judgement = replace(evidence().judgement, tolerance=100.0 * MICRO_G)
-    assert 'limit of 100 µg' in conformity_rule(replace(evidence(), judgement=judgement))
-    assert 'No limit was specified' in conformity_rule(evidence())
-    assert 'no statement' in conformity_rule(replace(evidence(), judgement=None))
+    said, rule = conformity(replace(evidence(), judgement=judgement))
+    assert said == 'The unit conforms to the limit of 100 µg.'
+    assert 'guard band 0' in rule
+    beyond = replace(judgement, kind=Verdict.RECALIBRATE)
+    assert 'does not conform' in conformity(replace(evidence(), judgement=beyond))[0]
+    for judged in (replace(judgement, kind=Verdict.OUTSIDE), evidence().judgement, None):
+        said, rule = conformity(replace(evidence(), judgement=judged))
+        assert said == ''
+        assert 'o statement of conformity is made' in rule
 
 
 def test_simulated_bags_mark_every_page(tmp_path):

@@ -20,6 +20,7 @@ from thermo_comp.report import figures_bags as of_bags
 from thermo_comp.report import figures_unit as of_unit
 from thermo_comp.report.html import label_text, number
 from thermo_comp.report.page import figures_of, position_error, schuler_peak
+from thermo_comp.report.states import curves
 from thermo_comp.report.style import drawing, svg
 from thermo_comp.report.trace import shown_bag
 from thermo_comp.thermal.regime import Regime
@@ -41,8 +42,8 @@ def test_bias_and_scale_curves_by_hand():
         dynamic=dynamic,
         response=(term('board', (0.3, 0.0, 0.0), (0.0, 1e-6, 0.0), tau_s=600.0),),
     )
-    soak, heating = of_unit.curves(one)
-    assert (soak.name, heating.name) == ('soak', 'heating at 1 K/min')
+    soak, heating = curves(one)
+    assert (soak.program.label, heating.program.label) == ('soak', 'heating at 1 K/min')
     count = 1.0 / 300.0 / MICRO_G
     t = soak.temperature - 20.0
     assert soak.value[:, :3] == pytest.approx(np.outer(0.3 * count * t, np.ones(3)))

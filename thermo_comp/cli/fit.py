@@ -97,7 +97,7 @@ def fit(
     sources, kind = fit_sources(bags, topics)
     info = None
     if certificate_info is not None:
-        from ..report.certificate import load_certificate_info
+        from ..report.statements import load_certificate_info
 
         info = load_certificate_info(certificate_info, serial or sources[0].serial)
     with options.usage_of():
@@ -122,7 +122,8 @@ def fit(
         from ..report.evidence import evidence_of_fit
         from ..report.page import write_report
 
-        write_report(evidence_of_fit(result), report, info=info, overwrite=force)
+        evidence = evidence_of_fit(result, wanted.gravity_sd)
+        write_report(evidence, report, info=info, overwrite=force)
     _say(out, result, output, report, verbose)
 
 

@@ -153,9 +153,9 @@ def report(
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
     """
     from ..judging.evaluation import drifts_of, open_bags
-    from ..report.certificate import load_certificate_info
     from ..report.evidence import evidence_of_bags
     from ..report.page import write_report
+    from ..report.statements import load_certificate_info
     from ..unit.calibration_file import load_calibration
 
     paths = bags or []

@@ -1,127 +1,27 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what makes a report a certificate: statements, results, budget, after ISO/IEC 17025."""
+"""Owns what makes a report a certificate after ISO/IEC 17025: results, budget, conformity."""
 
 from __future__ import annotations
 
-import datetime as dt
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, NamedTuple
+import math
+from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import ThermoCompError
 from ..judging.verdicts import Verdict
-from ..plain_yaml import read_plain_yaml
-from ..quantities import Bounds
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
 from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states
-from ..unit.schema import NotNegative, SchemaError, build
 from .evidence import Evidence
-from .html import number, rounded
+from .html import minus, number, rounded
+from .statements import CertificateInfo
+from .states import curves, evaluate, programs, slopes, table_temperatures
 
 #: Coverage factor of an expanded uncertainty: 95 % of a normal distribution.
 COVERAGE = 2.0
 _N_SLOPE = 33
-
-Text = Annotated[str, Bounds(longest=500)]
-
-
-@dataclass(frozen=True)
-class Party:
-    """Who calibrates, or for whom."""
-
-    name: Text = ''
-    address: Text = ''
-    accreditation: Text = ''
-
-
-@dataclass(frozen=True)
-class Item:
-    """What was calibrated."""
-
-    maker: Text = ''
-    model: Text = ''
-    serial: Text = ''
-
-
-@dataclass(frozen=True)
-class Instrument:
-    """What it was calibrated with: the chamber, a thermometer."""
-
-    name: Text
-    model: Text = ''
-    serial: Text = ''
-    traceability: Text = ''
-
-
-@dataclass(frozen=True)
-class GravityStatement:
-    """How well local gravity is known, and from where."""
-
-    standard_uncertainty_m_s2: NotNegative | None = None
-    source: Text = ''
-
-
-@dataclass(frozen=True)
-class Thermometers:
-    """How far the unit's thermometers may drift between the calibration and its use."""
-
-    standard_uncertainty_k: NotNegative | None = None
-
-
-@dataclass(frozen=True)
-class Dates:
-    """When, as in 2026-03-31."""
-
-    test: Text = ''
-    issue: Text = ''
-    due: Text = ''
-
-    def __post_init__(self) -> None:
-        for name in ('test', 'issue', 'due'):
-            value = getattr(self, name)
-            try:
-                _ = value and dt.date.fromisoformat(value)
-            except ValueError:
-                raise ValueError(
-                    f'`{name}` must be a date like 2026-03-31, got {value!r}'
-                ) from None
-
-
-@dataclass(frozen=True)
-class CertificateInfo:
-    """What a laboratory says of a calibration, key by key as in its file; all may be left out."""
-
-    number: Text = ''
-    laboratory: Party = Party()
-    customer: Party = Party()
-    operator: Text = ''
-    unit: Item = Item()
-    instruments: tuple[Instrument, ...] = ()
-    gravity: GravityStatement = GravityStatement()
-    thermometers: Thermometers = Thermometers()
-    dates: Dates = Dates()
-    conditions: Text = ''
-    remarks: Text = ''
-    signatory: Text = ''
-
-
-def load_certificate_info(path: str | Path, serial: str | None = None) -> CertificateInfo:
-    """Read a laboratory's statements; ThermoCompError, with file and key, if one is wrong."""
-    data = read_plain_yaml(path)
-    try:
-        info = build(CertificateInfo, {} if data is None else data)
-        if serial and info.unit.serial and info.unit.serial != serial:
-            raise SchemaError(
-                'unit.serial', f'must be that of the calibration, {serial}, got {info.unit.serial}'
-            )
-    except ValueError as error:
-        raise ThermoCompError(f'{path}: {error}') from error
-    return info
 
 
 class Contribution(NamedTuple):
@@ -140,6 +40,33 @@ class Result(NamedTuple):
     value: str
     expanded: str
     unit: str
+
+
+class StateResult(NamedTuple):
+    """
+    One axis in a soak or a ramp at one temperature of the board.
+
+    Each deviation is that of the value before it from a straight line over temperature, which
+    meets a soak at the reference temperature and has the slope of the soak.
+    """
+
+    program: str
+    temperature: str  # [degC]
+    bias: str  # [micro-g]
+    bias_expanded: str
+    bias_deviation: str
+    scale: str  # from that at the reference temperature [ppm]
+    scale_expanded: str
+    scale_deviation: str
+
+
+class AxisOverTemperature(NamedTuple):
+    """The table of one axis, and the slopes of its lines [micro-g/K, ppm/K]."""
+
+    axis: str
+    bias_slope: float
+    scale_slope: float
+    rows: list[StateResult]
 
 
 def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...]:
@@ -165,14 +92,29 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         slope = f'{drift_k:g} K times the slope of the correction'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
     beyond = 'what the residual exceeds noise, attitude and model by'
+    # What the fit was told of gravity's uncertainty is part of the claim already.
+    gravity = unclaimed_gravity_sd(evidence, info)
+    told = 'stated to the fit, a part of the model' if evidence.gravity_sd else ''
     return (
         Contribution('noise', 'A', noise, seconds),
-        Contribution('gravity', 'B', info.gravity.standard_uncertainty_m_s2, info.gravity.source),
+        Contribution('gravity', 'B', gravity, info.gravity.source or told),
         Contribution('attitude', 'A', attitude, 'axes not at right angles; |f| needs no fixture'),
         Contribution('thermometers', 'B', drift, slope),
         Contribution('model', 'A', model, 'posterior of all parameters at the judged windows'),
         Contribution('repeatability', 'A', rest, beyond),
     )
+
+
+def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
+    """
+    Give the standard uncertainty of gravity that the calibration's covariance lacks [m/s^2].
+
+    None: nobody has stated how well gravity is known.
+    """
+    stated = info.gravity.standard_uncertainty_m_s2
+    if stated is None:
+        return 0.0 if evidence.gravity_sd else None
+    return float(np.sqrt(max(stated**2 - evidence.gravity_sd**2, 0.0)))
 
 
 def combined(contributions: tuple[Contribution, ...]) -> float:
@@ -191,8 +133,7 @@ def results(
     bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
     # Without a claim there is no uncertainty to expand.
     known = COVERAGE if calibration.has_uncertainty else np.nan
-    by_gravity = (info.gravity.standard_uncertainty_m_s2 or 0.0) / calibration.gravity_m_s2
-    scale_sd = np.hypot(scale_sd, by_gravity) * np.abs(scale)
+    scale_sd = np.hypot(scale_sd, _gravity_part(evidence, info)) * np.abs(scale)
     below = ((1, 0), (2, 0), (2, 1))
     said = {
         'scale factor {}': (AXES, scale, scale_sd, f'{unit} per m/s²'),
@@ -214,32 +155,84 @@ def results(
         for name in ('static', 'dynamic'):
             one = evidence.judgement.sections[name]
             if one.n:
-                texts = rounded(one.mean / MICRO_G, expanded_ug if known > 0.0 else np.nan)
+                is_known = known > 0.0 and unclaimed_gravity_sd(evidence, info) is not None
+                mean_ug = one.mean / MICRO_G
+                texts = rounded(mean_ug, expanded_ug) if is_known else (number(mean_ug), '–')
                 found.append(Result(f'mean of |f| − g, {name}', *texts, 'µg'))
     return found
 
 
-def conformity_rule(evidence: Evidence) -> str:
-    """Say by which rule the verdict was found."""
+def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOverTemperature]:
+    """Tabulate bias and scale of each axis in a soak and in ramps at temperatures of the board."""
+    calibration = evidence.calibration
+    if calibration is None or not calibration.needs_temperature:
+        return []
+    known = COVERAGE if calibration.has_uncertainty else np.nan
+    slope = slopes(curves(calibration)[0])
+    bias_0, *_ = in_a_soak(calibration)
+    found = [
+        AxisOverTemperature(axis, float(slope[k]), float(slope[k + 3]), [])
+        for k, axis in enumerate(AXES)
+    ]
+    for program in programs(calibration):
+        at = table_temperatures(*program.regime.temperature_range_c)
+        value, sd = evaluate(calibration, program, at)[2:]
+        sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
+        off = value - np.outer(at - calibration.reference_temperature_c, slope)
+        value[:, :3] += bias_0 / MICRO_G
+        for k, table in enumerate(found):
+            for row in range(len(at)):
+                cells: list[str] = []
+                for column in (k, k + 3):
+                    expanded = float(known * sd[row, column])
+                    both = float(value[row, column]), float(off[row, column])
+                    if math.isfinite(expanded):
+                        said, deviation = (rounded(one, expanded)[0] for one in both)
+                        cells += said, rounded(both[0], expanded)[1], deviation
+                    else:
+                        cells += number(both[0], 4), '–', number(both[1], 4)
+                celsius = minus(f'{at[row]:.1f}')
+                table.rows.append(StateResult(program.name, celsius, *cells))
+    return found
+
+
+def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
+    """Give the relative uncertainty of scale that gravity adds; NaN where nobody has stated it."""
+    sd = unclaimed_gravity_sd(evidence, info)
+    if sd is None or evidence.calibration is None:
+        return np.nan
+    return sd / evidence.calibration.gravity_m_s2
+
+
+def withheld_because(evidence: Evidence, info: CertificateInfo) -> str:
+    """Say why an expanded uncertainty is a dash, if one is."""
+    calibration = evidence.calibration
+    if calibration is not None and not calibration.has_uncertainty:
+        return 'U is withheld: the calibration states no uncertainty.'
+    if unclaimed_gravity_sd(evidence, info) is None:
+        return (
+            'U of the scale factors and of |f| − g is withheld: the uncertainty of local gravity, '
+            'which is a part of it, is not stated.'
+        )
+    return ''
+
+
+def conformity(evidence: Evidence) -> tuple[str, str]:
+    """State conformity to the limit that was specified, and the rule; no limit, no statement."""
     judgement = evidence.judgement
     if judgement is None:
-        return 'No recording was judged: no statement of conformity is made.'
-    if judgement.tolerance is not None:
-        limit = number(judgement.tolerance / MICRO_G)
-        return (
-            f'Simple acceptance: the RMS of |f| − g of each regime within the calibrated ranges '
-            f'is at most the limit of {limit} µg and below that without the correction; the '
-            'uncertainty is not subtracted from the limit (guard band 0).'
-        )
-    if judgement.kind is Verdict.NO_CLAIM:
-        return (
-            'No limit was specified and the calibration states no uncertainty: no statement of '
-            'conformity is made.'
-        )
+        return '', 'No recording was judged: no statement of conformity is made.'
+    if judgement.tolerance is None:
+        return '', 'No limit was specified (--tolerance): no statement of conformity is made.'
+    limit = number(judgement.tolerance / MICRO_G)
+    if judgement.kind in (Verdict.OUTSIDE, Verdict.SWAPPED):
+        return '', f'No statement of conformity is made: {judgement.kind.value}.'
+    does = 'conforms' if judgement.is_valid else 'does not conform'
     return (
-        'No limit was specified. The calibration conforms to its own statement: in each regime '
-        'the RMS of |f| − g is at most twice the RMS of what is claimed for the same windows, '
-        'and below that without the correction.'
+        f'The unit {does} to the limit of {limit} µg.',
+        'Rule: simple acceptance. The RMS of |f| − g of each regime within the calibrated ranges '
+        'is at most the limit, and below that without the correction; the uncertainty is not '
+        'subtracted from the limit (guard band 0).',
     )
 
 

@@ -12,7 +12,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from ..fitting import FitResult, ResidualRow
-from ..fitting.coverage import LeastKnown, least_known
+from ..fitting.coverage import LeastKnown, distinct_directions, least_known
 from ..fitting.data_checks import Finding
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector
@@ -21,6 +21,7 @@ from ..judging.judgement import Judgement
 from ..judging.verdicts import Verdict
 from ..judging.windows import WINDOW_S, Windows, corrected_windows, means_by, usual_window
 from ..replay import check_unit
+from ..text import counted
 from ..typing import Floats
 from ..unit.calibration import Calibration, Source
 from ..unit.gravity import spoken
@@ -58,7 +59,8 @@ class Evidence:
 
     `windows` are at rest, of all bags, `judgement` what they tell; `steps` what each step of the
     model leaves, `left_out`, by `Windows.position`, the RMS of ``|f| - g`` by what the others say
-    of the unit [m/s^2]; `findings` speak against calibration or bags, `checks` found them good.
+    of the unit [m/s^2]; `findings` speak against calibration or bags, `checks` found them good;
+    `gravity_sd` is the uncertainty of gravity that the calibration's covariance holds [m/s^2].
     """
 
     serial: str
@@ -72,6 +74,7 @@ class Evidence:
     findings: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
     history: tuple[Epoch, ...] = ()
+    gravity_sd: float = 0.0
 
     @property
     def sources(self) -> tuple[Source, ...]:
@@ -171,6 +174,14 @@ class Evidence:
             for k in range(len(places))
         )
 
+    @property
+    def positions_text(self) -> str:
+        """Count the directions of the positions, and the rests where there are more of them."""
+        n_rests = len(self.positions)
+        n = len(distinct_directions(np.array([one.up for one in self.positions]).reshape(-1, 3)))
+        said = counted(n, 'position')
+        return said if n == n_rests else f'{said} ({counted(n_rests, "rest")})'
+
     def axis_residuals(self) -> dict[str, Floats]:
         """Give the residual of each axis by rung, (n, 3) [m/s^2], about its position's mean."""
         windows = self.windows
@@ -229,8 +240,8 @@ def evidence_of_bags(
     )
 
 
-def evidence_of_fit(result: FitResult) -> Evidence:
-    """Gather what a fit has to show, on its own bags."""
+def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
+    """Gather what a fit has to show, on its own bags; `gravity_sd` is what it was told."""
     found = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
     left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
     against = [f'{one.name}: {one.message}' for one in result.findings if _is_reservation(one)]
@@ -239,6 +250,7 @@ def evidence_of_fit(result: FitResult) -> Evidence:
     return replace(
         judged,
         steps=result.residuals,
+        gravity_sd=gravity_sd,
         left_out={k: left_out[one] for k, one in enumerate(found) if left_out.get(one, 0.0) > 0.0},
         findings=tuple(dict.fromkeys((*judged.findings, *against))),
         checks=tuple(one.message for one in result.findings if not _is_reservation(one)),

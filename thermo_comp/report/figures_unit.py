@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,12 +17,13 @@ from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
-from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states, sd_of_states, step_states
+from ..unit.prediction import bias_and_scale, ramp_states, step_states
 from ..unit.rate_bias import MILLIDEGREE
 from ..unit.rate_triad import rate_triad
 from . import style
 from .evidence import CHOSEN, Evidence, given
 from .html import label_text, minus, number
+from .states import Curve, curves, slopes
 
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
@@ -30,8 +31,8 @@ _N_CURVE = 61
 _BOARD = 'T board, °C'
 #: From a few readings to where the longest lag of the bank has forgotten.
 _STEP_MINUTES = (0.2, 500.0)
-# Line, hatch and marker.
-_WAYS: dict[str, tuple[style.Line, str, str]] = {
+# Line, hatch and marker of a soak and of ramps.
+_LOOKS: dict[str, tuple[style.Line, str, str]] = {
     'soak': (style.STATIC_LINE, '////', 'o'),
     'heating': (style.DYNAMIC_LINE, '\\\\\\\\', '^'),
     'cooling': (style.AXIS_LINES[2], '....', 'v'),
@@ -85,11 +86,6 @@ def _panels(
     return figure, panels
 
 
-def slopes(soak: Curve) -> Floats:
-    """Fit the lines that are left out of what is drawn, through 0 at the reference, shape (6,)."""
-    return np.asarray(np.polyfit(soak.temperature, soak.value, 1)[0])
-
-
 def _draw_less_line(
     axes: Axes, calibration: Calibration, drawn: list[Curve], k: int, unit: str
 ) -> None:
@@ -97,18 +93,19 @@ def _draw_less_line(
     reference, slope = calibration.reference_temperature_c, slopes(drawn[0])[k]
     widest = 0.0
     for curve in drawn:
-        at, color = curve.temperature, curve.line['color']
+        line, hatch, marker = _LOOKS[curve.program.name]
+        at, color = curve.temperature, line['color']
         value = curve.value[:, k] - slope * (at - reference)
         if calibration.posterior is not None:
             half = BAND_SDS * curve.sd[:, k]
-            look: style.Line = {'facecolor': color, 'edgecolor': color, 'hatch': curve.hatch}
+            look: style.Line = {'facecolor': color, 'edgecolor': color, 'hatch': hatch}
             axes.fill_between(at, value - half, value + half, alpha=0.25, linewidth=0, **look)
             widest = max(widest, float(half.max()))
         # The ends of the valid range are marked; a range of a few K stays visible so.
-        look = {'marker': curve.marker, 'markersize': 3.5, 'markevery': [0, -1]}
-        axes.plot(at, value, label=curve.name, **look, **curve.line)
-    title = f'{AXES[k % 3]}: {minus(f"{slope:+.3g}")} {unit}/K'
-    axes.set_title(f'{title}, ±{number(widest, 2)}' if widest else title)
+        look = {'marker': marker, 'markersize': 3.5, 'markevery': [0, -1]}
+        axes.plot(at, value, label=curve.program.label, **look, **line)
+    title = f'{AXES[k % 3]}: slope {minus(f"{slope:+.3g}")} {unit}/K'
+    axes.set_title(f'{title}\n95 % band: ±{number(widest, 2)} {unit} at most' if widest else title)
     axes.axvline(reference, color=style.GREY, linewidth=0.8)
     axes.locator_params(axis='y', nbins=5)
 
@@ -129,44 +126,6 @@ def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     known = np.abs(force) >= 0.5 * windows.gravity
     scale = np.divide(error, force, out=np.full(error.shape, np.nan), where=known)
     return mean[:, 0], np.hstack((error / MICRO_G, scale * 1e6))
-
-
-class Curve(NamedTuple):
-    """Bias [micro-g] and scale [ppm] in one state, against a soak at the reference, (n, 6)."""
-
-    name: str
-    line: style.Line
-    hatch: str
-    marker: str
-    temperature: Floats
-    value: Floats
-    sd: Floats
-
-
-def curves(calibration: Calibration) -> list[Curve]:
-    """Evaluate a soak and, where they differ, ramps at half of the fastest rate."""
-    static, dynamic = calibration.regime_sets()
-    ways = [('soak', static, 0.0)]
-    if calibration.response or static != dynamic:
-        cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
-        ramps = (('heating', dynamic, heating), ('cooling', dynamic, cooling))
-        ways += [one for one in ramps if one[2]]
-    bias_0, _, scale_0, _ = in_a_soak(calibration)
-    found = []
-    for way, part, rate_k_min in ways:
-        rate = rate_k_min / 60.0
-        name = f'{way} at {abs(rate_k_min):g} K/min' if rate else way
-        lower, upper = part.temperature_range_c
-        temperature = np.linspace(lower, upper, _N_CURVE)
-        begun = lower if rate > 0.0 else upper
-        lasted_s = (temperature - begun) / rate if rate else 0.0
-        states = ramp_states(calibration, temperature, rate, lasted_s)
-        bias, scale = bias_and_scale(calibration, states)
-        sd_bias, sd_scale = sd_of_states(calibration, states)
-        value = np.hstack(((bias - bias_0) / MICRO_G, (scale / scale_0 - 1.0) * 1e6))
-        sd = np.hstack((sd_bias / MICRO_G, sd_scale * 1e6))
-        found.append(Curve(name, *_WAYS[way], temperature, value, sd))
-    return found
 
 
 def draw_step(evidence: Evidence) -> Figure:
@@ -199,7 +158,7 @@ def draw_hysteresis(evidence: Evidence) -> Figure:
     for i, axes in enumerate(panels):
         middle = (heating[:, i] + cooling[:, i]) / 2.0
         for name, bias in (('heating', heating), ('cooling', cooling)):
-            line, _, marker = _WAYS[name]
+            line, _, marker = _LOOKS[name]
             look: style.Line = {'marker': marker, 'markevery': 12, 'markersize': 3.5}
             axes.plot(temperature, bias[:, i] - middle, label=name, **look, **line)
         axes.set_title(f'bias {AXES[i]}')

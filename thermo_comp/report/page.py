@@ -15,14 +15,23 @@ from matplotlib.figure import Figure
 from ..files import PAGE, PICTURE, write_atomically
 from ..fitting.reduction import ReducedBag
 from ..judging.evaluation import drifts_of
-from ..text import counted
 from ..thermal.regime import Regime
 from ..unit.gravity import STANDARD_GRAVITY
 from . import figures_bags as of_bags
 from . import figures_unit as of_unit
-from .certificate import CertificateInfo, budget, combined, conformity_rule, results
+from .certificate import (
+    budget,
+    combined,
+    conformity,
+    over_temperature,
+    results,
+    unclaimed_gravity_sd,
+    withheld_because,
+)
 from .evidence import LEFT_OUT, Evidence
 from .html import label_text, render, utc
+from .statements import CertificateInfo
+from .states import programs
 from .style import drawing, png, svg
 from .trace import span_of
 
@@ -90,7 +99,11 @@ def render_report(
         results=results(evidence, info, contributions),
         budget=contributions,
         combined=combined(contributions),
-        rule=conformity_rule(evidence),
+        conformity=conformity(evidence),
+        over_temperature=over_temperature(evidence, info),
+        programs=_programs(evidence),
+        withheld=withheld_because(evidence, info),
+        is_gravity_known=unclaimed_gravity_sd(evidence, info) is not None,
         error=position_error,
         schuler=schuler_peak,
         figures=figures,
@@ -135,13 +148,19 @@ def _seen(evidence: Evidence) -> list[str]:
         board = evidence.judgement.windows.board
         which = 'bags of its own fit' if evidence.is_seen else 'bags that the fit has not seen'
         said.append(
-            f'{counted(len(evidence.positions), "position")} in {which}, '
-            f'{np.min(board):.1f} to {np.max(board):.1f} °C.'
+            f'{evidence.positions_text} in {which}, {np.min(board):.1f} to {np.max(board):.1f} °C.'
         )
     shown = evidence.shown
     if shown is not None and all(one.regime == Regime.UNKNOWN for one in shown.stretches):
         said.append('The regime was never known: the bag is too short for the detector.')
     return said
+
+
+def _programs(evidence: Evidence) -> str:
+    """Name the soak and the ramps of the table over temperature."""
+    if evidence.calibration is None:
+        return ''
+    return ', '.join(one.label for one in programs(evidence.calibration))
 
 
 def _test_dates(evidence: Evidence) -> str:
@@ -230,8 +249,8 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         'that begin in a soak at its end, less the value at '
         f'{calibration.reference_temperature_c:g} °C (grey line) and less a straight line, whose '
         'slope stands above each panel.',
-        'Hatched: 95 % band of all that was fitted, with its largest half width above the panel; '
-        'where it is wider than the curves are apart, the bags do not tell.'
+        'Hatched: 95 % band of all that was fitted, its largest half width above the panel; '
+        'where it is wider than the curves are apart, the bags do not tell them apart.'
         if has_band
         else '',
         'Circles: what was measured in each soak of each position, all of the residual taken for '

@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns what a laboratory states on a certificate, and the reading of its file."""
+
+from __future__ import annotations
+
+import datetime as dt
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from ..errors import ThermoCompError
+from ..plain_yaml import read_plain_yaml
+from ..quantities import Bounds
+from ..unit.schema import NotNegative, SchemaError, build
+
+Text = Annotated[str, Bounds(longest=500)]
+
+
+@dataclass(frozen=True)
+class Party:
+    """Who calibrates, or for whom."""
+
+    name: Text = ''
+    address: Text = ''
+    accreditation: Text = ''
+
+
+@dataclass(frozen=True)
+class Item:
+    """What was calibrated, and in which condition it came."""
+
+    maker: Text = ''
+    model: Text = ''
+    serial: Text = ''
+    condition: Text = ''
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """What it was calibrated with: the chamber, a thermometer."""
+
+    name: Text
+    model: Text = ''
+    serial: Text = ''
+    traceability: Text = ''
+
+
+@dataclass(frozen=True)
+class GravityStatement:
+    """How well local gravity is known, and from where."""
+
+    standard_uncertainty_m_s2: NotNegative | None = None
+    source: Text = ''
+
+
+@dataclass(frozen=True)
+class Thermometers:
+    """How far the unit's thermometers may drift between the calibration and its use."""
+
+    standard_uncertainty_k: NotNegative | None = None
+
+
+@dataclass(frozen=True)
+class Dates:
+    """When, as in 2026-03-31; `receipt` is when the unit came to the laboratory."""
+
+    receipt: Text = ''
+    test: Text = ''
+    issue: Text = ''
+    due: Text = ''
+
+    def __post_init__(self) -> None:
+        for name in ('receipt', 'test', 'issue', 'due'):
+            value = getattr(self, name)
+            try:
+                _ = value and dt.date.fromisoformat(value)
+            except ValueError:
+                raise ValueError(
+                    f'`{name}` must be a date like 2026-03-31, got {value!r}'
+                ) from None
+
+
+@dataclass(frozen=True)
+class CertificateInfo:
+    """What a laboratory says of a calibration, key by key as in its file; all may be left out."""
+
+    number: Text = ''
+    laboratory: Party = Party()
+    customer: Party = Party()
+    place: Text = ''
+    operator: Text = ''
+    unit: Item = Item()
+    instruments: tuple[Instrument, ...] = ()
+    gravity: GravityStatement = GravityStatement()
+    thermometers: Thermometers = Thermometers()
+    dates: Dates = Dates()
+    conditions: Text = ''
+    remarks: Text = ''
+    signatory: Text = ''
+
+
+def load_certificate_info(path: str | Path, serial: str | None = None) -> CertificateInfo:
+    """Read a laboratory's statements; ThermoCompError, with file and key, if one is wrong."""
+    data = read_plain_yaml(path)
+    try:
+        info = build(CertificateInfo, {} if data is None else data)
+        if serial and info.unit.serial and info.unit.serial != serial:
+            raise SchemaError(
+                'unit.serial', f'must be that of the calibration, {serial}, got {info.unit.serial}'
+            )
+    except ValueError as error:
+        raise ThermoCompError(f'{path}: {error}') from error
+    return info

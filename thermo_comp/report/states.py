@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns bias and scale of a calibration over temperature, in a soak and in ramps, with their sd."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..typing import Floats
+from ..unit.calibration import Calibration, RegimeSet
+from ..unit.gravity import MICRO_G
+from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states, sd_of_states
+
+_N_CURVE = 61
+#: Steps of a table over temperature [K], and the largest number of its temperatures in a state.
+_STEPS_K = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+_MOST_TEMPERATURES = 8
+
+
+class Program(NamedTuple):
+    """A soak, or a ramp through the whole range of a set from a soak at its end."""
+
+    name: str  # soak, heating or cooling
+    regime: RegimeSet
+    rate_k_min: float
+
+    @property
+    def label(self) -> str:
+        """The name, and the rate of a ramp."""
+        return f'{self.name} at {abs(self.rate_k_min):g} K/min' if self.rate_k_min else self.name
+
+
+class Curve(NamedTuple):
+    """
+    Bias [micro-g] and scale [ppm] of x, y, z in one program, shape (n, 6), and their sd.
+
+    The values are differences from a soak at the reference temperature; the sd are those of bias
+    and scale themselves.
+    """
+
+    program: Program
+    temperature: Floats
+    value: Floats
+    sd: Floats
+
+
+def programs(calibration: Calibration) -> list[Program]:
+    """List a soak and, where they differ from it, ramps at half of the fastest rate calibrated."""
+    static, dynamic = calibration.regime_sets()
+    found = [Program('soak', static, 0.0)]
+    if calibration.response or static != dynamic:
+        cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
+        ramps = (Program('heating', dynamic, heating), Program('cooling', dynamic, cooling))
+        found += [one for one in ramps if one.rate_k_min]
+    return found
+
+
+def evaluate(calibration: Calibration, program: Program, temperature: Floats) -> Curve:
+    """Evaluate bias and scale in a program at board temperatures, shape (n,)."""
+    rate = program.rate_k_min / 60.0
+    lower, upper = program.regime.temperature_range_c
+    begun = lower if rate > 0.0 else upper
+    lasted_s = (temperature - begun) / rate if rate else 0.0
+    states = ramp_states(calibration, temperature, rate, lasted_s)
+    bias, scale = bias_and_scale(calibration, states)
+    sd_bias, sd_scale = sd_of_states(calibration, states)
+    bias_0, _, scale_0, _ = in_a_soak(calibration)
+    value = np.hstack(((bias - bias_0) / MICRO_G, (scale / scale_0 - 1.0) * 1e6))
+    return Curve(program, temperature, value, np.hstack((sd_bias / MICRO_G, sd_scale * 1e6)))
+
+
+def curves(calibration: Calibration) -> list[Curve]:
+    """Evaluate each program over the whole range of its set."""
+    return [
+        evaluate(calibration, one, np.linspace(*one.regime.temperature_range_c, _N_CURVE))
+        for one in programs(calibration)
+    ]
+
+
+def slopes(soak: Curve) -> Floats:
+    """Fit a straight line to each column of a soak and give its slope per kelvin, shape (6,)."""
+    return np.asarray(np.polyfit(soak.temperature, soak.value, 1)[0])
+
+
+def table_temperatures(lowest: float, highest: float) -> Floats:
+    """Choose the temperatures of a table: both ends of a range, and round ones between them."""
+    span = highest - lowest
+    step = next((one for one in _STEPS_K if span <= one * (_MOST_TEMPERATURES - 2)), _STEPS_K[-1])
+    within = step * np.arange(math.ceil(lowest / step), math.floor(highest / step) + 1)
+    # A round temperature nearer to an end than a quarter of the step says what the end says.
+    kept = within[(within - lowest > 0.25 * step) & (highest - within > 0.25 * step)]
+    return np.array([lowest, *kept, highest])
