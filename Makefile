@@ -37,6 +37,7 @@ help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
 
 demo: $(VENV)/.installed
+	@echo "thermo_comp: fitting nine sample bags three ways, playing a tenth through the node: a minute"
 	$(BIN)/thermo_comp demo --out out
 
 test: $(VENV)/.installed-test
@@ -87,13 +88,15 @@ $(BIN)/python:
 	    "$$($(PYTHON) --version 2>&1 || true). Install one, or: make PYTHON=/path/to/python3" >&2; \
 	  exit 1; \
 	fi; \
+	echo "thermo_comp: $$found makes the environment $(VENV)"; \
 	$$found -m venv $(VENV) || { \
 	  echo "thermo_comp: $$found cannot make a venv; on Debian and Ubuntu:" \
 	    "sudo apt install python3-venv" >&2; exit 1; }
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=24'
 
 $(VENV)/.installed: setup.py setup.cfg pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[ros]'
+	@echo "thermo_comp: pip installs it with numpy, scipy, matplotlib and rclpy into $(VENV): a few minutes"
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[ros]'
 	@touch $@
 
 $(VENV)/.installed-test: setup.py setup.cfg pyproject.toml | $(BIN)/python

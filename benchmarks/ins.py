@@ -190,19 +190,19 @@ def draw(path: Path, results: dict[str, dict[str, Flights]]) -> None:
     mpl.use('Agg')
     from matplotlib import pyplot as plt
 
-    figure, panels = plt.subplots(1, 2, figsize=(9.6, 3.8), sharey=True, layout='constrained')
+    figure, panels = plt.subplots(1, 2, figsize=(9.6, 3.8), layout='constrained')
     for panel, (program, flights) in zip(panels, results.items(), strict=True):
         for name, one in flights.items():
             minutes, colour = one.time_s / 60.0, COLOURS[name]
             low, high = np.quantile(one.position, (0.05, 0.95), axis=1)
             if name != 'one set':
                 panel.fill_between(minutes, low, high, color=colour, alpha=0.15, linewidth=0)
-            panel.plot(minutes, np.sqrt(np.mean(one.position**2, 1)), color=colour, label=name)
-        panel.plot(minutes, one.sigma[:, 0], color=colour, dashes=(4, 3), label="filter's sigma")
-        panel.set(yscale='log', xlabel='minutes after levelling', title=program, ylim=(1e-3, None))
+            rms = np.sqrt(np.mean(one.position**2, 1))
+            panel.plot(minutes, rms, color=colour, label=f'{name}: {rms[-1]:.3g} m at the end')
+        panel.set(xlabel='minutes after levelling', title=program, ylim=(0.0, None))
+        panel.legend(loc='upper left')
         panel.grid(alpha=0.3)
     panels[0].set_ylabel('horizontal position error, m')
-    panels[0].legend(loc='lower right')
     figure.savefig(path, dpi=110)
 
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the reading of the README: its blocks, the outputs that it shows, and how alike is alike.
+Owns the outputs that the README and the page of the command line show, and how alike is alike.
 
-``python test/readme_helpers.py`` runs the shown commands and writes what they say into the README,
+``python test/readme_helpers.py`` runs the commands of that page, writes what they print into it,
 and the picture of the demonstration into docs/images; look at the difference before you commit it.
 """
 
@@ -20,20 +20,27 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / 'README.md').read_text(encoding='utf-8')
-FENCES = re.findall(r'^```(\w+)\n(.*?)^```', README, re.MULTILINE | re.DOTALL)
+SESSION = ROOT / 'docs' / 'cli.md'
+FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
 _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
 def shown() -> dict[str, tuple[list[str], str]]:
-    """Return what the README shows: sub-command -> (words of the command line, output)."""
+    """Return what the page shows: sub-command -> (words of the command line, output)."""
     found = {}
-    for kind, text in FENCES:
+    for kind, text in FENCE.findall(SESSION.read_text(encoding='utf-8')):
         if kind == 'console':
             command, _, output = text.partition('\n')
             words = shlex.split(command.removeprefix('$ '))
             assert words[0] == 'thermo_comp'
             found[words[1]] = (words[1:], output)
     return found
+
+
+def shown_of_demo() -> list[str]:
+    """Return the lines of the demonstration that the README shows."""
+    (text,) = (text for kind, text in FENCE.findall(README) if kind == 'text')
+    return str(text).splitlines()
 
 
 def is_alike(got: str, expected: str) -> bool:
@@ -50,11 +57,7 @@ def is_alike(got: str, expected: str) -> bool:
 
 
 def refresh() -> None:
-    """
-    Write the real output of the shown commands, and the table of the parameters, into the README.
-    """
-    from make_reference import parameters_table
-
+    """Write the real output of the shown commands into their page."""
     environment = {**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80'}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, 'bags').symlink_to(ROOT / 'bags')
@@ -72,15 +75,13 @@ def refresh() -> None:
             )
             return f'```console\n{command}\n{finished.stdout.rstrip()}\n```'
 
-        text = re.sub(r'^```console\n(.*?)^```', run, README, flags=re.MULTILINE | re.DOTALL)
+        page = SESSION.read_text(encoding='utf-8')
+        text = re.sub(r'^```console\n(.*?)^```', run, page, flags=re.MULTILINE | re.DOTALL)
         shutil.copy(
             Path(folder, 'out', 'figures', '4_gravity.png'), ROOT / 'docs/images/gravity.png'
         )
-    table = rf'\g<1>{parameters_table().strip()}\n\g<2>'
-    text = re.sub(r'(<!-- parameters.*?-->\n).*?(<!-- end)', table, text, flags=re.DOTALL)
-    (ROOT / 'README.md').write_text(text, encoding='utf-8')
+    SESSION.write_text(text, encoding='utf-8')
 
 
 if __name__ == '__main__':
-    sys.path[:0] = [str(ROOT), str(ROOT / 'docs')]
     refresh()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Cli
-from readme_helpers import ROOT, is_alike, shown
+from readme_helpers import ROOT, is_alike, shown, shown_of_demo
 
 from thermo_comp.recording.reader import inspect_recording
 
@@ -28,8 +28,10 @@ def test_end_to_end(tmp_path: Path, cli: Cli) -> None:
     said = cli('demo', cwd=tmp_path).stdout
     assert 'messages in 15407, messages out 15407' in said
     assert 'bit for bit: yes' in said
-    # What it says is what the README shows.
+    # What it says is what the page of the command line shows, and the README in part.
     assert is_alike(said, shown()['demo'][1]), said
+    lines = said.splitlines()
+    assert [one for one in shown_of_demo() if not any(is_alike(line, one) for line in lines)] == []
     out = tmp_path / 'out'
     topics = inspect_recording(out / 'out.mcap').topics
     (imu,) = (count for name, (_, count) in topics.items() if name.endswith('imu/data_raw'))

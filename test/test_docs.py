@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
-# README's console blocks run with their output in test_readme; a bag that plays for minutes, one
+# The session of cli.md runs with its output in test_readme; a bag that plays for minutes, one
 # that grows, and the demo, have tests of their own (test_player, test_record, test_cli_demo).
 ELSEWHERE = (
     'thermo_comp demo',
@@ -42,7 +42,7 @@ def commands() -> list[tuple[str, str, str]]:
     found = []
     for page in PAGES:
         for kind, text in FENCE.findall(page.read_text(encoding='utf-8')):
-            if (page.name == 'README.md' and kind == 'console') or kind not in ('console', 'sh'):
+            if (page.name == 'cli.md' and kind == 'console') or kind not in ('console', 'sh'):
                 continue
             joined = re.sub(r'\\\n\s*', '', text)
             prompt = r'^\$ ' if kind == 'console' else r'^'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the README shows is what a reader gets: its commands run, its tables and links are true."""
+"""README, and the session on the page of the command line: their outputs and links are true."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 import yaml
 from conftest import Cli, Once
 from desk_helpers import write_fit_of_the_readme
-from readme_helpers import FENCES, README, ROOT, is_alike, shown
+from readme_helpers import FENCE, README, ROOT, SESSION, is_alike, shown
 
 from thermo_comp.cli.app import app
 
@@ -37,21 +37,13 @@ def test_commands_that_are_not_run_here_exist() -> None:
     known |= {group.typer_instance.info.name for group in app.registered_groups}
     named = set(re.findall(r'(?:^|^\$ |`)thermo_comp (\w+)', README, re.MULTILINE))
     assert named <= known, named - known
-    assert {c for c in known if f'`thermo_comp {c}' in README} == known
+    page = SESSION.read_text(encoding='utf-8')
+    assert {c for c in known if f'`thermo_comp {c}' in page} == known
     makefile = (ROOT / 'Makefile').read_text()
     for target in re.findall(r'^make (\w+)', README, re.MULTILINE):
         assert re.search(rf'^{target}:', makefile, re.MULTILINE), target
     for script in re.findall(r'python (benchmarks/\w+\.py)', README):
         assert (ROOT / script).is_file(), script
-
-
-def test_the_parameters_are_the_node_s() -> None:
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-    from make_reference import parameters_table
-
-    table = re.search(r'<!-- parameters.*?-->\n(.*?)<!-- end', README, re.DOTALL)
-    assert table is not None
-    assert table[1].strip() == parameters_table().strip()
 
 
 def test_links_lead_somewhere() -> None:
@@ -60,7 +52,8 @@ def test_links_lead_somewhere() -> None:
 
 
 def test_the_calibration_s_keys_are_those_of_the_example() -> None:
-    (excerpt,) = (yaml.safe_load(text) for kind, text in FENCES if kind == 'yaml')
+    page = (ROOT / 'docs' / 'calibration_file.md').read_text(encoding='utf-8')
+    (excerpt,) = (yaml.safe_load(text) for kind, text in FENCE.findall(page) if kind == 'yaml')
     example = yaml.safe_load((ROOT / 'config' / 'calibration.example.yaml').read_text())
 
     def holds(part: object, whole: object) -> bool:
@@ -74,4 +67,6 @@ def test_the_calibration_s_keys_are_those_of_the_example() -> None:
 
 
 def test_it_fits_the_page() -> None:
-    assert [line for line in README.splitlines() if len(line) > 100 and '|' not in line] == []
+    lines = README.splitlines()
+    assert len(lines) <= 150
+    assert [line for line in lines if len(line) > 100 and '|' not in line] == []

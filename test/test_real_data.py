@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +23,7 @@ sys.path.insert(0, str(ROOT / 'benchmarks'))
 
 from recorded.data import GRAVITY, faces_bag, freezer_bag, handheld_bag
 
-from thermo_comp.errors import FitError
+from thermo_comp.errors import FitError, RecordingError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.judging.evaluation import evaluate
@@ -114,6 +115,28 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
     slope = np.diff(z.bias_function.value(np.array([-4.0, 14.0])))[0] / 18.0 / MG
     assert slope == pytest.approx(1.61, abs=0.2)
     assert result.residuals[-1].fitted.rms / MG < 0.75
+
+
+def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(real_data, work):
+    # After the last jump, in parts of 71 s: each half is corrected by a fit of the other half.
+    bag = freezer_bag(real_data, work)
+    parts = [Part(518.5 + 71.0 * k, 518.5 + 71.0 * (k + 1)) for k in range(20)]
+    raw, left = [], []
+    for first in (0, 1):
+        seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts[first::2]]
+        calibration = fit(seen, OPTIONS).calibration
+        for part in parts[1 - first :: 2]:
+            # In two parts somebody knocked at the freezer: no minute of them is at rest.
+            with suppress(RecordingError):
+                judged = evaluate([bag], [('unit', calibration)], topics=Topics(part=part))
+                windows = judged.judgements['unit'].windows
+                raw += windows.raw_residual.tolist()
+                left += windows.residual.tolist()
+    assert len(raw) == 18
+    # The drift: about its mean, as nobody knows the constants of one attitude.
+    assert np.std(raw) / MG == pytest.approx(2.1, abs=0.2)
+    # White noise of 1.5 mg per root hertz leaves 0.19 mg of a minute.
+    assert np.sqrt(np.mean(np.square(left))) / MG < 0.4
 
 
 def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
