@@ -41,8 +41,9 @@ _TOGETHER = (('product', 'square'), (*_LAGS, 'product', 'mixed', 'square'))
 # The noise is sought in steps of this factor, then of its roots; its white part follows in so many
 # rounds.
 _NOISE_STEP, _NOISE_ROUNDS = 3.0, 2
-# A column of the chosen model stays if the log evidence falls by this without it: e^3 = 20 to one.
-_LEAST_GAIN = 3.0
+# A column of the chosen model stays if the log evidence falls by this without it: less is worth no
+# more than a bare mention (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
+_LEAST_GAIN = 1.0
 # Logarithms of mean squares that differ by less than this are equal: 5 % of an RMS.
 _EQUAL = 0.1
 # Norms of left-out positions alone decide for a group if they gain so many standard errors.

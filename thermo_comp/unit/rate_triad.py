@@ -26,7 +26,8 @@ def rate_triad(calibration: Calibration) -> Calibration:
             unit.AxisSet(curve.bias_function, Polynomial((1.0,)), curve.delta, sd)
             for curve, sd in zip(curves.axes(), own.residual_sd_rad_s, strict=True)
         )
-        return replace(shared, x=x, y=y, z=z)
+        # Its lack of fit is that of the specific force.
+        return replace(shared, x=x, y=y, z=z, lack_of_fit=())
 
     triad = replace(
         calibration,
