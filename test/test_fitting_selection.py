@@ -318,7 +318,7 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm: Case, away
     places = layout.weights[0, :, 0]
     true = mean[places].copy()
     mean[places] += away * sd[0]
-    priors = [InformativePrior(mean, np.diag((part * sd) ** -2.0)) for part in (1.0, 100.0)]
+    priors = [InformativePrior(mean, np.diag(1.0 / (part * sd))) for part in (1.0, 100.0)]
     prior = replace(
         constants(truth), column_sd=candidates.typical, informative=priors[-1]
     )  # fmt: skip

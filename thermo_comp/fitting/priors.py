@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from .. import __version__
 from ..errors import FitError
@@ -44,6 +45,8 @@ _ALONE = 0.01
 _MORE_ALONE = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 # Ageing that nobody has stated, of biases [parts of g] and of scales, is what the bags show.
 _AGEINGS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
+# Ageing of scales is as large as that of biases, in these units, or a small part of it.
+_SCALE_SHARES = (0.0, 0.01, 1.0)
 # Correlations are believed to this part of a variance.
 _EXACT = 1e-6
 
@@ -117,7 +120,11 @@ def informative_priors(
     stated = options.ageing_bias, options.ageing_scale
     tried = [(grown(*stated), more) for more in _MORE_ALONE]
     if not any(stated):
-        tried += [(grown(one * options.gravity, one), 0.0) for one in _AGEINGS]
+        tried += [
+            (grown(ageing * options.gravity, share * ageing), 0.0)
+            for share in _SCALE_SHARES
+            for ageing in _AGEINGS
+        ]
     # The fit only begins with the last: noise must not take what a narrow one leaves.
     tried.append((tried[-1][0], _MORE_ALONE[-1]))
     layout = regression.layout(regression.windows.parts)
@@ -130,8 +137,11 @@ def informative_priors(
         root = np.sqrt(floor)
         scaled, correlation = to_file / root[:, None], known / np.outer(root, root)
         wider = correlation + (_EXACT + more) * np.eye(len(root))
-        precision = scaled.T @ np.linalg.solve(wider, scaled)
-        result.append(InformativePrior(mean, (precision + precision.T) / 2.0))
+        # Parameters that are almost one, as the levels of both sets, would drown in a product.
+        whitened = solve_triangular(np.linalg.cholesky(wider), scaled, lower=True)
+        root = np.linalg.qr(whitened, mode='r')
+        root = root * np.sign(np.diag(root))[:, None]
+        result.append(InformativePrior(mean, np.asarray(root)))
     return result
 
 

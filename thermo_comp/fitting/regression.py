@@ -19,7 +19,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve
+from scipy.linalg import cho_solve, solve_triangular
 
 from ..typing import Bools, Floats, Ints
 from .equations import Equations, Tangent, as_vector, moved_by
@@ -290,10 +290,17 @@ class Regression(Equations):
         """Solve for the unit's own unknowns: the step, and the factor of their Hessian."""
         known, n = self.unit_prior(prior, layout), layout.n_unit
         away = (as_vector(state, layout) - self.prior_mean(prior, layout))[:n]
-        hessian = information + known
-        factor = factored(hessian)
-        step = cho_solve((factor, True), pull - known @ away, check_finite=False)
-        return step, factor
+        if prior.informative is None:
+            factor = factored(information + known)
+            return cho_solve((factor, True), pull - known @ away, check_finite=False), factor
+        # In standard deviations of the prior no parameter drowns another.
+        root = prior.informative.root
+        turned = solve_triangular(root, information, trans='T')
+        turned = solve_triangular(root, turned.T, trans='T')
+        factor = factored((turned + turned.T) / 2.0 + np.eye(n))
+        right = solve_triangular(root, pull, trans='T') - root @ away
+        step = solve_triangular(root, cho_solve((factor, True), right, check_finite=False))
+        return step, root.T @ factor
 
     def step(
         self, state: State, prior: Prior, layout: Layout, grams: Floats, *, held: bool = False
@@ -336,7 +343,10 @@ class Regression(Equations):
         away = as_vector(state, layout) - self.prior_mean(prior, layout)
         own = away[: layout.n_unit]
         local = self.precision(prior, layout)[layout.n_unit :]
-        size = float(own @ self.unit_prior(prior, layout) @ own)
+        if prior.informative is None:
+            size = float(own @ self.unit_prior(prior, layout) @ own)
+        else:
+            size = float(np.sum((prior.informative.root @ own) ** 2))
         size += float(local @ away[layout.n_unit :] ** 2)
         if self.n_bags > 1 and layout.start.size:
             bound = (_COMMON_START * self.n_bags) ** 2 * prior.start_share
@@ -409,11 +419,13 @@ class Regression(Equations):
             variance.append((inverse**2).sum(axis=0) + ((cross @ covariance) * cross).sum(axis=1))
         everything = np.concatenate(variance)
         determined = 1.0 - precision * everything
-        known = self.unit_prior(prior, layout)
-        if prior.informative is not None:
-            determined[:n] = 1.0 - np.einsum('ij,ji->i', known, covariance)
         of_prior = float(np.log(precision[n:][precision[n:] > 0.0]).sum())
-        of_prior += float(np.linalg.slogdet(known)[1])
+        if prior.informative is None:
+            of_prior += float(np.log(precision[:n]).sum())
+        else:
+            root = prior.informative.root
+            determined[:n] = 1.0 - np.sum(root * (root @ covariance), axis=0)
+            of_prior += 2.0 * float(np.log(np.diag(root)).sum())
         log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
         size = self._size(square, prior) + self._away(state, prior, layout)
         evidence = -0.5 * (size + log_hessian - of_prior)

@@ -100,10 +100,20 @@ WHITE = Noise()
 
 @dataclass(frozen=True)
 class InformativePrior:
-    """Prior of the unit's parameters in the order of `Layout`: mean and inverse covariance."""
+    """
+    Prior of the unit's parameters in the order of `Layout`.
+
+    mean: shape (n_unit,)
+    root: upper triangle R whose ``R.T @ R`` is the inverse covariance, shape (n_unit, n_unit)
+    """
 
     mean: Floats
-    precision: Floats
+    root: Floats
+
+    @cached_property
+    def precision(self) -> Floats:
+        """Inverse covariance, shape (n_unit, n_unit)."""
+        return np.asarray(self.root.T @ self.root)
 
 
 @dataclass(frozen=True)
