@@ -139,9 +139,9 @@ def informative_priors(
         wider = correlation + (_EXACT + more) * np.eye(len(root))
         # Parameters that are almost one, as the levels of both sets, would drown in a product.
         whitened = solve_triangular(np.linalg.cholesky(wider), scaled, lower=True)
-        root = np.linalg.qr(whitened, mode='r')
+        root: Floats = np.asarray(np.linalg.qr(whitened, mode='r'))
         root = root * np.sign(np.diag(root))[:, None]
-        result.append(InformativePrior(mean, np.asarray(root)))
+        result.append(InformativePrior(mean, root))
     return result
 
 
