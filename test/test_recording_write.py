@@ -27,10 +27,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader as Reader2
 
 from thermo_comp.errors import OutputError, RecordingError
-from thermo_comp.online.status import STAMPED_TYPE, stamped_flag
 from thermo_comp.recording.blocks import ImuColumns
 from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.writer import BagWriter
+from thermo_comp.topics import FLAGS, STAMPED
 
 STEP_NS = 2_500_000
 REQUIRED: tuple[()] = ()
@@ -403,7 +403,7 @@ def test_regime_topics_are_offered_as_the_node_offers_them(tmp_path: Path, name:
     with BagWriter(tmp_path / name) as bag:
         bag.write_bool('imu0/regime/dynamic', [1], [True])
         for topic in ('imu0/regime/stamped', '/diagnostics'):
-            bag.write_raw(topic, STAMPED_TYPE, [1], [stamped_flag(1, True, 'T-1')])
+            bag.write_raw(topic, STAMPED.type, [1], [FLAGS[STAMPED](1, True, 'T-1')])
     path = tmp_path / name / 'bag_0.mcap' if name == 'bag' else tmp_path / name
     with path.open('rb') as file:
         channels = make_reader(file).get_summary().channels.values()
