@@ -50,10 +50,6 @@ def unit(bag: Path) -> Path:
 
 
 class TestHelp:
-    def test_all_commands_are_there(self) -> None:
-        wanted = {'fit', 'evaluate', 'replay', 'play', 'simulate', 'convert', 'info', 'report'}
-        assert wanted | {'demo'} <= set(COMMANDS)
-
     @pytest.mark.parametrize('command', COMMANDS)
     def test_has_an_example_and_fits(self, command: str, cli: Cli) -> None:
         said = cli(command, '--help').stdout
@@ -96,11 +92,6 @@ class TestOutput:
         data = parsed(cli(*arguments, code=None).stdout)
         assert set(data['calibrations']) == {'unit'}
         assert data['is_valid'] == data['verdict'].startswith('valid')
-
-    def test_quiet_says_nothing(self, bag: Path, unit: Path, cli: Cli, tmp_path: Path) -> None:
-        arguments = ('replay', bag, '-c', unit, '-o', tmp_path / 'out', '--serial', '', '-q')
-        finished = cli(*arguments)
-        assert (finished.stdout, finished.stderr) == ('', '')
 
     def test_a_reader_that_has_seen_enough_is_no_error(self, bag: Path) -> None:
         command = f'{sys.executable} -m thermo_comp info {bag} | head -n 1'
@@ -196,11 +187,6 @@ class TestPlay:
         words = ['play', 'a', '--ros-args', '-r', 'x:=y', '--', '-q']
         assert split_arguments(words) == (['play', 'a', '-q'], ['-r', 'x:=y'])
         assert split_arguments(['info', '--', 'a']) == (['info', '--', 'a'], [])
-
-
-def test_a_report_of_nothing(cli: Cli, tmp_path: Path) -> None:
-    said = cli('report', '-o', tmp_path / 'page.html', code=2).stderr
-    assert 'give bags, a calibration, or both' in said
 
 
 class TestSimulate:

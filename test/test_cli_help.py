@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -120,43 +119,3 @@ def test_every_option_says_what_it_is_for() -> None:
         if parameter.name != 'help' and not getattr(parameter, 'help', '')
     ]
     assert bare == []
-
-
-class TestExchange:
-    def test_what_is_lost_is_said(self, desk: Desk) -> None:
-        written = desk.run('thermo_comp export unit42.yaml --to px4 -o unit.params').stdout
-        assert 'scale over temperature is lost' in written
-        assert 'set it to the device id' in written
-
-    @pytest.mark.parametrize(
-        ('arguments', 'message'),
-        [
-            (('--to', 'px4', '--number', '4'), r'`number` must be 0\.\.3, got 4'),
-            (('--to', 'ardupilot', '--number', '0'), r'`number` must be 1\.\.3, got 0'),
-            (('--to', 'px4', '--up', '0', '0', '2'), r'`up` must be a unit vector'),
-            (('--to', 'ardupilot', '--device-id', '7'), r'--device-id is for PX4'),
-            (('--to', 'imu_tk', '--up', '0', '0', '1'), r'--up is for PX4 and ArduPilot'),
-            (('--to', 'betaflight'), r'betaflight'),
-        ],
-    )
-    def test_export_s_usage(
-        self, arguments: tuple[str, ...], message: str, root: Path, cli: Cli, tmp_path: Path
-    ) -> None:
-        example = root / 'config' / 'calibration.example.yaml'
-        finished = cli('export', example, *arguments, '-o', tmp_path / 'out', code=2)
-        assert re.search(message, finished.stderr)
-        assert 'export --help' in finished.stderr
-
-    @pytest.mark.parametrize(
-        ('content', 'message'),
-        [
-            ('hello', 'no TC_A* (PX4) or INS_TCAL* (ArduPilot) parameters'),
-            ('TC_A0_X1_0 1\nTC_A1_X1_0 1', 'several sets of parameters [0, 1]: choose one'),
-        ],
-    )
-    def test_import_refuses(self, content: str, message: str, cli: Cli, tmp_path: Path) -> None:
-        (tmp_path / 'file').write_text(content)
-        arguments = ('import', tmp_path / 'file', '--serial', '1', '-o', tmp_path / 'out.yaml')
-        finished = cli(*arguments, code=1)
-        assert message in finished.stderr
-        assert not (tmp_path / 'out.yaml').exists()
