@@ -245,6 +245,12 @@ def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]
     subprocess.run(['umount', str(disk)], check=True)
 
 
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make pages without what takes long: their figures, which test_report.py draws."""
+    monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: [])
+
+
 class Once(Protocol):
     """Make a folder once in a run of the tests, whichever worker asks for it first."""
 

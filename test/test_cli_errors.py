@@ -268,11 +268,10 @@ class TestEvaluations:
         refused(cli, 1, r'no window of 60 s at rest', 'evaluate', tmp_path / 'bag', '-c', unit)
 
 
+@pytest.mark.usefixtures('no_figures')
 def test_a_torn_bag_is_worked_through_and_the_exit_code_tells(
-    cli: Cli, unit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cli: Cli, unit: Path, tmp_path: Path
 ) -> None:
-    # Drawing is what takes long.
-    monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: [])
     whole = bag(tmp_path / 'whole.mcap').read_bytes()
     torn = tmp_path / 'torn.mcap'
     torn.write_bytes(whole[:-100])
