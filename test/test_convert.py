@@ -451,10 +451,3 @@ class TestFreezer:
         # The clipped rows are among what the node holds back.
         assert offline.counters.n_in - offline.counters.n_out >= offline.counters.n_saturated
         assert offline.counters.n_saturated >= report.findings['clipped'].count > 0
-
-    def test_a_map_with_the_wrong_unit_is_refused(self, path: Path, tmp_path: Path) -> None:
-        text = (ROOT / 'config' / 'columns' / 'freezer.yaml').read_text()
-        (tmp_path / 'map.yaml').write_text(text.replace('unit: g ', 'unit: m/s^2 '))
-        columns = load_column_map(tmp_path / 'map.yaml')
-        with pytest.raises(RecordingError, match='looks like g'):
-            write_log(table_log(path, columns), tmp_path / 'bag')
