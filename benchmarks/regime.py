@@ -1,13 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures of docs/regime.md: the detector against four rules, in one run.
+Owns the figures of docs/regime.md: the detector over ramps and soaks, in one run.
 
 Closed-form responses of a case (first-order lag) and a board (a second lag behind it) to a
 chamber's ramp, with the chamber's ripple and a self-heating drift, are read by sensors of several
-noises, quanta and rates. Ours runs as shipped; each rival's threshold is the largest value that
-its statistic takes in 20 h of soak of the same sensor, so all rivals have the same rate of false
-alarms, about one in 20 h, which is more than ours has. Seeded: one command, one set of figures.
+noises, quanta and rates. The detector runs as shipped. Seeded: one command, one set of figures.
 
     python benchmarks/regime.py --quick            # seconds
     python benchmarks/regime.py --workers 2        # some minutes
@@ -23,31 +21,18 @@ from multiprocessing.pool import Pool
 from pathlib import Path
 
 import numpy as np
-from regime_figures import plot_rules
-from regime_rules import RIVALS, SENSORS, Scene, known_signature_delays, read, temperatures
-from regime_runs import (
-    OURS,
-    Job,
-    Outcome,
-    cost,
-    ours,
-    rng_of,
-    run_scenes,
-    run_soak,
-    settings,
-    tuned,
-)
+from regime_figures import plot_ramp
+from regime_runs import Job, Outcome, cost, ours, rng_of, run_ramps, run_soak, settings
+from regime_scenes import SENSORS, Scene, known_signature_delays, read, temperatures
 
 from thermo_comp.thermal.regime import Regime
 
 SOAK_H = 5.0
 # ramps per scene, by the rate of the readings [Hz]: ten times the readings, ten times the work
 RAMPS = {10.0: 1, 1.0: 6, 0.1: 10}
-TUNING_H = 20.0
-
 
 Rows = list[list[str]]
-Matrix = list[tuple[Scene, dict[str, Outcome]]]
+Matrix = list[tuple[Scene, Outcome]]
 
 
 def quantiles(delays: list[float]) -> tuple[float, float]:
@@ -80,13 +65,13 @@ def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
     """Delays of the named ramp by sensor, and of the CUSUM that knows it."""
     n, hours = (6, 20.0) if is_quick else (200, 400.0)
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
-    jobs = [((scene,), n, 0.0, seed, rippled) for scene in scenes for rippled in (False, True)]
+    jobs = [(scene, n, seed, rippled) for scene in scenes for rippled in (False, True)]
     plain = [scene for scene in scenes if not scene.quantum]
     bounds = pool.starmap_async(
         known_signature_delays,
         [(each, settings(each).false_alarms_per_hour, hours, n, seed) for each in plain],
     )
-    found = [each[0] for each in pool.map(run_scenes, jobs, chunksize=1)]
+    found = pool.map(run_ramps, jobs, chunksize=1)
     bound_of = dict(zip(plain, bounds.get(), strict=True))
     rows = [
         [
@@ -101,8 +86,8 @@ def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
             'ramps',
         ]
     ]
-    for (scene, outcomes), job in zip(found, jobs, strict=True):
-        one, is_rippled = outcomes[OURS], job[4]
+    for (scene, one), job in zip(found, jobs, strict=True):
+        is_rippled = job[3]
         bound = ('', '') if is_rippled else bound_of.get(scene, ('', ''))
         rows.append(
             [
@@ -137,36 +122,31 @@ def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
 
 
 def run_matrix(
-    pool: Pool,
-    is_quick: bool,
-    seed: int,
-    rates: Sequence[float],
-    n_ramps: int | None,
-    hours: float,
+    pool: Pool, is_quick: bool, seed: int, rates: Sequence[float], n_ramps: int | None
 ) -> Matrix:
-    """All rules over all scenes; `hours` of soak tune the rivals, 0 leaves them out."""
+    """Run the detector over all scenes."""
     ramps = (0.1, 0.5, 3.0) if is_quick else (0.1, 0.2, 0.5, 1.0, 3.0)
     lags = (180.0, 900.0) if is_quick else (180.0, 900.0, 1200.0)
     jobs: list[Job] = [
         (
-            tuple(Scene(ramp, lag, noise, quantum, rate) for ramp in ramps),
+            Scene(ramp, lag, noise, quantum, rate),
             1 if is_quick else n_ramps or RAMPS[rate],
-            2.5 if is_quick else hours,
             seed,
             True,
         )
         for rate in rates
         for lag in lags
         for noise, quantum in SENSORS
+        for ramp in ramps
     ]
-    return [one for each in pool.map(run_scenes, jobs, chunksize=1) for one in each]
+    return pool.map(run_ramps, jobs, chunksize=1)
 
 
 def rate_table(matrix: Matrix) -> Rows:
-    """Count what ours made of the ramps, by the rate of the readings."""
+    """Count what the detector made of the ramps, by the rate of the readings."""
     rows = [['readings', 'ramps', 'missed', 'missed of >= 0.2 K/min', 'with a flip']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
-        mine = [(scene, each[OURS]) for scene, each in matrix if scene.rate_hz == rate]
+        mine = [(scene, one) for scene, one in matrix if scene.rate_hz == rate]
         rows.append(
             [
                 f'{rate:g} Hz',
@@ -179,61 +159,25 @@ def rate_table(matrix: Matrix) -> Rows:
     return rows
 
 
-def rule_table(matrix: Matrix) -> Rows:
-    """Missed ramps, flips and the flagged share, by rule."""
-    rows = [
-        [
-            'rule',
-            'ramps',
-            'missed of >= 0.2 K/min',
-            'with a flip',
-            'already dynamic',
-            'share flagged',
-        ]
-    ]
-    for name in matrix[0][1]:
-        every = [each[name] for _, each in matrix]
-        due = [each[name] for scene, each in matrix if scene.ramp_k_min >= 0.2]
-        count = sum(one.n for one in every)
-        flagged = sum(one.flagged * one.n for one in due) / sum(one.n for one in due)
-        rows.append(
-            [
-                f'`{name}`',
-                f'{count}',
-                f'{sum(one.missed for one in due)}',
-                f'{sum(one.flips for one in every)}',
-                f'{sum(one.early for one in every)}',
-                f'{flagged:.3f}',
-            ]
-        )
-    return rows
-
-
 def scene_table(matrix: Matrix, lag: float) -> Rows:
-    """Median delay and flagged share of each rule in each scene of one lag."""
-    names = list(matrix[0][1])
-    rows = [['sensor', 'Hz', 'K/min', *(f'`{name}`' for name in names)]]
-    for scene, each in matrix:
+    """Median delay and flagged share in each scene of one lag."""
+    rows = [['sensor', 'Hz', 'K/min', 'median, s', 'share flagged']]
+    for scene, one in matrix:
         if scene.lag_s == lag:
-            cells = [
-                f'{quantiles(each[name].delays)[0]:.0f} ({each[name].flagged:.2f})'
-                for name in names
-            ]
-            rows.append([scene.sensor, f'{scene.rate_hz:g}', f'{scene.ramp_k_min:g}', *cells])
+            delay, share = f'{quantiles(one.delays)[0]:.0f}', f'{one.flagged:.2f}'
+            row = [scene.sensor, f'{scene.rate_hz:g}', f'{scene.ramp_k_min:g}', delay, share]
+            rows.append(row)
     return rows
 
 
-def draw_rules(seed: int, folder: Path) -> None:
-    """Draw one ramp under every rule."""
+def draw_ramp(seed: int, folder: Path) -> None:
+    """Draw one ramp and the flag."""
     scene = Scene(0.5, 900.0, 0.01, 0.0, 1.0)
     rng = rng_of(seed, 11, scene)
     t = np.arange(-2700.0, 10800.0)
     case, board = temperatures(scene, t, 3600.0, rng)
-    readings = read(case, scene, rng)
-    flags = {OURS: ours(scene, readings, read(board, scene, rng)) == Regime.DYNAMIC}
-    for name, threshold in tuned(scene, TUNING_H, seed).items():
-        flags[name] = RIVALS[name](scene, readings) > threshold
-    plot_rules(t, case, board, flags, folder)
+    flag = ours(scene, read(case, scene, rng), read(board, scene, rng))
+    plot_ramp(t, case, board, flag == Regime.DYNAMIC, folder)
 
 
 Tables = Iterator[tuple[str, Rows]]
@@ -252,20 +196,15 @@ def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Run all rules over all scenes."""
-    n_ramps = arguments.ramps
-    hours = 0.0 if n_ramps else TUNING_H
+    """Run the detector over all scenes."""
     rates = arguments.rates or ((1.0, 0.1) if arguments.quick else tuple(RAMPS))
-    matrix = run_matrix(pool, arguments.quick, arguments.seed, rates, n_ramps, hours)
+    matrix = run_matrix(pool, arguments.quick, arguments.seed, rates, arguments.ramps)
     yield 'Ramps by rate of the readings', rate_table(matrix)
-    if n_ramps:
-        return
-    yield 'The matrix by rule', rule_table(matrix)
     for lag in sorted({scene.lag_s for scene, _ in matrix}):
-        title = 'Median onset delay in s (share of the ramp flagged), lag {:g} min'
+        title = 'Median onset delay, share of the ramp flagged: lag {:g} min'
         yield title.format(lag / 60.0), scene_table(matrix, lag)
     if arguments.figures:
-        draw_rules(arguments.seed, arguments.figures)
+        draw_ramp(arguments.seed, arguments.figures)
 
 
 def part_cost(_pool: Pool, _arguments: argparse.Namespace) -> Tables:
@@ -294,7 +233,7 @@ def main() -> None:
     parser.add_argument(
         '--rates', type=float, nargs='+', choices=RAMPS, help='matrix: readings, Hz'
     )
-    parser.add_argument('--ramps', type=int, help='matrix: so many per scene, of ours alone')
+    parser.add_argument('--ramps', type=int, help='matrix: number of ramps per scene')
     parser.add_argument('--figures', metavar='FOLDER', type=Path, help='draw there, too')
     parser.add_argument('--json', metavar='FILE', help='every table, machine-readable')
     arguments = parser.parse_args()

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the runs of benchmarks/regime.py: a detector or a rule over ramps and soaks, and its cost.
+Owns the runs of benchmarks/regime.py: the detector over ramps and soaks, and its cost.
 """
 
 from __future__ import annotations
@@ -12,22 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from regime_rules import BOARD_LAG_S, RIPPLE_C, RIVALS, Scene, read, temperatures
+from regime_scenes import BOARD_LAG_S, RIPPLE_C, Scene, read, temperatures
 
 from thermo_comp.thermal.regime import Regime, RegimeDetector
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.thermal.thermometer import Thermometer
 from thermo_comp.typing import Bools, Floats
 
-SEGMENT_H = 2.5
-OURS = 'ours'
-SETTLE_S = 1800.0
-Job = tuple[tuple[Scene, ...], int, float, int, bool]
+#: Scene, number of ramps, seed, whether the chamber ripples and the unit heats itself.
+Job = tuple[Scene, int, int, bool]
 
 
 @dataclass
 class Outcome:
-    """What a rule made of the ramps of one scene."""
+    """What the detector made of the ramps of one scene."""
 
     delays: list[float]
     missed: int
@@ -87,43 +85,20 @@ def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
     return outcome
 
 
-def tuned(scene: Scene, hours: float, seed: int) -> dict[str, float]:
-    """Threshold of each rival: the largest value of its statistic in some hours of soak."""
-    rng = rng_of(seed, 3, scene)
-    thresholds = dict.fromkeys(RIVALS if hours else (), 0.0)
-    for _ in range(round(hours / SEGMENT_H)):
-        t = np.arange(0.0, 3600.0 * SEGMENT_H, 1.0 / scene.rate_hz)
-        soak = read(temperatures(scene, t, 0.0, rng)[0], scene, rng)
-        for name in thresholds:
-            peak = RIVALS[name](scene, soak)[t > SETTLE_S].max()
-            thresholds[name] = max(thresholds[name], float(peak))
-    return thresholds
-
-
-def run_scenes(job: Job) -> list[tuple[Scene, dict[str, Outcome]]]:
-    """All rules over `n` ramps of each scene of one sensor, the rivals tuned on its soak first."""
-    scenes, n, hours, seed, is_rippled = job
-    thresholds = tuned(scenes[0], hours, seed)
-    return [(scene, run_ramps(scene, n, thresholds, seed, is_rippled)) for scene in scenes]
-
-
-def run_ramps(
-    scene: Scene, n: int, thresholds: dict[str, float], seed: int, is_rippled: bool
-) -> dict[str, Outcome]:
-    """Ours, and the rivals at their thresholds, over `n` ramps of one scene."""
+def run_ramps(job: Job) -> tuple[Scene, Outcome]:
+    """Run the shipped detector over ramps of one scene."""
+    scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
     # long enough for three edges of the coarsest sensor
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
     duration = min(max(edges_s, 2400.0), 7200.0)
     t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)
-    flags: dict[str, list[tuple[Floats, Bools]]] = {OURS: []}
+    flags: list[tuple[Floats, Bools]] = []
     for _ in range(n):
         case, board = temperatures(scene, t, duration, rng, RIPPLE_C if is_rippled else 0.0)
-        readings = read(case, scene, rng)
-        flags[OURS].append((t, ours(scene, readings, read(board, scene, rng)) == Regime.DYNAMIC))
-        for name, threshold in thresholds.items():
-            flags.setdefault(name, []).append((t, RIVALS[name](scene, readings) > threshold))
-    return {name: judge(each, duration) for name, each in flags.items()}
+        found = ours(scene, read(case, scene, rng), read(board, scene, rng))
+        flags.append((t, found == Regime.DYNAMIC))
+    return scene, judge(flags, duration)
 
 
 def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:

@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 from thermo_comp.quantities import QUANTITIES, Bounds
 from thermo_comp.ros.parameters import NodeConfig
+from thermo_comp.topics import INPUTS, OUTPUTS, STATUS
 from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.schema import fields_of, plain
 
@@ -98,13 +99,7 @@ stamps are carried through; the node never stamps with its own clock and needs n
 
 | direction | topic | type | QoS |
 |---|---|---|---|
-| in | `accel/counts` | geometry_msgs/Vector3Stamped, counts per cycle | best effort, keep last 2000 |
-| in, with `input:=imu` | `imu/uncompensated` | sensor_msgs/Imu, m/s^2; orientation and its covariance pass through, and so do angular rate and its covariance unless the calibration has a `gyroscope` | same |
-| in | `temperature/board`, `temperature/case`, and `temperature/<name>` for any more that the calibration names | sensor_msgs/Temperature, std_msgs/Float32 or Float64, or a field of any message, degC | best effort, keep last 50 |
-| out | `imu/data_raw` | sensor_msgs/Imu, specific force in m/s^2 | reliable |
-| out | `regime/dynamic` | std_msgs/Bool: S = 1; on every change and with every reading that decides: of the case, or of the board while there is no case; nothing while unknown | reliable, transient local |
-| out | `regime/stamped` | diagnostic_msgs/DiagnosticArray: the same flag with the stamp of the reading that decides; `status[0].message` is `dynamic` or `static` | reliable, transient local |
-| out | `/diagnostics` | diagnostic_msgs/DiagnosticArray, 1 Hz, hardware_id = serial | reliable |
+{topics}
 
 Each QoS policy can be overridden at start with the usual `qos_overrides./topic.subscription.reliability`
 parameters.
@@ -347,6 +342,17 @@ def _type(value: dict[str, Any]) -> str:
     return ' '.join([kind, *bounds])
 
 
+def topics_table() -> str:
+    """Write the node's topics as the rows of a Markdown table."""
+    directions = {'in': INPUTS.values(), 'out': (*OUTPUTS, STATUS)}
+    return '\n'.join(
+        f'| {direction} | `{one.name}` | {one.type.replace("/msg/", "/")}: {one.meaning} '
+        f'| {one.qos} |'
+        for direction, topics in directions.items()
+        for one in topics
+    )
+
+
 def parameters_table() -> str:
     """
     Write the node's parameters as a Markdown table.
@@ -378,7 +384,9 @@ def pages() -> dict[Path, str]:
         ROOT / 'config' / 'calibration.schema.json': json.dumps(calibration_schema(), indent=2)
         + '\n',
         ROOT / 'docs' / 'calibration_file.md': calibration_page(),
-        ROOT / 'docs' / 'ros_interface.md': INTERFACE.format(parameters=parameters_table()),
+        ROOT / 'docs' / 'ros_interface.md': INTERFACE.format(
+            topics=topics_table(), parameters=parameters_table()
+        ),
     }
 
 

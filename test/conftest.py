@@ -228,6 +228,29 @@ def cli(program: Cli) -> Cli:
     return run
 
 
+@pytest.fixture
+def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
+    """Mount a file system of 4 KiB, or as many as the test says."""
+    disk = tmp_path / 'disk'
+    disk.mkdir()
+    size = f'size={getattr(request, "param", 4)}k'
+    command = ['mount', '-t', 'tmpfs', '-o', size, 'none', str(disk)]
+    try:
+        mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
+    except FileNotFoundError:
+        mounted = False
+    if not mounted:
+        pytest.skip('a small file system can only be mounted by root')
+    yield disk
+    subprocess.run(['umount', str(disk)], check=True)
+
+
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make pages without what takes long: their figures, which test_report.py draws."""
+    monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: [])
+
+
 class Once(Protocol):
     """Make a folder once in a run of the tests, whichever worker asks for it first."""
 

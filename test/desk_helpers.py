@@ -96,14 +96,14 @@ class Desk:
             self._cli('export', self._make('unit42.yaml'), *to, '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
             # Short: some examples play it as slowly as it was recorded.
-            self._cli('simulate', '--profile', '20 2s', '-o', path, '-q')
+            self._cli('simulate', '--profile', '20 1s', '-o', path, '-q')
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
             self._cli('simulate', *program, '-o', path, '-q')
         elif name == 'unit42':
             from fleet_helpers import write_unit
 
-            write_unit(path, 42, 3)
+            write_unit(path, 42, 2)
         elif name == 'fleet':
             pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
             from fleet_helpers import write_unit

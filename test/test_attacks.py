@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import random
 import signal
 import subprocess
@@ -18,8 +17,6 @@ from typing import Any
 import numpy as np
 import pytest
 from builders import calibration
-from conftest import Cli
-from fleet_helpers import write_unit
 
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
@@ -197,42 +194,6 @@ def test_links_exchanged_under_the_folder_lead_nowhere_else(tmp_path: Path) -> N
     assert serials <= {'inside'}
     known = ('calibration_directory', 'No such file', 'Not a directory', 'Invalid argument')
     assert [one for one in refusals if not any(text in one for text in known)] == []
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    disk = tmp_path / 'disk'
-    disk.mkdir()
-    command = ['mount', '-t', 'tmpfs', '-o', 'size=64k', 'none', str(disk)]
-    if os.geteuid() or subprocess.run(command, check=False).returncode:
-        pytest.skip('a small file system can only be mounted by root')
-    yield disk
-    subprocess.run(['umount', str(disk)], check=True)
-
-
-def test_a_full_disk_under_convert_and_fleet(small_disk: Path, tmp_path: Path, cli: Cli) -> None:
-    table = tmp_path / 'log.csv'
-    samples = np.random.default_rng(3).normal((0.0, 0.0, 9.8), 0.1, (9000, 3))
-    rows = [f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(samples)]
-    table.write_text('\n'.join(['time_s,x,y,z,board', *rows]))
-    columns = tmp_path / 'columns.yaml'
-    columns.write_text(
-        'stamp: {rate_hz: 100.0, start_s: 1.0}\n'
-        'accel: {columns: [x, y, z], unit: m/s^2, output: imu}\n'
-        'board: {column: board, unit: degC}\n'
-    )
-    finished = cli('convert', table, '--columns', columns, '-o', small_disk / 'log', code=None)
-    assert finished.returncode == 1, finished.stderr
-    assert 'No space left on device' in finished.stderr
-    write_unit(tmp_path / 'fleet' / 'unit1', 1, 2)
-    options = ('--gravity', '9.80665', '--model', 'golovach', '--workers', '1')
-    options = (*options, '-o', small_disk / 'out')
-    (small_disk / 'filler').write_bytes(bytes(60_000))
-    finished = cli('fleet', 'fit', tmp_path / 'fleet', *options, code=None)
-    assert finished.returncode == 1, finished.stderr
-    assert 'Traceback' not in finished.stderr
-    assert 'No space left on device' in finished.stderr + finished.stdout
-    assert not list(small_disk.rglob('*.partial*'))
 
 
 SAVING = """

@@ -13,7 +13,7 @@ from builders import axis_set, calibration, regime_set, rich_calibration, term
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.errors import CalibrationError, OutputError
+from thermo_comp.errors import CalibrationError
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration import GroupEvidence, parameter_layout
 from thermo_comp.unit.calibration_file import (
@@ -21,7 +21,6 @@ from thermo_comp.unit.calibration_file import (
     dump_calibration,
     load_calibration,
     parse_calibration,
-    save_calibration,
 )
 from thermo_comp.unit.functions import CubicSpline, Exponential
 
@@ -234,13 +233,6 @@ def test_bytes_that_are_no_calibration(content, message):
     assert re.fullmatch(r'not valid YAML( \(line \d+\))?', told) if quotes else told == whole
 
 
-@given(st.binary(max_size=300))
-@settings(max_examples=200, deadline=None)
-def test_any_bytes_give_a_calibration_or_a_calibration_error(content):
-    with pytest.raises(CalibrationError):
-        parse_calibration(content)
-
-
 @given(st.data())
 @settings(max_examples=150, deadline=None)
 def test_any_damage_gives_a_calibration_or_a_calibration_error(data):
@@ -300,17 +292,6 @@ def test_functions_that_overflow_are_refused(old, new, key, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(text.replace(old, new, 1).encode())
     assert caught.value.key == key
-
-
-def test_write_replaces_as_a_whole_or_not_at_all(tmp_path):
-    path = tmp_path / 'unit.yaml'
-    save_calibration(calibration(), path)
-    assert load_calibration(path) == calibration()
-    save_calibration(RICH, path)
-    assert load_calibration(path) == RICH
-    assert [p.name for p in tmp_path.iterdir()] == ['unit.yaml']
-    with pytest.raises(OutputError, match=r'cannot be written: .* is no directory'):
-        save_calibration(calibration(), path / 'unit.yaml')
 
 
 def test_value_that_the_reader_would_refuse_is_not_written():

@@ -28,10 +28,13 @@ def test_end_to_end(tmp_path: Path, cli: Cli) -> None:
     said = cli('demo', cwd=tmp_path).stdout
     assert 'messages in 15407, messages out 15407' in said
     assert 'bit for bit: yes' in said
-    # What it says is what the page of the command line shows, and the README in part.
-    assert is_alike(said, shown()['demo'][1]), said
-    lines = said.splitlines()
-    assert [one for one in shown_of_demo() if not any(is_alike(line, one) for line in lines)] == []
+    # What it says is what the page of the command line shows, and the README in part; how fast it
+    # was is the machine's business.
+    speed = re.compile(r' in [\d.]+ s, \d+ times real time')
+    assert is_alike(speed.sub('', said), speed.sub('', shown()['demo'][1])), said
+    lines = speed.sub('', said).splitlines()
+    shown_lines = [speed.sub('', one) for one in shown_of_demo()]
+    assert [one for one in shown_lines if not any(is_alike(line, one) for line in lines)] == []
     out = tmp_path / 'out'
     topics = inspect_recording(out / 'out.mcap').topics
     (imu,) = (count for name, (_, count) in topics.items() if name.endswith('imu/data_raw'))

@@ -114,6 +114,10 @@ class TestUsage:
                 r'--reference-temperature: must be less than 1000, got 10000',
             ),
             (('convert', 'a.parquet', '-o', 'b'), r'--columns'),
+            (('export', 'a', '--to', 'ardupilot', '--device-id', '7', '-o', 'b'), r'is for PX4'),
+            (('export', 'a', '--to', 'imu_tk', '--up', '0', '0', '1', '-o', 'b'), r'--up is for'),
+            (('export', 'a', '--to', 'betaflight', '-o', 'b'), r'betaflight'),
+            (('report', '-o', 'b'), r'give bags, a calibration, or both'),
             (('fit', 'a.mcap', '-o', 'b', '--gravity', '9.8', '--rate-hz', '9'), r'for tables'),
         ],
         ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
@@ -150,31 +154,10 @@ class TestBags:
     def test_missing(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
         self.replayed(cli, unit, tmp_path / 'absent', r'absent: no such file or directory')
 
-    def test_no_bag(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
-        (tmp_path / 'notes.txt').write_text('hello')
-        self.replayed(cli, unit, tmp_path / 'notes.txt', r'not a bag: expected a directory, .mcap')
-        (tmp_path / 'folder').mkdir()
-        self.replayed(cli, unit, tmp_path / 'folder', r'the directory has no metadata.yaml')
-
     def test_garbage_in_a_bag_s_clothes(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
         for name in ('noise.mcap', 'noise.db3', 'noise.bag'):
             (tmp_path / name).write_bytes(b'\x89MCAP0\r\n' + bytes(range(256)) * 8)
             self.replayed(cli, unit, tmp_path / name, name)
-
-    def test_nothing_at_all_in_it(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
-        (tmp_path / 'nothing.mcap').write_bytes(b'')
-        self.replayed(cli, unit, tmp_path / 'nothing.mcap', r'nothing.mcap')
-
-    def test_no_messages(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
-        with BagWriter(tmp_path / 'empty'):
-            pass
-        self.replayed(cli, unit, tmp_path / 'empty', r'the bag holds no messages')
-
-    def test_missing_topic_says_what_there_is(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
-        path = bag(tmp_path / 'bag', counts=False)
-        self.replayed(
-            cli, unit, path, r'no such topic; the bag has .*/temperature/board.*--topic counts='
-        )
 
     def test_missing_board_temperature(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
         path = bag(tmp_path / 'bag', board=False)
@@ -192,39 +175,10 @@ class TestBags:
         said = cli('replay', path, '-c', unit, '-o', tmp_path / 'out').stdout
         assert '600 of 600 samples corrected' in said
 
-    def test_wrong_message_type(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
-        stamps = START_NS + np.arange(10)
-        with BagWriter(tmp_path / 'bag') as writer:
-            writer.write_temperature(TOPICS.counts, stamps, np.full(10, 20.0))
-            writer.write_temperature(TOPICS.board, stamps, np.full(10, 20.0))
-        self.replayed(
-            cli,
-            unit,
-            tmp_path / 'bag',
-            r'accel/counts: the topic has type sensor_msgs/msg/Temperature, expected '
-            r'geometry_msgs/msg/Vector3Stamped',
-        )
-
     def test_another_unit_s_bag(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
         path = bag(tmp_path / 'bag', serial='T-2')
         self.replayed(cli, unit, path, r'unit.serial: this calibration is of unit T-1.*of T-2')
         refused(cli, 1, r'is of unit T-1', 'evaluate', path, '-c', unit)
-
-    def test_existing_output(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
-        path = bag(tmp_path / 'bag')
-        (tmp_path / 'there').mkdir()
-        arguments = ('replay', path, '-c', unit, '-o', tmp_path / 'there')
-        refused(cli, 1, r'there: exists already; --force overwrites it', *arguments)
-        (tmp_path / 'there' / 'thesis.tex').write_text('years of work')
-        # Not even --force replaces what is no bag.
-        refused(cli, 1, r'thesis.tex, which belongs to no bag', *arguments, '--force')
-        assert (tmp_path / 'there' / 'thesis.tex').exists()
-
-    def test_output_that_cannot_be_written(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
-        path = bag(tmp_path / 'bag')
-        (tmp_path / 'file').write_text('')
-        out = tmp_path / 'file' / 'out'
-        refused(cli, 1, r'cannot be written', 'replay', path, '-c', unit, '-o', out)
 
 
 class TestCalibrations:
@@ -240,17 +194,6 @@ class TestCalibrations:
         text = re.sub(r'bias: 5\.0', 'bias: .nan', unit.read_text(), count=1)
         assert '.nan' in text
         self.used(cli, tmp_path, text, r'bad.yaml: axes.x.bias: ')
-
-    def test_missing_key(self, cli: Cli, tmp_path: Path, unit: Path) -> None:
-        text = unit.read_text().replace('gravity_m_s2', 'gravity')
-        self.used(cli, tmp_path, text, r'gravity')
-
-    def test_no_yaml(self, cli: Cli, tmp_path: Path) -> None:
-        self.used(cli, tmp_path, '{', r'not valid YAML')
-
-    def test_a_newer_format(self, cli: Cli, tmp_path: Path, unit: Path) -> None:
-        text = unit.read_text().replace('format_version: 2', 'format_version: 3')
-        self.used(cli, tmp_path, text, r'format_version: .*newer')
 
     def test_missing_file(self, cli: Cli, tmp_path: Path) -> None:
         recorded = bag(tmp_path / 'bag')
@@ -325,6 +268,7 @@ class TestEvaluations:
         refused(cli, 1, r'no window of 60 s at rest', 'evaluate', tmp_path / 'bag', '-c', unit)
 
 
+@pytest.mark.usefixtures('no_figures')
 def test_a_torn_bag_is_worked_through_and_the_exit_code_tells(
     cli: Cli, unit: Path, tmp_path: Path
 ) -> None:

@@ -259,14 +259,6 @@ def test_a_log_of_1_hz_says_what_it_is_good_for(tmp_path, rng, cli):
     assert 'sensor_accel at 10 Hz' in said
 
 
-def test_absent_instances_are_named(flight):
-    path, _ = flight
-    with pytest.raises(RecordingError, match='no IMU 2; there are: 0, 1'):
-        read_autopilot(path, imu=2)
-    with pytest.raises(RecordingError, match='no barometer 1; there are: 0'):
-        read_autopilot(path, baro=1)
-
-
 def test_log_without_an_accelerometer(tmp_path):
     log = UlogWriter(BARO)
     log.data(log.subscribe('sensor_baro', 0), struct.pack('<QQIffI', 1, 1, 9, 1e5, 20.0, 0))

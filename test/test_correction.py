@@ -111,7 +111,7 @@ def assert_same(blocks, rows):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(40, 900))
-@settings(max_examples=4, deadline=None, phases=[Phase.generate])
+@settings(max_examples=3, deadline=None, phases=[Phase.generate])
 def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)

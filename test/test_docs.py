@@ -23,7 +23,7 @@ from desk_helpers import Desk
 from matplotlib import pyplot as plt
 from readme_helpers import is_alike
 
-pytestmark = pytest.mark.usefixtures('equal_fits_once')
+pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'

@@ -12,22 +12,23 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from builders import calibration
 from conftest import ROOT, Cli
+from fleet_helpers import write_unit
 
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
-FIT = [*sorted((ROOT / 'bags' / 'fit').glob('*.mcap'))]
+#: Two bags that are fitted in half a second, in the working folder as is the calibration.
+FIT = ('bags/01.mcap', 'bags/02.mcap')
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
 GRAVITY = ('--gravity', '9.80665', '--model', 'golovach')
-#: Arguments before and behind the output; the calibration is `unit.yaml` in the working folder.
+#: Arguments before and behind the output.
 COMMANDS = {
     'unit.yaml': (('fit', *FIT, *GRAVITY, '-f', '-o'), ()),
     'page.html': (('report', '-c', 'unit.yaml', '-f', '-o'), ()),
@@ -37,25 +38,9 @@ COMMANDS = {
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
-    """Return a file system of 4 KiB, or as many as the test says."""
-    disk = tmp_path / 'disk'
-    disk.mkdir()
-    size = f'size={getattr(request, "param", 4)}k'
-    command = ['mount', '-t', 'tmpfs', '-o', size, 'none', str(disk)]
-    try:
-        mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
-    except FileNotFoundError:
-        mounted = False
-    if not mounted:
-        pytest.skip('a small file system can only be mounted by root')
-    yield disk
-    subprocess.run(['umount', str(disk)], check=True)
-
-
-@pytest.fixture
 def folder(tmp_path: Path) -> Path:
     save_calibration(calibration(), tmp_path / 'unit.yaml')
+    write_unit(tmp_path / 'bags', 1, 2)
     return tmp_path
 
 
@@ -201,15 +186,16 @@ def rewritten(torn: Path, whole: Path) -> None:
 
 def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder: Path, cli: Cli) -> None:
     torn, whole = folder / 'torn.mcap', folder / 'whole.mcap'
-    torn.write_bytes(FIT[0].read_bytes()[:400_000])
+    content = (folder / FIT[0]).read_bytes()
+    torn.write_bytes(content[: len(content) // 2])
     rewritten(torn, whole)
     results = []
     for bag, code in ((torn, 1), (whole, 0)):
         output = folder / f'{bag.stem}.yaml'
-        finished = cli('fit', bag, *FIT[1:], *GRAVITY, '-o', output, code=code)
+        finished = cli('fit', bag, FIT[1], *GRAVITY, '-o', output, code=code, cwd=folder)
         results.append((finished.stderr, load_calibration(output)))
     (said, from_torn), (nothing, from_whole) = results
-    assert 'torn.mcap: the file is cut off at byte 400000: ' in said
+    assert f'torn.mcap: the file is cut off at byte {len(content) // 2}: ' in said
     assert 'torn.mcap' not in nothing
     assert 'Traceback' not in said
     for name in ('axes', 'misalignment', 'static', 'dynamic'):
@@ -218,7 +204,7 @@ def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder: Path, cli: Cli) -> 
 
 def test_a_fit_of_a_bag_that_holds_nothing_any_more(folder: Path, cli: Cli) -> None:
     torn = folder / 'torn.mcap'
-    torn.write_bytes(FIT[0].read_bytes()[:2000])
-    finished = cli('fit', torn, *FIT[1:], *GRAVITY, '-o', folder / 'new.yaml', code=1)
+    torn.write_bytes((folder / FIT[0]).read_bytes()[:2000])
+    finished = cli('fit', torn, FIT[1], *GRAVITY, '-o', 'new.yaml', code=1, cwd=folder)
     assert 'torn.mcap: ' in finished.stderr
     assert 'Traceback' not in finished.stderr

@@ -23,7 +23,7 @@ from conftest import ROOT
 from fleet_helpers import OPTIONS, damage, write_unit
 
 from thermo_comp.cli.app import run as run_command
-from thermo_comp.errors import ThermoCompError
+from thermo_comp.errors import OutputError, ThermoCompError
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet.run import Results, fit_fleet
 from thermo_comp.fleet.table import COLUMNS, Row, read_parquet
@@ -157,6 +157,14 @@ def test_bags_that_cannot_be_read_any_more_take_no_result_away(
     third = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, client=client)
     assert third.n_done == 0
     assert third.rows == first.rows
+
+
+@pytest.mark.parametrize('small_disk', [8], indirect=True)
+def test_a_full_disk_is_one_clear_error(client: Any, small_disk: Path, tmp_path: Path) -> None:
+    write_unit(tmp_path / 'bags' / 'unit', 1, 1)
+    with pytest.raises(OutputError, match='No space left on device'):
+        fit_fleet(str(tmp_path / 'bags'), small_disk / 'out', OPTIONS, client=client)
+    assert not list(small_disk.rglob('*.partial*'))
 
 
 def test_an_interrupted_run_goes_on_where_it_was(client: Any, tmp_path: Path) -> None:

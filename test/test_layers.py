@@ -23,6 +23,7 @@ LAYERS = {
     'files': 0,
     'plain_yaml': 0,
     'quantities': 0,
+    'topics': 0,
     'thermal': 1,
     'unit': 1,
     'online': 2,

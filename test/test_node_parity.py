@@ -18,12 +18,12 @@ from builders import rich_calibration
 from rosbags.highlevel import AnyReader
 
 from thermo_comp.cli.demo import through_the_node
-from thermo_comp.online.status import STAMPED_TOPIC
 from thermo_comp.recording.blocks import Block, ImuColumns
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
-from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, replay
+from thermo_comp.replay import replay
+from thermo_comp.topics import IMU_OUT, REGIME, STAMPED
 from thermo_comp.unit.calibration import Calibration, Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
@@ -84,14 +84,14 @@ def thermal_test(path: Path, imu: bool = False, has_case: bool = True) -> int:
 def output_of(path: Path) -> tuple[Block, list[bool], list[bytes]]:
     """Read a corrected bag; the flags, and the stamped ones as bytes, by a library not ours."""
     with AnyReader([path]) as reader:
-        wanted = [c for c in reader.connections if c.topic.endswith(REGIME_TOPIC)]
+        wanted = [c for c in reader.connections if c.topic.endswith(REGIME.name)]
         flags = [
             bool(reader.deserialize(data, connection.msgtype).data)
             for connection, _, data in reader.messages(wanted)
         ]
-        wanted = [c for c in reader.connections if c.topic.endswith(STAMPED_TOPIC)]
+        wanted = [c for c in reader.connections if c.topic.endswith(STAMPED.name)]
         stamped = [bytes(data) for _, _, data in reader.messages(wanted)]
-    topics = Topics(imu=OUTPUT_TOPIC, input='imu')
+    topics = Topics(imu=IMU_OUT.name, input='imu')
     return read_recording(path, topics, require=('accel',)).columns, flags, stamped
 
 

@@ -29,12 +29,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures('no_figures')
 @pytest.mark.parametrize('options', [(), ('--tolerance', '1ug', '--window', '120')])
-def test_evaluate_and_report_agree(
-    cli, folder: Path, options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_evaluate_and_report_agree(cli, folder: Path, options: tuple[str, ...]) -> None:
     # WHY: of one bag and one calibration one said "re-calibrate", the other "holds".
-    monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: [])  # what takes long
     page = folder / f'page{len(options)}.html'
     given = (folder / 'held_out.mcap', '-c', folder / 'unit.yaml', *options, '--json')
     one = cli('evaluate', *given, code=None)

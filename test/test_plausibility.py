@@ -201,8 +201,13 @@ def in_its_chamber(preset, sensor):
     return sorted(readings)
 
 
-@pytest.mark.parametrize('preset', ['thermostatted', 'bare-quartz', 'mems'])
-@pytest.mark.parametrize('sensor', SENSORS)
+@pytest.mark.parametrize(
+    ('preset', 'sensor'),
+    [
+        *(('thermostatted', sensor) for sensor in SENSORS),
+        *((preset, 'sixteenths') for preset in ('bare-quartz', 'mems')),
+    ],
+)
 def test_a_unit_in_its_chamber_is_never_doubted(preset, sensor):
     tracker = tracker_of(sensor)
     for stamp_ns, is_case, celsius in in_its_chamber(preset, sensor):

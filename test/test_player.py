@@ -38,6 +38,7 @@ from thermo_comp.ros import player
 from thermo_comp.ros.listener import Recorder
 from thermo_comp.ros.player import opened_player, play
 from thermo_comp.ros.waitloop import wait_until
+from thermo_comp.topics import IMU
 
 WINDOW = player.WINDOW['accel']
 
@@ -307,13 +308,13 @@ def test_record_ends_when_told_or_when_nothing_comes(peer: Peer, tmp_path: Path)
 
     thread = threading.Thread(target=flood, daemon=True)
     thread.start()
-    topics = {'imu/data_raw': Imu}
+    topics = {'imu/data_raw': IMU}
     path = tmp_path / 'out.mcap'
     with Recorder(path, topics=topics) as recorder:
         assert wait_until(lambda: recorder.counts['imu/data_raw'] >= 20, TIMEOUT)
     stop.set()
     thread.join(TIMEOUT)
-    with Recorder(tmp_path / 'no.mcap', topics={'nobody/is/there': Imu}) as recorder:
+    with Recorder(tmp_path / 'no.mcap', topics={'nobody/is/there': IMU}) as recorder:
         assert not wait_until(lambda: False, 0.2)
         assert recorder.counts == {'nobody/is/there': 0}
     with pytest.raises(OutputError, match=r'out.mcap'), Recorder(path, topics=topics):
@@ -329,7 +330,7 @@ def test_a_recorder_says_that_the_disk_is_full(
     monkeypatch.setattr(BagWriter, 'write_raw', full)
 
     def run() -> None:
-        with Recorder(tmp_path / 'out', topics={'imu/data_raw': Imu}) as recorder:
+        with Recorder(tmp_path / 'out', topics={'imu/data_raw': IMU}) as recorder:
             imu = peer.publisher(Imu, 'imu/data_raw')
             assert wait_until(lambda: recorder.has_publishers, TIMEOUT)
             imu.publish(Imu())

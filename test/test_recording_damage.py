@@ -187,7 +187,7 @@ def test_a_torn_directory_says_which_file(tmp_path: Path) -> None:
     assert 'no message is' in str(info.truncated)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     data=st.data(),
     compression=st.sampled_from(['none', 'lz4', 'zstd', 'unchunked']),
@@ -212,7 +212,7 @@ def test_changed_bytes_are_an_error_or_harmless(
             assert len(found.columns) <= 24
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(content=st.binary(max_size=300), has_magic=st.booleans())
 def test_any_bytes_are_an_error_or_an_empty_bag(content: bytes, has_magic: bool) -> None:
     magic = b'\x89MCAP0\r\n' + b'\x01' + struct.pack('<Q', 8) + bytes(8)
@@ -319,28 +319,6 @@ def test_small_records_are_small(tmp_path: Path) -> None:
     path.write_bytes(whole_file(struct.pack('<BQ', Opcode.SCHEMA, len(large)) + large))
     with pytest.raises(RecordingError, match=f'has {len(large)} bytes'):
         read(path)
-
-
-def test_a_wrong_message_index_is_only_a_hint(tmp_path: Path) -> None:
-    """
-    WHY: offsets of a damaged index can point into a payload that looks like a record.
-    PROMISE: the records themselves decide, whatever the index says.
-    """
-    messages = regular_messages(24)
-    path = tmp_path / 'bag.mcap'
-    content, position, length = small_bag('none')
-    index_at = position + length
-    assert content[index_at] == Opcode.MESSAGE_INDEX
-    first_row = index_at + 9 + 2 + 4
-    for offset in (0, 1, 7, 80, 10_000, 1 << 62, (1 << 64) - 1):
-        changed = bytearray(content)
-        struct.pack_into('<Q', changed, first_row + 8, offset)
-        path.write_bytes(changed)
-        assert_columns(read(path).columns, messages)
-    changed = bytearray(content)
-    struct.pack_into('<I', changed, index_at + 11, 3)  # a length that is no multiple of a row
-    path.write_bytes(changed)
-    assert_columns(read(path).columns, messages)
 
 
 def test_false_times_of_a_chunk_are_found(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from recording_helpers import (
     BOARD,
     CASE,
     IMU_IN,
-    assert_columns,
     regular_messages,
     write_mcap,
     write_rosbag2,
@@ -33,17 +32,6 @@ from thermo_comp.recording.reader import inspect_recording, open_recording, read
 def whole(folder: Path, storage: str = 'mcap', compression: str = '') -> Path:
     write_rosbag2(folder / 'bag', regular_messages(400), storage=storage, compression=compression)
     return folder / 'bag'
-
-
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-@pytest.mark.parametrize('compression', ['', 'FILE', 'MESSAGE'])
-def test_every_storage_gives_the_same_messages(
-    tmp_path: Path, storage: str, compression: str
-) -> None:
-    recording = read_recording(whole(tmp_path, storage, compression))
-    assert_columns(recording.columns, regular_messages(400))
-    assert recording.info.truncated is None
-    assert recording.info.storage == storage
 
 
 def test_rows_deleted_from_a_database_are_missed(tmp_path: Path, cli: Cli) -> None:

@@ -75,7 +75,7 @@ def read(path: Path) -> Recording:
     return read_recording(path, require=())
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     messages=bags(),
     chunk_size=st.sampled_from([1, 150, 400, 1000, 5000, 1 << 20]),

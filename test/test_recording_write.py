@@ -22,15 +22,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from recording_helpers import START_NS, read_with_rosbags, typestore
+from recording_helpers import START_NS, typestore
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader as Reader2
 
 from thermo_comp.errors import OutputError, RecordingError
-from thermo_comp.online.status import STAMPED_TYPE, stamped_flag
 from thermo_comp.recording.blocks import ImuColumns
 from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.writer import BagWriter
+from thermo_comp.topics import FLAGS, STAMPED
 
 STEP_NS = 2_500_000
 REQUIRED: tuple[()] = ()
@@ -40,7 +40,7 @@ def imu_columns(rng: np.random.Generator, n: int) -> ImuColumns:
     return ImuColumns(*(rng.normal(size=(n, width)) for width in (4, 9, 3, 9, 9)))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     counts=st.lists(st.integers(0, 60), min_size=1, max_size=4),
     frame_id=st.text(max_size=20).filter(lambda text: '\0' not in text),
@@ -200,16 +200,6 @@ def test_a_bare_file_names_itself(tmp_path: Path) -> None:
     assert content['relative_file_paths'] == [content['files'][0]['path']] == ['bag.mcap']
 
 
-def test_an_imu_without_gyro_claims_none(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / 'bag.mcap') as bag:
-        bag.write_imu('imu/data_raw', [START_NS], [[1.0, 2.0, 3.0]], np.eye(3).ravel(), 'link')
-    ((_, log_ns, message),) = read_with_rosbags(tmp_path / 'bag.mcap')
-    assert log_ns == START_NS
-    assert message.orientation_covariance[0] == message.angular_velocity_covariance[0] == -1.0
-    assert message.orientation.w == 1.0
-    assert message.linear_acceleration_covariance.tolist() == np.eye(3).ravel().tolist()
-
-
 def test_own_definition_of_a_raw_message(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag.mcap') as bag:
         with pytest.raises(RecordingError, match='/x: the definition of message type a/msg/B is'):
@@ -222,22 +212,6 @@ def test_own_definition_of_a_raw_message(tmp_path: Path) -> None:
         assert reader.deserialize(data, connection.msgtype).data == 7
     with open_recording(tmp_path / 'bag.mcap', require=()) as ours:
         assert ours.definitions['a/msg/B'] == ('ros2msg', 'uint8 data\n')
-
-
-def test_inputs_can_be_copied_beside_the_outputs(tmp_path: Path) -> None:
-    small(tmp_path / 'in')
-    with (
-        open_recording(tmp_path / 'in', require=('accel',)) as reader,
-        BagWriter(tmp_path / 'out') as bag,
-    ):
-        for block in reader.blocks(raw=True):
-            for role, raw in block.raw.items():
-                name = reader.topics[role]
-                kind, _ = reader.info.topics[name]
-                bag.write_raw(name, kind, raw.log_ns, raw, reader.definitions[kind])
-    found, given = (read_with_rosbags(tmp_path / name) for name in ('out', 'in'))
-    assert [entry[:2] for entry in found] == [entry[:2] for entry in given]
-    assert [entry[2].vector for entry in found] == [entry[2].vector for entry in given]
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
@@ -274,15 +248,12 @@ def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path: Path) -
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match='is not replaced: it is a file'):
         BagWriter(tmp_path / 'file', overwrite=True)
-    (tmp_path / 'folder.mcap').mkdir()
-    with pytest.raises(OutputError, match='is not replaced: it is a folder'):
-        BagWriter(tmp_path / 'folder.mcap', overwrite=True)
-
-
-def test_a_folder_of_bags_is_no_bag(tmp_path: Path) -> None:
     small(tmp_path / 'fit' / '01.mcap', 1.0)
     with pytest.raises(OutputError, match=r'is not replaced: it has no metadata\.yaml'):
         BagWriter(tmp_path / 'fit', overwrite=True)
+    (tmp_path / 'folder.mcap').mkdir()
+    with pytest.raises(OutputError, match='is not replaced: it is a folder'):
+        BagWriter(tmp_path / 'folder.mcap', overwrite=True)
 
 
 @contextmanager
@@ -403,7 +374,7 @@ def test_regime_topics_are_offered_as_the_node_offers_them(tmp_path: Path, name:
     with BagWriter(tmp_path / name) as bag:
         bag.write_bool('imu0/regime/dynamic', [1], [True])
         for topic in ('imu0/regime/stamped', '/diagnostics'):
-            bag.write_raw(topic, STAMPED_TYPE, [1], [stamped_flag(1, True, 'T-1')])
+            bag.write_raw(topic, STAMPED.type, [1], [FLAGS[STAMPED](1, True, 'T-1')])
     path = tmp_path / name / 'bag_0.mcap' if name == 'bag' else tmp_path / name
     with path.open('rb') as file:
         channels = make_reader(file).get_summary().channels.values()

@@ -4,7 +4,7 @@
 The detector: early, quiet, never blind, in small; the long runs are in benchmarks/regime.py.
 
 All runs are seeded. A limit on a median of n delays holds with the benchmark's spread: the median
-of 24 scatters by about 0.3 of the delays' sd, 1 s at 1 mK and 3 s with coarse steps.
+of 24 scatters by about 0.3 of the delays' sd, 1 s at 1 mK; of 12 with coarse steps by 4 s.
 """
 
 import math
@@ -67,7 +67,7 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
 def headline():
     """Run the ramp that the requirement names: 0.5 K/min behind 15 min, 1 Hz, after a soak."""
     return {
-        name: onsets(*sensor, 0.5, LAG_S, 24, end_s=300.0, soak_s=2700.0)
+        name: onsets(*sensor, 0.5, LAG_S, 12 if sensor[1] else 24, end_s=300.0, soak_s=2700.0)
         for name, sensor in SENSORS.items()
     }
 
@@ -78,15 +78,15 @@ def headline():
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
         # Two edges must be crossed: with the second between 62.5 and 125 mK from the start the
-        # median cannot be below the time the case takes to move 94 mK, 146 s; of 24 runs it
-        # scatters by 4 s.
+        # median cannot be below the time the case takes to move 94 mK, 146 s; of 12 runs it
+        # scatters by 6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
 )
 def test_onset_is_early(headline, sensor, median_s, late_s):
     found, n_static = headline[sensor]
-    assert n_static == 24
+    assert n_static == len(found)
     assert all(len(each) == 1 and each[0][1] == DYNAMIC for each in found)
     delays = [each[0][0] for each in found]
     assert np.median(delays) <= median_s
@@ -135,7 +135,7 @@ def test_direction_is_that_of_the_ramp(headline, direction_of):
     ],
 )
 def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt, end_s):
-    found, _ = onsets(noise, quantum, rate_k_min, lag, 4, dt=dt, end_s=end_s, soak_s=2700.0)
+    found, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 4, dt=dt, end_s=end_s)
     for each in found:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
         # the slowest: 1 K steps in a ramp of 0.2 K/min, two edges 5 min apart behind 15 min

@@ -25,7 +25,8 @@ from thermo_comp.recording.blocks import Block, ImuColumns
 from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
-from thermo_comp.replay import OUTPUT_TOPIC, REGIME_TOPIC, ReplayResult, replay, switches
+from thermo_comp.replay import ReplayResult, replay, switches
+from thermo_comp.topics import IMU_OUT, REGIME
 from thermo_comp.unit.calibration import Axes, AxisReference, Calibration, Unit
 
 TOPICS = Topics()
@@ -106,7 +107,7 @@ def output_of(path: Path) -> tuple[Block, list[tuple[int, bool]]]:
     """Read a corrected bag through a library that is not ours."""
     flags, stamped = [], []
     with AnyReader([path]) as reader:
-        wanted = [c for c in reader.connections if c.topic == '/' + REGIME_TOPIC]
+        wanted = [c for c in reader.connections if c.topic == '/' + REGIME.name]
         for connection, log_ns, data in reader.messages(wanted) if wanted else ():
             flags.append((log_ns, bool(reader.deserialize(data, connection.msgtype).data)))
         wanted = [c for c in reader.connections if c.topic == '/regime/stamped']
@@ -120,7 +121,7 @@ def output_of(path: Path) -> tuple[Block, list[tuple[int, bool]]]:
             assert stamp.sec * 10**9 + stamp.nanosec == log_ns
             stamped.append((log_ns, status.message == 'dynamic'))
     assert stamped == flags
-    topics = Topics(imu=OUTPUT_TOPIC, input='imu')
+    topics = Topics(imu=IMU_OUT.name, input='imu')
     return read_recording(path, topics, require=('accel',)).columns, flags
 
 
@@ -368,7 +369,7 @@ def test_every_topic_is_copied(tmp_path: Path, storage: str) -> None:
         definition = ('ros2msg', 'string data')
         writer.write_raw('odd', 'odd_msgs/msg/Odd', stamps, messages, definition)
         writer.write_bool('gps/ok', stamps, np.arange(len(stamps)) % 2)
-        writer.write_bool(OUTPUT_TOPIC, stamps, np.zeros(len(stamps)))
+        writer.write_bool(IMU_OUT.name, stamps, np.zeros(len(stamps)))
     bag = mcap
     if storage == 'sqlite3':
         bag = tmp_path / 'sqlite'
@@ -395,7 +396,7 @@ def test_every_topic_is_copied(tmp_path: Path, storage: str) -> None:
                 for one in (found, given)
             ]
             assert each[0] == each[1], topic
-        (output,) = (one for one in found.connections if one.topic == f'/{OUTPUT_TOPIC}')
+        (output,) = (one for one in found.connections if one.topic == f'/{IMU_OUT.name}')
         assert output.msgtype == 'sensor_msgs/msg/Imu'
         times = [stamp for _, stamp, _ in found.messages()]
         assert times == sorted(times)

@@ -275,8 +275,8 @@ def test_simulated_bags_mark_every_page(tmp_path):
     assert 'class="simulated"' not in render_report(evidence_of_bags([], calibration), figures=[])
 
 
-def test_command_takes_the_statements(cli, tmp_path, monkeypatch):
-    monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: [])  # what takes long
+@pytest.mark.usefixtures('no_figures')
+def test_command_takes_the_statements(cli, tmp_path):
     save_calibration(fitted().calibration, tmp_path / 'unit.yaml')
     given = ('-c', tmp_path / 'unit.yaml', '-o', tmp_path / 'page.html', '--certificate-info')
     cli('report', *given, lab(tmp_path))

@@ -12,7 +12,6 @@ from builders import calibration
 from conftest import ROOT
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.plain_yaml import PlainYamlError, load_plain_yaml
 from thermo_comp.recording.reader import inspect_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration import Unit
@@ -90,24 +89,3 @@ def test_metadata_of_a_bag_leads_nowhere_else(tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match=r'secret\.mcap of the bag is missing'):
             inspect_recording(bag)
         metadata.write_text(metadata.read_text().replace(f'- {elsewhere}', f'- {name}', 1))
-
-
-@pytest.mark.parametrize(
-    ('text', 'message'),
-    [
-        ('a: &x 1\nb: *x', 'aliases'),
-        ('[' * 60 + ']' * 60, 'nested deeper than 12'),
-        ('a: !!python/object/apply:os.system [ls]', r'YAML tags are not accepted \(line 1\)'),
-        ('a: [', 'expected the node content|did not find'),
-    ],
-)
-def test_yaml_of_strangers(text: str, message: str) -> None:
-    with pytest.raises(PlainYamlError, match=message):
-        load_plain_yaml(text)
-
-
-def test_plain_yaml_is_read() -> None:
-    assert load_plain_yaml('a: [1, 2.5, x]\nb: {c: null}') == {
-        'a': [1, 2.5, 'x'],
-        'b': {'c': None},
-    }

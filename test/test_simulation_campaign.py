@@ -69,15 +69,6 @@ def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
         assert vector == pytest.approx(1.12, abs=0.07)
 
 
-@pytest.mark.parametrize('kind', TRIAD_NAMES)
-def test_units_of_a_kind_differ(kind: str) -> None:
-    one, other = (unit_preset(kind, seed) for seed in (1, 2))
-    assert one == unit_preset(kind, 1)
-    assert one.network.capacity != other.network.capacity
-    assert one.scale_factor != other.scale_factor
-    assert all(abs(K / 335.0 - 1.0) < 0.02 for K in one.scale_factor)
-
-
 def test_siblings_are_near_and_not_the_same() -> None:
     unit = unit_preset('between', 1)
     first, again, second = (unit.sibling(seed) for seed in (1, 1, 2))

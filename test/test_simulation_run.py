@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import welch
-from simulation_helpers import ideal_regime, noiseless, of_part, rippled
+from simulation_helpers import noiseless, of_part, rippled
 
 from thermo_comp.simulation.campaign import Cyclogram, parse_cyclogram, positions
 from thermo_comp.simulation.drift import PartEffect
@@ -198,15 +198,6 @@ def test_thermometers_have_their_rate_and_noise(unit: UnitModel, rate_hz: float)
     assert error.std() == pytest.approx(0.005, rel=0.16)
 
 
-def test_chamber_ripple_stays_within_its_amplitude() -> None:
-    chamber, grid_s = rippled(DEMO, period=240.0), np.arange(DEMO.duration_s)
-    air, smooth = (np.interp(grid_s, one.time_s, one.temperature_c) for one in (chamber, DEMO))
-    deviation = air - smooth
-    assert np.abs(deviation).max() <= 0.1 + 1e-9
-    # A sine's deviation is its amplitude over root two; the lines and the wander take a little.
-    assert deviation.std() == pytest.approx(0.1 / np.sqrt(2.0), rel=0.1)
-
-
 @pytest.mark.parametrize(
     ('n', 'least'), [(6, 0.0), (9, 0.4), (12, 0.6), (18, 0.7), (24, 0.8), (26, 1.2), (40, 2.0)]
 )
@@ -223,15 +214,6 @@ def test_positions_tell_the_nine_terms_apart(n: int, least: float) -> None:
     assert weakest > least if least else abs(weakest) < 1e-9
     assert np.any(up != positions(n, 6))
     assert np.abs(up.sum(axis=0)).max() < 0.1 * n
-
-
-def test_ideal_regime_is_the_heat_flow_into_the_board(unit: UnitModel) -> None:
-    run = simulate(unit, SHORT, UP, rate_hz=1.0)
-    flag = ideal_regime(run)
-    assert not flag[:240].any()
-    # A minute after the ramp began the board moves; five minutes after its end it still does.
-    assert flag[310:].all()
-    assert not ideal_regime(run, threshold_k_min=2.0).any()
 
 
 def test_run_refuses_what_cannot_be(unit: UnitModel) -> None:

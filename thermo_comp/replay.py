@@ -27,16 +27,15 @@ from .errors import CalibrationError, OutputError
 from .files import shown_name
 from .online.batch import CompensatedBlock, process_block
 from .online.compensator import HELD, SWAPPED, Compensator
-from .online.status import STAMPED_TOPIC, STAMPED_TYPE, CompensatorConfig, Counters, stamped_flag
+from .online.status import CompensatorConfig, Counters
 from .recording.blocks import Block, ImuColumns, Messages, RecordingInfo, Role
 from .recording.reader import RecordingReader, open_recording
-from .recording.topics import TEMPERATURE, Topics
+from .recording.topics import Topics
 from .recording.writer import TABLES, BagWriter, WriteRows, table_writer
+from .topics import FLAGS, IMU_OUT, OUTPUTS, TEMPERATURE, thermometer
 from .typing import Ints
 from .unit.calibration import Calibration
 
-OUTPUT_TOPIC = 'imu/data_raw'
-REGIME_TOPIC = 'regime/dynamic'
 # Readings between these quantiles are no glitches; thermometers have this noise [K].
 _BULK, _NOISE_K = (0.01, 0.99), 0.1
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
@@ -169,7 +168,7 @@ def _messages_of(
 ) -> Iterator[WriteBlock]:
     """Write blocks as the node's messages, and beside them what was recorded until then."""
     with bag as writer:
-        taken = {OUTPUT_TOPIC, REGIME_TOPIC, STAMPED_TOPIC}
+        taken = {topic.name for topic in OUTPUTS}
         taken |= {reader.topics[one].strip('/') for one in reader.topics.keys() - reader.fields}
         others = {topic for topic in reader.info.topics if topic.strip('/') not in taken}
         following = reader.raw(others if all_topics else ())
@@ -188,7 +187,7 @@ def _messages_of(
         def write(block: Block, corrected: CompensatedBlock, new: list[tuple[int, bool]]) -> None:
             if len(corrected.stamp_ns):
                 writer.write_imu(
-                    OUTPUT_TOPIC,
+                    IMU_OUT.name,
                     corrected.stamp_ns,
                     corrected.specific_force,
                     corrected.covariance,
@@ -196,16 +195,15 @@ def _messages_of(
                     imu=_imu_of(block, corrected),
                 )
             if new:
-                stamps, values = zip(*new, strict=True)
-                times = np.array(stamps, dtype=np.int64)
-                writer.write_bool(REGIME_TOPIC, times, np.array(values))
-                stamped = [stamped_flag(*flag, serial) for flag in new]
-                writer.write_raw(STAMPED_TOPIC, STAMPED_TYPE, times, stamped)
+                times = np.array([stamp for stamp, _ in new], dtype=np.int64)
+                for topic, pack in FLAGS.items():
+                    packed = [pack(*flag, serial) for flag in new]
+                    writer.write_raw(topic.name, topic.type, times, packed)
             # Their log time becomes their stamp, as that of the outputs is.
             for role, messages in block.raw.items():
                 name, kind = reader.topics[role], ''
                 if role in reader.fields:
-                    name, kind = f'temperature/{role}', TEMPERATURE
+                    name, kind = thermometer(role), TEMPERATURE
                 copy(name, kind or reader.info.topics[name][0], messages, block.stamp_ns[role])
             if len(block):
                 copy_others(block.log_ns['accel'][-1])

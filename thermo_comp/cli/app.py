@@ -30,9 +30,6 @@ _UsageMistake: Any = typer.BadParameter.__mro__[2]
 #: How typer says that the value of an option is no number: the option's names, the kind of number.
 _NO_NUMBER = re.compile(r"'(-[\w-]+)'(?: / '(-[\w-]+)')?: .*\b(?:a )?valid (number|float|integer)")
 
-#: How 0.1 spelt `--topic`.
-_OLD_TOPIC = re.compile(r'--(counts|imu|board|case)-topic(?:=(.*))?')
-
 # The bounds of a number on a line of their own: beside its name they cut the longest option names.
 rich_utils.RANGE_STRING = '\n[{}]'
 
@@ -138,16 +135,12 @@ def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Give a command's own arguments and ROS's, which stand from ``--ros-args`` up to ``--``."""
     own: list[str] = []
     ros: list[str] = []
-    target, given = own, iter(arguments)
-    for argument in given:
-        old = _OLD_TOPIC.fullmatch(argument)
+    target = own
+    for argument in arguments:
         if argument == '--ros-args':
             target = ros
         elif argument == '--' and target is ros:
             target = own
-        elif old and target is own:
-            topic = next(given, '') if old[2] is None else old[2]
-            own += ['--topic', f'{old[1]}={topic}']
         else:
             target.append(argument)
     return own, ros

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ..errors import CalibrationError
 from ..files import CALIBRATION, PARAMETERS, bag_kind, check_output, read_bounded, write_atomically
+from ..topics import SAMPLES, thermometer
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from . import shared_options as options
 from .output import Output, picked
@@ -87,13 +88,13 @@ def convert(
         report = write_log(read, output, force, done)
     found, further = report.log, dict(report.messages)
     usual = {f'{name}_messages': further.pop(name) for name in ('accel', 'board', 'case')}
-    accel = 'accel/counts' if found.input == 'counts' else 'imu/uncompensated'
+    accel = SAMPLES[found.input].name
     out.line(
         f'{found.path}: {report.rows} rows, {report.duration_s:.1f} s at {report.rate_hz:.4g} Hz'
     )
     out.line(f'{output}:')
     for name, count in report.messages.items():
-        out.line(f'  {count:8} {accel if name == "accel" else f"temperature/{name}"}')
+        out.line(f'  {count:8} {accel if name == "accel" else thermometer(name)}')
     out.line(f'unit: {found.unit}; {report.believed}')
     if report.rate_hz < SLOW_HZ:
         out.line(

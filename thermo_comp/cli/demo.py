@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import ThermoCompError
+from ..topics import IMU_OUT, OUTPUTS, REGIME
 from ..unit.gravity import STANDARD_GRAVITY
 from . import shared_options as options
 from .judge import tell_sections
@@ -75,7 +76,7 @@ def demo(
         played, counts = through_the_node(held_out, unit, recorded, progress=done)
     info, wall_s = played.info, played.duration_s
     bag_s, n_in = (info.end_ns - info.start_ns) * 1e-9, max(played.n_messages.values())
-    n_out, n_flags = counts['imu/data_raw'], counts['regime/dynamic']
+    n_out, n_flags = counts[IMU_OUT.name], counts[REGIME.name]
     out.line(
         f'played {held_out} through the node: {bag_s / 60.0:.0f} min in {wall_s:.1f} s, '
         f'{bag_s / wall_s:.0f} times real time'
@@ -127,7 +128,7 @@ def through_the_node(
     Returns what was played and how many messages were recorded, by topic. Only the QoS differs
     from a robot's: reliable, without a limit of depth. And the player waits for the node.
     """
-    from ..ros.listener import OUTPUTS, Recorder
+    from ..ros.listener import Recorder
     from ..ros.node import node_in_thread
     from ..ros.player import lossless, opened_player
     from ..ros.waitloop import wait_until
@@ -148,7 +149,7 @@ def through_the_node(
             """Tell whether both ends of every topic know each other."""
             heard = {one.topic_name for one in node.node.subscriptions}
             sent = {one.topic_name for one in player.node.publishers}
-            results = {f'{namespace}/{topic}' for topic in OUTPUTS}
+            results = {f'{namespace}/{topic.name}' for topic in OUTPUTS}
             return (
                 recorder.has_publishers
                 and heard.isdisjoint(player.unheard())
@@ -183,7 +184,7 @@ def _messages(path: Path) -> list[tuple[int, bytes]]:
     from ..recording.reader import open_recording
     from ..recording.topics import Topics
 
-    with open_recording(path, Topics(imu='imu/data_raw', input='imu'), require=['accel']) as bag:
+    with open_recording(path, Topics(imu=IMU_OUT.name, input='imu'), require=['accel']) as bag:
         return [
             one
             for block in bag.blocks(raw=True)

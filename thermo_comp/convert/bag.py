@@ -18,7 +18,8 @@ import numpy as np
 from ..errors import RecordingError
 from ..recording.chunks import translated
 from ..recording.reader import inspect_recording, read_recording
-from ..recording.topics import IMU, TEMPERATURE, Present, Topics, said_choice
+from ..recording.topics import Present, Topics, said_choice
+from ..topics import IMU, TEMPERATURE
 from .log import ForeignLog
 
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'

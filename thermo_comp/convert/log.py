@@ -27,6 +27,7 @@ from ..recording.stillness import CellAccumulator
 from ..recording.topics import Topics
 from ..recording.writer import STAMP_END_NS, BagWriter
 from ..text import valid_serial
+from ..topics import thermometer
 from ..typing import Bools, Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 
@@ -217,7 +218,7 @@ def _write(
     per_g = PER_G.get(log.unit, log.counts_per_g or 1.0)
     factor = STANDARD_GRAVITY / per_g if log.input == 'imu' else 1.0
     waiting = [
-        (f'temperature/{name}', readings, np.maximum.accumulate(readings.stamp_ns))
+        (thermometer(name), readings, np.maximum.accumulate(readings.stamp_ns))
         for name, readings in log.temperatures.items()
         if len(readings.celsius)
     ]

@@ -20,9 +20,10 @@ import numpy as np
 
 from ..errors import OutputError, RecordingError
 from ..files import MCAP, check_output
+from ..topics import COUNTS, IMU_IN, TEMPERATURE, thermometer
 from .blocks import Block, RecordingInfo, Role
 from .reader import open_recording
-from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, Topics
+from .topics import Topics
 from .writer import BagWriter
 
 _USUAL = Topics()
@@ -160,9 +161,11 @@ class PositionBags:
             )
             self.written.append(path)
             self._number += 1
-        accel = (_USUAL.counts, VECTOR3_STAMPED) if block.imu is None else (_USUAL.imu, IMU)
+        accel = COUNTS if block.imu is None else IMU_IN
         for role, one in block.raw.items():
-            topic, kind = accel if role == 'accel' else (f'temperature/{role}', TEMPERATURE)
+            is_accel = role == 'accel'
+            topic = accel.name if is_accel else thermometer(role)
+            kind = accel.type if is_accel else TEMPERATURE
             if self._writer is not None and len(one):
                 self._writer.write_raw(topic, kind, one.log_ns, one)
 

@@ -27,11 +27,11 @@ from mcap.opcode import Opcode
 
 from .. import __version__
 from ..errors import RecordingError
+from ..topics import OUTPUTS
 from .blocks import Messages, join_messages, scatter
 from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
 from .fields import typestore
 from .mcap_file import MAGIC, METADATA_NAME
-from .topics import REGIME_TOPICS
 
 Compression = Literal['none', 'lz4', 'zstd']
 
@@ -41,6 +41,8 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
     'lz4': lambda data, _: lz4.frame.compress(data),
     'zstd': zstandard.compress,
 }
+#: Topics of which a late reader gets the last message, perhaps in a namespace.
+_LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 # Versions of mcap differ in which of its methods are typed.
 _new_builder: Callable[[], Any] = RecordBuilder
@@ -268,7 +270,7 @@ class McapOutput:
 
 def _offered_qos(topic: str) -> dict[str, Any]:
     """Give the QoS profile that is recorded as offered: reliable, so that any reader matches."""
-    is_flag = topic.endswith(REGIME_TOPICS)  # of which a late reader gets the last one
+    is_flag = topic.endswith(_LATCHED)
     return {
         'history': 'keep_last',
         'depth': 1 if is_flag else 10,

@@ -14,12 +14,13 @@ import numpy as np
 
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..thermal.thermometer import COLDEST, HOTTEST
+from ..topics import TEMPERATURE
 from .blocks import Readings, RecordingInfo
 from .causes import CauseCounter
 from .fields import temperature_fields
 from .reader import RecordingReader, open_recording
 from .stillness import STILL_SD, CellAccumulator, still_intervals, why_restless
-from .topics import PLAIN, TEMPERATURE, Topics, shown
+from .topics import PLAIN, Topics, shown
 
 #: What no board endures, and a thermometer in kelvins reads.
 KELVINS = (180.0, 480.0)

@@ -17,19 +17,15 @@ from typing import Any, Literal, NamedTuple, cast
 from ..errors import RecordingError, ThermoCompError
 from ..plain_yaml import read_plain_yaml
 from ..text import one_line
+from ..topics import BOARD, CASE, COUNTS, FLAGS, IMU_IN, IMU_OUT, INPUTS, TEMPERATURE, thermometer
 from .blocks import Input, Role
 
-VECTOR3_STAMPED = 'geometry_msgs/msg/Vector3Stamped'
-IMU = 'sensor_msgs/msg/Imu'
-TEMPERATURE = 'sensor_msgs/msg/Temperature'
-BOOL = 'std_msgs/msg/Bool'
 #: What a thermometer may be without naming a field, and the field that it is then.
 PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
-_TYPES = {'counts': VECTOR3_STAMPED, 'imu': IMU, 'board': TEMPERATURE, 'case': TEMPERATURE}
+_TYPES = {key: topic.type for key, topic in INPUTS.items()}
 #: The driver's topic in REP 145, and the node's output: what is beside it tells which.
-_RAW = 'imu/data_raw'
-REGIME_TOPICS = ('regime/dynamic', 'regime/stamped')
+_RAW = IMU_OUT.name
 #: Words in the names of vector topics that are no specific force.
 _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
 
@@ -93,10 +89,10 @@ class Topics:
     ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
 
-    counts: str = 'accel/counts'
-    imu: str = 'imu/uncompensated'
-    board: str = 'temperature/board'
-    case: str = 'temperature/case'
+    counts: str = COUNTS.name
+    imu: str = IMU_IN.name
+    board: str = BOARD.name
+    case: str = CASE.name
     further: Mapping[str, str] = field(default_factory=dict)
     part: Part = WHOLE
     input: Input = 'auto'  # which prefers the counts
@@ -274,15 +270,10 @@ def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
     """Find the topic that the node or `replay` wrote; nothing where there is none."""
     for name in present:
         front = name.removesuffix(_RAW)
-        is_beside = any(front + other in present for other in REGIME_TOPICS)
+        is_beside = any(front + flag.name in present for flag in FLAGS)
         if is_called(name, _RAW) and (is_beside or 'corrected_by' in metadata):
             return name
     return ''
-
-
-def _among(present: Present, name: str) -> str:
-    n_alike = sum(count > 0 and kind == present[name][0] for kind, count in present.values())
-    return 'only' if n_alike == 1 else "driver's"
 
 
 def _said_own(name: str) -> str:
@@ -295,11 +286,11 @@ def _further(
     """Find the other thermometers: those named, and any beside the board's or the case's."""
     both = {}
     for own, wanted in topics.further.items():
-        name = _match(present, wanted, f'temperature/{own}')
+        name = _match(present, wanted, thermometer(own))
         if name is not None:
             both[own] = _of_type(present, name, TEMPERATURE, wanted)
         elif is_read:
-            raise _missing(present, {f'temperature/{own}': wanted})
+            raise _missing(present, {thermometer(own): wanted})
     beside = found.get('board') or found.get('case') or ''
     namespace, is_usual, _ = beside.rpartition('temperature/')
     front = f'{namespace}temperature/' if is_usual else '/temperature/'

@@ -25,13 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RecordingError
+from ..topics import IMU, N_NUMBERS, TEMPERATURE, VECTOR3_STAMPED
 from ..typing import Bytes, Floats, Ints
 from .blocks import ROLES, Block, ImuColumns, Messages, Readings, Role, Topic, gather, number_at
 from .fields import Field, typestore
-from .topics import IMU, TEMPERATURE, VECTOR3_STAMPED, shown
+from .topics import shown
 
-#: How many float64 numbers follow the header of each type.
-N_NUMBERS = {VECTOR3_STAMPED: 3, IMU: 37, TEMPERATURE: 2}
 #: The columns of sensor_msgs/Imu among its numbers, as `ImuColumns` has them.
 _IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
 _IMU_ACCELERATION = slice(25, 28)

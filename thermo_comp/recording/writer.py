@@ -23,11 +23,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import OutputError, RecordingError
 from ..files import CSV, PARQUET, Draft, Kind, bag_kind, drafted
+from ..topics import BOOL, IMU, N_NUMBERS, TEMPERATURE, VECTOR3_STAMPED
 from ..typing import Ints
 from .blocks import ImuColumns, Messages
 from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
-from .topics import BOOL, IMU, TEMPERATURE, VECTOR3_STAMPED
-from .wire import N_NUMBERS, encode_stamped
+from .wire import encode_stamped
 
 STAMP_END_NS = 2**31 * 10**9  # the first stamp that no ROS message can hold; none is before 0 [ns]
 _AUTO_FLUSH_BYTES = 1 << 26

@@ -16,7 +16,7 @@ from dataclasses import asdict
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.qos import QoSCompatibility, qos_check_compatible
 from rclpy.subscription import Subscription
 
 from ..online.checks import RATE_TOLERANCE
@@ -25,9 +25,11 @@ from ..text import one_line
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT
+from ..topics import STATUS
+from .messages import qos_of, type_name
 from .reader import LoadedCalibration
 from .relay import Relay
-from .waitloop import WaitLoop, type_name
+from .waitloop import WaitLoop
 
 IDLE_S = 5.0  # after so long without samples [s] readings take effect without them
 #: Readings stamped this much ahead of the samples wait too long to be of one clock with them [s].
@@ -70,7 +72,7 @@ class Reporter:
 
     def __init__(self, loop: WaitLoop, relay: Relay) -> None:
         self._loop, self._node, self._relay = loop, loop.node, relay
-        self._publisher = loop.publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
+        self._publisher = loop.publisher(DiagnosticArray, STATUS.name, qos_of(STATUS))
         self._level = DiagnosticStatus.STALE
         self._n_publishers = 0
         self._last_samples = time.monotonic()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any
 
 from rclpy.node import Node
@@ -20,6 +19,7 @@ from sensor_msgs.msg import Temperature
 from ..errors import ThermoCompError
 from ..recording.blocks import NO_STAMP_NS
 from ..recording.topics import PLAIN, split_field
+from .messages import message_class
 
 _STEP = re.compile(r'([A-Za-z]\w*)|\[([0-9]{1,6})\]|\.')
 
@@ -28,9 +28,8 @@ class LiveField:
     """A number in the messages of a topic; ThermoCompError for a type or field that is not."""
 
     def __init__(self, topic: str, kind: str, path: str) -> None:
-        package, _, name = kind.partition('/msg/')
         try:
-            self.kind: Any = getattr(import_module(f'{package}.msg'), name)
+            self.kind = message_class(kind)
         except (ImportError, AttributeError, ValueError) as error:
             reason = f'its type {kind} is not installed here'
             raise ThermoCompError(reason, key=topic) from error

@@ -18,40 +18,29 @@ from struct import Struct
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Bool
 
 from ..errors import ThermoCompError
-from ..online.status import STAMPED_TOPIC
 from ..recording.blocks import NO_STAMP_NS, Messages, Role, Topic, with_stamps
 from ..recording.growing import News
-from ..recording.topics import (
-    IMU,
-    TEMPERATURE,
-    VECTOR3_STAMPED,
-    Topics,
-    is_thermometer,
-    split_field,
-)
+from ..recording.topics import Topics, is_thermometer, split_field
 from ..recording.wire import Feed, decode_blocks
 from ..recording.writer import BagWriter
+from ..topics import IMU, OUTPUTS, SAMPLES, TEMPERATURE, thermometer
 from ..typing import Ints
 from .fields import LiveField, live_field
-from .waitloop import RawSubscription, WaitLoop, own_node, type_name
+from .messages import message_class
+from .waitloop import RawSubscription, WaitLoop, own_node
 
-#: The node's outputs.
-OUTPUTS = {'imu/data_raw': Imu, 'regime/dynamic': Bool, STAMPED_TOPIC: DiagnosticArray}
 #: Time between two looks at what is published, and between two blocks [s].
 LOOK_S, BLOCK_S = 0.5, 1.0
 
 _ALL = HistoryPolicy.KEEP_ALL
 _RELIABLE = QoSProfile(history=_ALL, reliability=ReliabilityPolicy.RELIABLE)
 _AS_OFFERED = QoSProfile(history=_ALL, reliability=ReliabilityPolicy.BEST_AVAILABLE)
-_CLASSES = {type_name(kind): kind for kind in (Vector3Stamped, Imu, Temperature)}
 _STAMP = Struct('<iI')
+#: The node's outputs by name, with their types.
+_RESULTS = {topic.name: topic.type for topic in OUTPUTS}
 
 
 class _Listener:
@@ -100,7 +89,7 @@ class Recorder(_Listener):
         self,
         path: str | Path,
         *,
-        topics: Mapping[str, Any] = OUTPUTS,
+        topics: Mapping[str, str] = _RESULTS,
         ros_args: Sequence[str] = (),
         overwrite: bool = False,
     ) -> None:
@@ -114,24 +103,23 @@ class Recorder(_Listener):
             self._writer.abort()
             return
         with self._writer as writer:
-            times = [_stamps(data) for name, data, _ in self._came if self._topics[name] is Imu]
+            times = [_stamps(data) for name, data, _ in self._came if self._topics[name] == IMU]
             newest_ns = times[0][:1] if times else np.zeros(1, np.int64)
             following = iter(times)
             rows: dict[str, tuple[list[Ints], list[bytes]]] = {}
             for name, messages, _ in self._came:
-                is_stamped = self._topics[name] is Imu
+                is_stamped = self._topics[name] == IMU
                 log_ns = next(following) if is_stamped else newest_ns.repeat(len(messages))
                 newest_ns = log_ns[-1:]
                 parts, joined = rows.setdefault(name, ([], []))
                 parts.append(log_ns)
                 joined += messages
             for name, (parts, joined) in rows.items():
-                kind = type_name(self._topics[name])
-                writer.write_raw(name, kind, np.concatenate(parts), joined)
+                writer.write_raw(name, self._topics[name], np.concatenate(parts), joined)
 
     def _open(self) -> None:
         for name, kind in self._topics.items():
-            self._heard[name] = self._loop.subscribe(kind, name, _RELIABLE)
+            self._heard[name] = self._loop.subscribe(message_class(kind), name, _RELIABLE)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -206,13 +194,14 @@ class LiveTopics(_Listener):
         resolved = self._node.resolve_topic_name
         chosen = self._feeds.get('accel')
         inputs = {
-            getattr(self._topics, key): kind
-            for key, kind in (('counts', VECTOR3_STAMPED), ('imu', IMU))
-            if self._topics.input in (key, 'auto') and (chosen is None or chosen.type == kind)
+            getattr(self._topics, key): usual.type
+            for key, usual in SAMPLES.items()
+            if self._topics.input in (key, 'auto')
+            and (chosen is None or chosen.type == usual.type)
         }
         if not any(self._hear('accel', name, kind, problems) for name, kind in inputs.items()):
             problems.append(f'nobody publishes {" or ".join(map(resolved, inputs))}')
-        front = resolved('temperature/name').removesuffix('name')
+        front = resolved(thermometer('name')).removesuffix('name')
         further = {
             name.removeprefix(front): name
             for name, kinds in self._node.get_topic_names_and_types()
@@ -247,6 +236,6 @@ class LiveTopics(_Listener):
         elif offers:
             self._feeds[role] = Topic(name, kind, 'cdr')
             self._heard[role] = self._loop.subscribe(
-                _CLASSES[kind], topic, _AS_OFFERED, is_hot=role == 'accel'
+                message_class(kind), topic, _AS_OFFERED, is_hot=role == 'accel'
             )
         return role in self._heard

@@ -26,11 +26,12 @@ from ..errors import CalibrationError, ThermoCompError
 from ..online.compensator import Compensator
 from ..online.segments import Model
 from ..text import hold_standard_streams, one_line
+from ..topics import BOARD, CASE, COUNTS, IMU_IN, IMU_OUT, SAMPLES
 from . import parameters
 from .diagnostics import Reporter
 from .process import SignalWatch, use_profile
 from .reader import LoadedCalibration, Reader, read_within
-from .relay import INPUTS, Relay, Running
+from .relay import Relay, Running
 from .waitloop import WaitLoop, overrides
 
 NODE_NAME = 'thermo_comp'
@@ -43,11 +44,11 @@ REST_S = 0.2e-3
 #: After a signal the process ends within this time, whatever hangs [s].
 ENDING_S = 1.8
 
-USAGE = """\
+USAGE = f"""\
 usage: thermo_comp_node --ros-args -p calibration_file:=PATH [-p NAME:=VALUE ...]
 
-Compensates accel/counts (or imu/uncompensated, with -p input:=imu) into imu/data_raw, using
-temperature/board and temperature/case.
+Compensates {COUNTS.name} (or {IMU_IN.name}, with -p input:=imu) into {IMU_OUT.name}, using
+{BOARD.name} and {CASE.name}.
 
 example: thermo_comp_node --ros-args -p calibration_file:=unit42.yaml -r accel/counts:=/imu0/counts
 
@@ -84,7 +85,7 @@ class CompensationNode:
         self._reader = Reader()
         self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
         self._report_every(config.diagnostics_period)
-        topics = [self.node.resolve_topic_name(topic) for _, topic in INPUTS.values()]
+        topics = [self.node.resolve_topic_name(one.name) for one in SAMPLES.values()]
         # The input that is not open may be opened later, with these.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
         for name in overrides(self.node):

@@ -27,14 +27,13 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Temperature
 
 from ..errors import ThermoCompError
-from ..online.status import STAMPED_TOPIC
 from ..recording.blocks import ROLES, Block, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics
-from .relay import INPUTS
+from ..topics import FLAGS, IMU_OUT, SAMPLES, TEMPERATURE, thermometer
+from .messages import message_class
 from .waitloop import own_node, wait_until
 
 NODE_NAME = 'thermo_comp_player'
@@ -98,11 +97,13 @@ class Player:
 
     def __init__(self, node: Node, reader: RecordingReader, rate: float) -> None:
         self.node, self._reader, self._rate = node, reader, rate
-        kinds = {role: (Temperature, f'temperature/{role}') for role in reader.topics}
-        kinds['accel'] = INPUTS[reader.info.input or 'counts']
+        kinds = {role: (TEMPERATURE, thermometer(role)) for role in reader.topics}
+        samples = SAMPLES[reader.info.input or 'counts']
+        kinds['accel'] = samples.type, samples.name
         self._publishers: dict[Role, Any] = {
             role: node.create_publisher(
-                *kinds[role],
+                message_class(kinds[role][0]),
+                kinds[role][1],
                 QoSProfile(depth=WINDOW[role], durability=DurabilityPolicy.TRANSIENT_LOCAL),
             )
             for role in reader.topics
@@ -179,13 +180,12 @@ class Player:
 
 def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> list[str]:
     """Give the ROS arguments under which a node loses nothing, at the price of latency."""
-    inputs = ['accel/counts', 'imu/uncompensated', *(f'temperature/{n}' for n in thermometers)]
+    inputs = [*(one.name for one in SAMPLES.values()), *map(thermometer, thermometers)]
     overrides = [
         *(f'{topic}.subscription.reliability:=reliable' for topic in inputs),
         *(f'{topic}.subscription.history:=keep_all' for topic in inputs),
-        'imu/data_raw.publisher.history:=keep_all',
-        'regime/dynamic.publisher.depth:=1000',
-        f'{STAMPED_TOPIC}.publisher.depth:=1000',
+        f'{IMU_OUT.name}.publisher.history:=keep_all',
+        *(f'{flag.name}.publisher.depth:=1000' for flag in FLAGS),
     ]
     return [word for one in overrides for word in ('-p', f'qos_overrides.{namespace}/{one}')]
 

@@ -23,31 +23,21 @@ from functools import partial
 from operator import itemgetter
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Vector3Stamped
 from rclpy.executors import ExternalShutdownException
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Bool
 
 from ..errors import ThermoCompError
 from ..online.compensator import Compensator
 from ..online.segments import Model
-from ..online.status import STAMPED_TOPIC, stamped_flag
 from ..recording.blocks import NO_STAMP_NS
 from ..recording.topics import TWINS, split_field
+from ..topics import BOARD, FLAGS, IMU_OUT, SAMPLES, thermometer
 from .fields import LiveField, live_field
+from .messages import message_class, qos_of
 from .parameters import NodeConfig, named_topics
 from .reader import LoadedCalibration
 from .waitloop import RawSubscription, RCLError, WaitLoop
-
-INPUTS = {'counts': (Vector3Stamped, 'accel/counts'), 'imu': (Imu, 'imu/uncompensated')}
-#: As many samples as may wait for one wake-up, in and out: 0.2 s at 10 kHz.
-SAMPLE_QOS = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
-TEMPERATURE_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-OUTPUT_QOS = QoSProfile(depth=2000)
-FLAG_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 #: Without samples, readings take effect but for those not older than the newest by this [ns]: a
 #: sample that Fast DDS has to repeat can be 3 s late.
@@ -185,23 +175,25 @@ class Relay:
         #: By their names; and the fields of those that are no Temperature.
         self.thermometers = {
             name: loop.subscribe(
-                Temperature, split_field(self._topic(name))[0], TEMPERATURE_QOS, is_hot=False
+                Temperature, split_field(self._topic(name))[0], qos_of(BOARD), is_hot=False
             )
             for name in compensator.thermal.inputs
         }
         self._fields: dict[str, LiveField] = {}
         self._problems: set[str] = set()
-        imu = loop.publisher(Imu, self._names.get('output', 'imu/data_raw'), OUTPUT_QOS)
+        imu = loop.publisher(Imu, self._names.get('output', IMU_OUT.name), qos_of(IMU_OUT))
         self._publish: Callable[[bytes], None] = imu.handle.publish_raw
         self._check_topics(imu.topic_name)
-        self._flag = loop.publisher(Bool, 'regime/dynamic', FLAG_QOS)
-        self._stamped = loop.publisher(DiagnosticArray, STAMPED_TOPIC, FLAG_QOS)
+        self._flags = [
+            (loop.publisher(message_class(one.type), one.name, qos_of(one)).publish, pack)
+            for one, pack in FLAGS.items()
+        ]
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
 
     def _topic(self, name: str) -> str:
         """Give the topic of a thermometer, with the field of its messages if one is named."""
-        usual = f'temperature/{name}'
+        usual = thermometer(name)
         return self._names.get(name, self._names.get(usual, usual))
 
     def _check_topics(self, output: str) -> None:
@@ -213,7 +205,7 @@ class Relay:
             if twin != name:
                 raise ThermoCompError(TWINS.format(twin, name), key=topic)
         if self.samples.subscription.topic_name == output:
-            reason = 'is both input and output: remap imu/data_raw to another name'
+            reason = f'is both input and output: remap {IMU_OUT.name} to another name'
             raise ThermoCompError(reason, key=output)
 
     def look(self) -> None:
@@ -235,7 +227,7 @@ class Relay:
                 self._loop.call_soon(partial(self._hear, name, topic, field))
 
     def _hear(self, name: str, topic: str, field: LiveField) -> None:
-        one = self._loop.subscribe(field.kind, topic, TEMPERATURE_QOS, is_hot=False)
+        one = self._loop.subscribe(field.kind, topic, qos_of(BOARD), is_hot=False)
         everything = {**self.thermometers, name: one}
         names = self.running.compensator.thermal.inputs
         self.thermometers = {own: everything[own] for own in names if own in everything}
@@ -252,11 +244,14 @@ class Relay:
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
         """Subscribe to the samples of a configuration."""
-        kind, usual = INPUTS[config.input]
-        return self._loop.subscribe(kind, self._names.get(config.input, usual), SAMPLE_QOS)
+        usual = SAMPLES[config.input]
+        name = self._names.get(config.input, usual.name)
+        return self._loop.subscribe(message_class(usual.type), name, qos_of(usual))
 
     def _converter(self, config: NodeConfig) -> SampleConverter:
-        return SampleConverter(INPUTS[config.input][0], config.frame_id, self.traffic)
+        return SampleConverter(
+            message_class(SAMPLES[config.input].type), config.frame_id, self.traffic
+        )
 
     def successor(self, loaded: LoadedCalibration, model: Model, config: NodeConfig) -> Running:
         """Make what is to run next; what runs stays as it is."""
@@ -358,8 +353,8 @@ class Relay:
         for stamp_ns, is_dynamic in compensator.take_flags():
             serial = compensator.calibration.unit.serial
             try:
-                self._flag.publish(Bool(data=is_dynamic))
-                self._stamped.publish(stamped_flag(stamp_ns, is_dynamic, serial))
+                for publish, pack in self._flags:
+                    publish(pack(stamp_ns, is_dynamic, serial))
             except RCLError:
                 self._count_unpublished()
             self.traffic.n_flags += 1

@@ -382,11 +382,6 @@ def wait_until(is_done: Callable[[], object], timeout_s: float, nap_s: float = 0
     return True
 
 
-def type_name(message_type: Any) -> str:
-    """Name a message type as ROS tools and bags do."""
-    return f'{message_type.__module__.partition(".")[0]}/msg/{message_type.__name__}'
-
-
 def overrides(node: Node) -> dict[str, Any]:
     """Give the parameters that the user set at the start, known to the node or not, by name."""
     return {name: one.value for name, one in node._parameter_overrides.items()}  # noqa: SLF001

@@ -1,16 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the scenes of benchmarks/regime.py: ramps behind lags, sensors, the rival rules, the bound.
+Owns the scenes of benchmarks/regime.py: ramps behind lags, the sensors that read them, the bound.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import oaconvolve
 
 from thermo_comp.typing import Floats
 
@@ -18,8 +16,6 @@ RIPPLE_C = 0.1
 DRIFT_K_MIN = 0.01
 DRIFT_S = 5400.0
 BOARD_LAG_S = 600.0
-WINDOW_S = 120.0
-SPAN_S = 600.0
 SENSORS = ((0.001, 0.0), (0.01, 0.0), (0.001, 0.0625), (0.01, 0.0625), (0.01, 1.0))
 
 
@@ -79,80 +75,6 @@ def read(truth: Floats, scene: Scene, rng: np.random.Generator) -> Floats:
     """Let a sensor read."""
     reading = truth + rng.normal(0.0, scene.noise_sd, truth.shape)
     return np.round(reading / scene.quantum) * scene.quantum if scene.quantum else reading
-
-
-def moving_fit(readings: Floats, n: int, powers: int, wanted: int, at_end: bool) -> Floats:
-    """Derive a least-squares polynomial over the last n readings, per sample period."""
-    k = np.arange(n) - (n - 1 if at_end else 0.5 * (n - 1))
-    design = np.stack([k**p for p in range(powers + 1)], axis=1)
-    weights = np.linalg.pinv(design)[wanted] * (1.0, 1.0, 2.0)[wanted]
-    out = np.zeros(len(readings))
-    out[n - 1 :] = oaconvolve(readings - readings[0], weights[::-1], mode='valid')
-    return out
-
-
-def second_derivative(scene: Scene, readings: Floats) -> Floats:
-    """|d2T/dt2| of a parabola over the window, K/s^2."""
-    n = max(5, round(WINDOW_S * scene.rate_hz))
-    return np.abs(moving_fit(readings, n, 2, 2, at_end=False)) * scene.rate_hz**2
-
-
-def first_derivative(scene: Scene, readings: Floats) -> Floats:
-    """|dT/dt| of a straight line over the window, K/s."""
-    n = max(5, round(WINDOW_S * scene.rate_hz))
-    return np.abs(moving_fit(readings, n, 1, 1, at_end=False)) * scene.rate_hz
-
-
-def savitzky_golay(scene: Scene, readings: Floats) -> Floats:
-    """|dT/dt| at the newest end of a parabola over the window, K/s."""
-    n = max(5, round(WINDOW_S * scene.rate_hz))
-    return np.abs(moving_fit(readings, n, 2, 1, at_end=True)) * scene.rate_hz
-
-
-def exponential_fit(scene: Scene, readings: Floats) -> Floats:
-    """
-    |dT/dt| of an exponential with the unit's lag, fitted over the last 600 s of updates, K/s.
-
-    After the idea of Kozlov and Tarygin (Sensors 2020, 20(5), 1299): only readings that change the
-    output of a quantized sensor are used, as the edge crossed, and the model extrapolates.
-    """
-    lag, span = scene.lag_s, SPAN_S
-    if not scene.quantum:
-        n = max(5, round(span * scene.rate_hz))
-        decay = np.exp(-(np.arange(n) - (n - 1)) / (scene.rate_hz * lag))
-        weights = np.linalg.pinv(np.stack([np.ones(n), decay], axis=1))[1] / -lag
-        out = np.zeros(len(readings))
-        out[n - 1 :] = oaconvolve(readings - readings[0], weights[::-1], mode='valid')
-        return np.abs(out)
-    changed = np.flatnonzero(np.diff(readings)) + 1
-    at = changed / scene.rate_hz
-    edge = 0.5 * (readings[changed] + readings[changed - 1]) - readings[0]
-    rates = np.zeros(len(changed))
-    first = 0
-    for k in range(len(changed)):
-        while at[k] - at[first] > span:
-            first += 1
-        used = slice(first, k + 1)
-        decay = np.exp(-(at[used] - at[k]) / lag)
-        spread = np.sum((decay - decay.mean()) ** 2)
-        if spread > 1e-9:
-            slope = np.sum((decay - decay.mean()) * (edge[used] - edge[used].mean())) / spread
-            rates[k] = -slope / lag
-    out = np.zeros(len(readings))
-    for k, begin in enumerate(changed):
-        end = changed[k + 1] if k + 1 < len(changed) else len(readings)
-        held = np.arange(min(end - begin, round(span * scene.rate_hz)))
-        out[begin : begin + len(held)] = np.abs(rates[k]) * np.exp(-held / scene.rate_hz / lag)
-    return out
-
-
-Rule = Callable[[Scene, Floats], Floats]
-RIVALS: dict[str, Rule] = {
-    '|d2T/dt2|': second_derivative,
-    '|dT/dt|': first_derivative,
-    'Savitzky-Golay': savitzky_golay,
-    'exponential fit': exponential_fit,
-}
 
 
 def known_signature_delays(

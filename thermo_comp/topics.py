@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the table of the node's ROS topics: name, message type, QoS and the flags' packers.
+
+Node, replay, recorders, player, bag writer and docs/ros_interface.md read this table. A message is
+packed in little-endian CDR: 4 bytes of encapsulation, then the fields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from struct import pack
+
+VECTOR3_STAMPED = 'geometry_msgs/msg/Vector3Stamped'
+IMU = 'sensor_msgs/msg/Imu'
+TEMPERATURE = 'sensor_msgs/msg/Temperature'
+BOOL = 'std_msgs/msg/Bool'
+DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
+
+#: Types that are a std_msgs/Header and float64 numbers alone: how many numbers.
+N_NUMBERS = {VECTOR3_STAMPED: 3, IMU: 37, TEMPERATURE: 2}
+
+_ENCAPSULATION = b'\0\1\0\0'
+
+#: Packs a flag: stamp of the reading that decides [ns], whether dynamic, serial of the unit.
+PackFlag = Callable[[int, bool, str], bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class NodeTopic:
+    """A topic of the node, with the QoS that the node asks for or offers."""
+
+    name: str
+    type: str
+    meaning: str  # for the reference page
+    depth: int
+    is_reliable: bool = True
+    is_latched: bool = False  # a late subscriber gets the last message (transient local)
+
+    @property
+    def qos(self) -> str:
+        """Describe the QoS for the reference page."""
+        words = ['reliable' if self.is_reliable else 'best effort']
+        words += ['transient local'] * self.is_latched
+        return ', '.join([*words, f'keep last {self.depth}'])
+
+
+def _bool_flag(_stamp_ns: int, is_dynamic: bool, _serial: str) -> bytes:
+    """Serialize a std_msgs/Bool."""
+    return _ENCAPSULATION + bytes([is_dynamic])
+
+
+def _stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
+    """Serialize a DiagnosticArray of one status, with the stamp of the reading that decides."""
+    status = b''
+    for text in ('regime', 'dynamic' if is_dynamic else 'static', serial):
+        # The level is one byte, and a length stands at a multiple of four.
+        status += bytes(-(1 + len(status)) % 4) + pack('<I', len(text.encode()) + 1)
+        status += text.encode() + b'\0'
+    status += bytes(-(1 + len(status)) % 4) + pack('<I', 0)  # no key and value
+    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+    # An empty frame_id with its NUL, padding, one status, its level.
+    head = pack('<iII4xIb', sec, nanosec, 1, 1, 0)
+    return _ENCAPSULATION + head + status
+
+
+def thermometer(name: str) -> str:
+    """Name the usual topic of a thermometer."""
+    return f'temperature/{name}'
+
+
+# 2000 samples are 0.2 s at 10 kHz: so many may wait for one wake-up, in and out.
+COUNTS = NodeTopic('accel/counts', VECTOR3_STAMPED, 'counts per cycle', 2000, is_reliable=False)
+IMU_IN = NodeTopic(
+    'imu/uncompensated',
+    IMU,
+    'm/s^2, with `input:=imu`; orientation and its covariance pass through, '
+    'and so do angular rate and its covariance unless the calibration has a `gyroscope`',
+    2000,
+    is_reliable=False,
+)
+BOARD, CASE = (
+    NodeTopic(thermometer(name), TEMPERATURE, meaning, 50, is_reliable=False)
+    for name, meaning in (
+        ('board', 'degC; or std_msgs/Float32, Float64, or a number in any message'),
+        ('case', 'the same, and `temperature/NAME` for any other that the calibration names'),
+    )
+)
+IMU_OUT = NodeTopic('imu/data_raw', IMU, 'specific force in m/s^2', 2000)
+REGIME = NodeTopic(
+    'regime/dynamic',
+    BOOL,
+    'S = 1; on every change and with every reading that decides: of the case, or of the board '
+    'while there is no case; nothing while unknown',
+    1,
+    is_latched=True,
+)
+STAMPED = NodeTopic(
+    'regime/stamped',
+    DIAGNOSTICS,
+    'the same flag with the stamp of the reading that decides; `status[0].message` is `dynamic` '
+    'or `static`',
+    1,
+    is_latched=True,
+)
+STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz, hardware_id = serial', 10)
+
+#: The samples by the value of the parameter `input`; all inputs by their names in `Topics`.
+SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}
+INPUTS = {**SAMPLES, 'board': BOARD, 'case': CASE}
+#: The regime flags with their packers; all topics of the bag that `replay` writes.
+FLAGS: dict[NodeTopic, PackFlag] = {REGIME: _bool_flag, STAMPED: _stamped_flag}
+OUTPUTS = (IMU_OUT, *FLAGS)
