@@ -31,16 +31,18 @@ _FLATTEST = 1e-6
 # Widths of the paper's sets, which stay whatever they gain, over the steepest: as good as free.
 _FREE = 10.0
 # Few attitudes leave a line of constants open, along which what a model misses would drag them
-# far: there the constants stay this much nearer to the first guess; the claim has the whole prior.
-_HELD = 0.05
+# far: there they stay within some times of how far the norms are off, but for a part of the prior.
+_NORM_ERRORS, _LEAST_HELD = 5.0, 0.05
 # P attitudes show 3 P drifts; a unit has 6, bias and scale of each axis, a support 2 P: with fewer
 # attitudes than 6 a tilt could be any drift of the unit.
 _DIRECTIONS_FOR_TILTS = 6
-# The noise begins with this [m/s^2].
+# The noise begins with the drift, of which constants explain nothing, but for this [m/s^2].
 _SIGMA = 1e-5
 # Mounting and turn-on repeat to some times the noise in 1 Hz: 20 .. 50 ug for a navigation sensor,
 # some tenths of a mg of MEMS.
 _MOUNTING_OVER_NOISE = 3.0
+# The largest scale of that [m/s^2]: 0.5 mg, as of consumer MEMS. Student's tail allows for more.
+_LARGEST_MOUNTING = 5e-3
 
 
 def regress(
@@ -64,14 +66,16 @@ def regress(
     misalignment = inverse[[1, 2, 2], [0, 0, 1]]
     state = regression.initial_state(start.bias / start.scale, misalignment, up)
     candidates = _candidates(windows, start, options, has_one_direction=has_one_direction)
+    drift = within_positions(data.mean / start.scale, data.position)
+    sigma = max(float(np.sqrt(np.mean(drift**2))), _SIGMA)
     prior = Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, BIAS_SD),
         scale_sd=SCALE_SD,
         misalignment_sd=MISALIGNMENT_SD,
         column_sd=np.zeros_like(candidates.typical),
-        offset_sd=_SIGMA,
-        sigma=np.full(3, _SIGMA),
+        offset_sd=sigma,
+        sigma=np.full(3, sigma),
         offset_scale=_mounting_scale(windows, start),
     )
     if options.mounting_sd is not None:
@@ -91,8 +95,15 @@ def regress(
         prior = replace(prior, column_sd=candidates.typical)
         return regression, fit_all(regression, state, prior, candidates), None
     is_open = len(distinct_directions(up)) < POSITIONS_NEEDED
-    near = _HELD if is_open else 1.0
-    held = replace(prior, bias_sd=near * prior.bias_sd, scale_sd=near * prior.scale_sd)
+    held = prior
+    if is_open:
+        norms = np.linalg.norm(position_means(data) / start.scale, axis=1)
+        off = _NORM_ERRORS * float(np.abs(norms - options.gravity).max())
+        bias, scale = (
+            float(np.clip(most, _LEAST_HELD, 1.0))
+            for most in (off / BIAS_SD, off / options.gravity / SCALE_SD)
+        )
+        held = replace(prior, bias_sd=bias * prior.bias_sd, scale_sd=scale * prior.scale_sd)
     selected = select(regression, state, held, candidates, tell)
     wide = replace(selected.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     return regression, replace(selected, prior=wide), candidates.typical
@@ -108,7 +119,7 @@ def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> floa
     bend = np.diff(data.mean / start.scale, n=2, axis=0)[same]
     sigma = float(np.median(np.abs(bend))) / (0.6745 * np.sqrt(6.0))
     density = sigma * np.sqrt(float(np.median(np.diff(data.time)[same])))
-    return float(max(_MOUNTING_OVER_NOISE * density, _FLATTEST))
+    return float(np.clip(_MOUNTING_OVER_NOISE * density, _FLATTEST, _LARGEST_MOUNTING))
 
 
 def _candidates(
