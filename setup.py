@@ -23,7 +23,7 @@ INSTALL = [
     'mcap>=1.1',
     'zstandard>=0.22',
     'lz4>=4.0',
-    'matplotlib>=3.6',
+    'matplotlib>=3.7',
     'Jinja2>=3.1',
 ]
 EXTRAS = {
@@ -32,7 +32,7 @@ EXTRAS = {
     'px4': ['pyulog>=1.0'],
     'ardupilot': ['pymavlink>=2.4.40'],
     'fleet': ['dask>=2024.1', 'distributed>=2024.1', 'fsspec>=2023.6', 'pyarrow>=14'],
-    'test': ['pytest>=7.4', 'pytest-xdist>=3.7', 'hypothesis>=6.98'],
+    'test': ['pytest>=7.4', 'pytest-xdist>=3.8', 'hypothesis>=6.98'],
     'dev': ['ruff>=0.15', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs', 'pre-commit>=3.5'],
     'fuzz': ['atheris>=3.0'],
     'docs': ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.27', 'mkdocs-jupyter>=0.25'],
