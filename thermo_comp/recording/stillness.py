@@ -19,6 +19,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
+from .colour import roughest_at_rest, spread_of_variances
 
 #: How many times the quiet level a cell's variance, of n >= 30 samples, may be: 4 is exceeded by
 #: chance with probability below 1e-11, and vibration worth cutting out is far above.
@@ -29,10 +30,6 @@ STILL_SD = 0.05
 # drifts with temperature and is taken over stretches [rad/s, s].
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
-# Quantiles in sd: a tenth, and what chance exceeds once in 1e11; degrees of freedom, as a part of
-# the samples', from which on noise is coloured, and the fewest of a cell.
-_TENTH, _NEVER = -1.2816, 6.7
-_COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
 # A drift is the median step of so many around, and no faster than this [parts of g per s].
@@ -260,13 +257,13 @@ def still_intervals(
     # variance lies a little below its mean; 1.3 covers it for cells of 32 samples.
     drift = _drift(cells, believable)
     level = np.quantile(cells.variance[believable], 0.1, axis=0)
-    wider = _spread_of_variances(cells, believable, level)
+    wider = spread_of_variances(cells, believable, level)
     limit = ratio * np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12, give or take what noise makes of it.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
     limit = limit + within**2 / 6.0 if len(within) else limit
     quiet = believable & (cells.variance <= limit).all(axis=1)
-    roughest = _roughest(cells, quiet, wider > 1.0, ratio)
+    roughest = roughest_at_rest(cells, quiet, wider > 1.0, ratio)
     quiet &= (cells.roughness <= roughest).all(axis=1)
     # A single change of so many sd is one as rough as a whole cell.
     is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
@@ -283,56 +280,6 @@ def still_intervals(
         for start, stop in zip(edges[::2], edges[1::2], strict=True)
         if stop - start >= min_cells
     ]
-
-
-def _spread_of_variances(cells: Cells, believable: Bools, level: Floats) -> Floats:
-    """
-    How much further the variances of cells at rest spread than those of white noise, per axis.
-
-    Behind a low pass a cell holds few independent samples. With a correlation r from one to the
-    next they are worth (1 - r) / (1 + r) of their number, and the roughness is 1 - r of the
-    variance; that follows from the tenth percentile `level` for as many degrees of freedom.
-    """
-    n_free = float(np.median(cells.count[believable])) - 1.0
-    quiet = believable & (cells.variance <= level).any(axis=1)
-    rough = np.median(cells.roughness[quiet], axis=0)
-    result = np.ones(3)
-    for axis in range(3):
-        n = n_free
-        for _ in range(_ITERATIONS if level[axis] > 0.0 else 0):
-            white = min(rough[axis] / level[axis] * _part_of_mean(n, _TENTH), 1.0)
-            n = max(n_free * white / (2.0 - white), _FEWEST_FREE)
-        if n < _COLOURED * n_free:
-            tails = [_part_of_mean(k, _NEVER) / _part_of_mean(k, _TENTH) for k in (n, n_free)]
-            result[axis] = tails[0] / tails[1]
-    return result
-
-
-def _roughest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: float) -> Floats:
-    """
-    Say how rough a cell at rest is at most, per axis; of coloured noise, which hides a step from a
-    cell's mean and variance, but not from the changes from sample to sample.
-
-    How far these spread follows from the tenth percentile and the median, as of a chi-square.
-    """
-    result = np.full(3, np.inf)
-    for axis in np.flatnonzero(is_coloured) if quiet.any() else ():
-        tenth, median = np.quantile(cells.roughness[quiet, axis], (0.1, 0.5))
-        n_free = float(np.median(cells.count[quiet])) - 1.0
-        frees = np.geomspace(_FEWEST_FREE, n_free, _ITERATIONS) if n_free > _FEWEST_FREE else ()
-        shares = [_part_of_mean(n, _TENTH) / _part_of_mean(n, 0.0) for n in frees]
-        n = float(np.interp(tenth / max(median, 1e-300), shares, frees)) if shares else n_free
-        widest = _part_of_mean(n, _NEVER) / _part_of_mean(n, 0.0)
-        usual = _part_of_mean(n_free, _NEVER) / _part_of_mean(n_free, 0.0)
-        floor = 0.25 * cells.quantum[axis] ** 2
-        result[axis] = ratio * max(median * max(widest / usual, 1.0), floor)
-    return result
-
-
-def _part_of_mean(n_free: float, sigmas: float) -> float:
-    """Quantile of a chi-square variance in parts of its mean (Wilson and Hilferty)."""
-    width = 2.0 / (9.0 * n_free)
-    return float((1.0 - width + sigmas * np.sqrt(width)) ** 3)
 
 
 def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
