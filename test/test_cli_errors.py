@@ -113,7 +113,6 @@ class TestUsage:
                 ('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', '1e4'),
                 r'--reference-temperature: must be less than 1000, got 10000',
             ),
-            (('convert', 'a.parquet', '-o', 'b'), r'--columns'),
             (('export', 'a', '--to', 'ardupilot', '--device-id', '7', '-o', 'b'), r'is for PX4'),
             (('export', 'a', '--to', 'imu_tk', '--up', '0', '0', '1', '-o', 'b'), r'--up is for'),
             (('export', 'a', '--to', 'betaflight', '-o', 'b'), r'betaflight'),
