@@ -103,7 +103,7 @@ class TestUsage:
             (('simulate', '-o', 'a', '--positions', '0'), r"Invalid value for '--positions'"),
             (
                 ('simulate', '-o', 'a', '--positions=2.5'),
-                r"--positions: expected a whole number, got '2\.5'",
+                r"--positions.*(expected a whole number, got '2\.5'|'2\.5' is not a valid int)",
             ),
             (
                 ('fit', 'a', '-o', 'b', '--gravity', '9.8,1'),

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from importlib.util import find_spec
-from math import isnan
 from pathlib import Path
 from typing import Any, Literal
 
@@ -61,10 +60,6 @@ def expanded(command: Callable[..., Any]) -> Any:
 
     @wraps(command)
     def run(**values: Any) -> Any:
-        for name, value in values.items():
-            # Not every version of typer sees that a NaN is in no range.
-            if isinstance(value, float) and isnan(value):
-                raise usage(f"'--{name.replace('_', '-')}': nan is no number")
         for name, make in makers.items():
             keys = inspect.signature(make).parameters
             values[name] = make(**{key: values.pop(key) for key in keys})
