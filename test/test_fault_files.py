@@ -243,9 +243,10 @@ def test_a_fit_that_is_killed_anywhere_leaves_the_old_file_or_the_new(folder: Pa
     # WHY: the writing alone was tried; a command may touch its output before that, or behind.
     target = folder / 'unit.yaml'
     old = target.read_bytes()
-    words = ('fit', FIT[0], *GRAVITY, '-f', '-q', '-o', target)
+    words = ('fit', *FIT, *GRAVITY, '-f', '-q', '-o', target)
     done = subprocess.run(
         [sys.executable, '-c', WATCHED, *map(str, (target, *words))],
+        cwd=folder,
         env={**os.environ, 'PYTHONPATH': str(ROOT)},
         capture_output=True,
         text=True,
