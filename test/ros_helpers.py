@@ -9,9 +9,11 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import SetParametersResult
@@ -25,6 +27,8 @@ from sensor_msgs.msg import Imu, Temperature
 from thermo_comp.ros.node import CompensationNode, node_in_thread  # noqa: F401 - for the tests
 
 SECOND_NS = 1_000_000_000
+#: Of the first of the samples that a test sends, and from one to the next [ns].
+START_NS, CYCLE_NS = 1_767_225_600 * SECOND_NS, 10_000_000
 #: Longest wait for anything on DDS [s]; only a broken test ever waits as long.
 TIMEOUT = 30.0
 DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
@@ -189,3 +193,45 @@ def drive(
     driver = Driver(peer, kind, topic, qos)
     peer.join(node)
     return driver
+
+
+def node_arguments(unit: Path, *overrides: str) -> list[str]:
+    """Make the arguments of a node that reports 20 times a second."""
+    words = [f'calibration_file:={unit}', 'diagnostics_period:=0.05', *overrides]
+    return [word for override in words for word in ('-p', override)]
+
+
+class Samples:
+    """Sends samples of a unit that stands and hears what comes of them."""
+
+    def __init__(self, peer: Peer, node: CompensationNode) -> None:
+        self._peer = peer
+        self.heard = peer.listen(Imu, 'imu/data_raw')
+        self.driver = drive(peer, node)
+        self.n_sent = 0
+
+    def send(self, n: int = 20) -> None:
+        for k in range(self.n_sent, self.n_sent + n):
+            if k % 10 == 0:
+                self.driver.temperatures(START_NS + k * CYCLE_NS, 20.0, 20.0)
+            self.driver.counts(START_NS + k * CYCLE_NS, *standing(k))
+        self.n_sent += n
+
+    def go_on(self) -> None:
+        """All samples of a further burst come out."""
+        before = len(self.heard)
+        self.send()
+        self._peer.wait_for(lambda: len(self.heard) >= before + 20, '20 further samples')
+
+
+def status_with(peer: Peer, heard: list[DiagnosticArray], text: str) -> DiagnosticStatus:
+    """Wait for the next status whose message holds a text."""
+    del heard[:]
+    found: list[DiagnosticStatus] = []
+
+    def look() -> bool:
+        found.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
+        return bool(found)
+
+    peer.wait_for(look, f'{text!r} among {[a.status[0].message for a in heard][-3:]}')
+    return found[0]

@@ -84,7 +84,7 @@ class TestUsage:
             ),
             (('play', 'a', '--rate', 'inf'), r'--rate must be finite; 0 is as fast as it is'),
             (('fit', 'a', '-o', 'b', '--latitude', '60'), r'--latitude and --height'),
-            (('evaluate', 'a', '-c', 'b', '--window', '0'), r"'--window': .* greater than"),
+            (('evaluate', 'a', '-c', 'b', '--window', '0'), r"'--window': .*(greater|range)"),
             (('evaluate', 'a', '-c', 'b', '--tolerance', '9'), r'--tolerance: expected .*, got'),
             (('report', '-c', 'b', '-o', 'c', '--tolerance', '9ft'), r'like 100ug .*9ft'),
             (('evaluate', 'a', '-c', 'b', '--height', '3'), r'--latitude and --height'),
@@ -94,7 +94,7 @@ class TestUsage:
             (('simulate', '-o', 'a', '--profile', '20, 90'), r'air of 20\.\.90 degC needs -.* W'),
             (
                 ('simulate', '-o', 'a', '--temperature-rate-hz', '1e6'),
-                r"'--temperature-rate-hz': .* less than or equal to 100",
+                r"'--temperature-rate-hz': .*(or equal to 100|<=100)",
             ),
             (
                 ('simulate', '-o', 'a', '--plan', 'held-out', '--positions', '3'),
@@ -103,7 +103,7 @@ class TestUsage:
             (('simulate', '-o', 'a', '--positions', '0'), r"Invalid value for '--positions'"),
             (
                 ('simulate', '-o', 'a', '--positions=2.5'),
-                r"--positions: expected a whole number, got '2\.5'",
+                r"--positions.*(expected a whole number, got '2\.5'|'2\.5' is not a valid int)",
             ),
             (
                 ('fit', 'a', '-o', 'b', '--gravity', '9.8,1'),
@@ -113,7 +113,6 @@ class TestUsage:
                 ('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', '1e4'),
                 r'--reference-temperature: must be less than 1000, got 10000',
             ),
-            (('convert', 'a.parquet', '-o', 'b'), r'--columns'),
             (('export', 'a', '--to', 'ardupilot', '--device-id', '7', '-o', 'b'), r'is for PX4'),
             (('export', 'a', '--to', 'imu_tk', '--up', '0', '0', '1', '-o', 'b'), r'--up is for'),
             (('export', 'a', '--to', 'betaflight', '-o', 'b'), r'betaflight'),

@@ -105,6 +105,32 @@ def test_a_table_is_read_by_its_headings(
     assert log.temperatures['board'].celsius[0] == 20.0
 
 
+@pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])
+def test_a_parquet_table_is_read_by_its_headings(
+    tmp_path: Path, rng: np.random.Generator, kind: str
+) -> None:
+    # WHY: Parquet needed a column map, although it states more than text does.
+    pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
+    import pyarrow.parquet as pq
+
+    stamp_ns = START_NS + STEP_NS * np.arange(N)
+    accel = UP + 0.002 * rng.standard_normal(UP.shape)
+    time = {
+        'dates': stamp_ns.astype('datetime64[ns]'),
+        'text': times('pandas'),
+        'numbers': stamp_ns,
+    }[kind]
+    columns = {'label': ['walk'] * N, 'timestamp': time, 'temperature': np.full(N, 20.5)}
+    columns |= {f'acc_{axis}': accel[:, k] for k, axis in enumerate('xyz')}
+    pq.write_table(pa.table(columns), tmp_path / 'log.parquet')
+    found = guess_columns(tmp_path / 'log.parquet')
+    assert found.accel.unit == 'g'
+    log = table_log(tmp_path / 'log.parquet', found)
+    assert log.stamp_ns.tolist() == stamp_ns.tolist()
+    np.testing.assert_array_equal(log.accel, accel)
+    assert log.temperatures['board'].celsius[0] == 20.5
+
+
 def test_the_right_triad_and_thermometers_are_taken() -> None:
     found = read_headings(
         [
@@ -122,15 +148,31 @@ def test_the_right_triad_and_thermometers_are_taken() -> None:
         'case': ('AHT_tmp[C]', 'degC'),
         't2': ('BMP_temp[K]', 'K'),
     }
-    assert read_headings(['ax', 'ay', 'az']) is None
     assert read_headings(['time', 'magx', 'magy', 'magz']) is None
 
 
 def test_headings_that_name_nothing_are_listed(tmp_path: Path) -> None:
     path = tmp_path / 'log.csv'
     path.write_text('a,b,c\n1,2,3\n2,3,4\n')
-    with pytest.raises(RecordingError, match="name no time or no accelerometer: 'a', 'b', 'c'"):
+    with pytest.raises(
+        RecordingError, match="name no accelerometer: 'a', 'b', 'c'; give a column map"
+    ):
         guess_columns(path)
+
+
+def test_headings_without_a_time_take_a_rate(tmp_path: Path, rng: np.random.Generator) -> None:
+    # WHY: --rate-hz was for tables without headings alone, and not heard with them.
+    path, rows = tmp_path / 'log.csv', UP + 0.002 * rng.standard_normal(UP.shape)
+    path.write_text('\n'.join(['ax,ay,az', *(f'{x:.5f},{y:.5f},{z:.5f}' for x, y, z in rows)]))
+    with pytest.raises(RecordingError, match="name no time: 'ax', 'ay', 'az'; give --rate-hz, or"):
+        guess_columns(path)
+    columns = guess_columns(path, 50.0)
+    (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(columns)))
+    assert load_column_map(tmp_path / 'map.yaml') == columns
+    np.testing.assert_array_equal(np.diff(table_log(path, columns).stamp_ns), 2 * 10**7)
+    path.write_text('t,ax,ay,az\n' + '0,0,0,9.8\n' * 100)
+    with pytest.raises(RecordingError, match="--rate-hz: its column 't' has the times"):
+        guess_columns(path, 100.0)
 
 
 def test_the_guessed_map_is_printed(tmp_path: Path, rng: np.random.Generator, cli: Cli) -> None:

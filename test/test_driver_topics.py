@@ -19,7 +19,16 @@ from builders import thermal_calibration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_helpers import SECOND_NS, TIMEOUT, Peer, node_in_thread, stamped, standing
+from ros_helpers import (
+    SECOND_NS,
+    START_NS,
+    TIMEOUT,
+    Peer,
+    node_arguments,
+    node_in_thread,
+    stamped,
+    standing,
+)
 from sensor_msgs.msg import BatteryState, Temperature
 from std_msgs.msg import Float64
 
@@ -31,7 +40,6 @@ from thermo_comp.ros.node import main
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
-START_NS = 1_767_225_600 * SECOND_NS
 NAMES = {'board': '/pack:temperature', 'case': '/case_t'}
 
 
@@ -47,11 +55,6 @@ def unit(tmp_path: Path) -> Path:
     path = tmp_path / 'unit.yaml'
     save_calibration(thermal_calibration(), path)
     return path
-
-
-def arguments(unit: Path, topics: str) -> list[str]:
-    words = [f'calibration_file:={unit}', f'topics:={topics}', 'diagnostics_period:=0.05']
-    return [word for override in words for word in ('-p', override)]
 
 
 def sample(stamp_ns: int) -> Vector3Stamped:
@@ -81,7 +84,7 @@ def test_the_node_finds_the_type_while_it_runs(peer: Peer, unit: Path, is_file: 
 
         return look
 
-    with node_in_thread(*arguments(unit, topics)):
+    with node_in_thread(*node_arguments(unit, f'topics:={topics}')):
         # Each finds a subscriber of its own type.
         board = peer.publisher(BatteryState, '/pack')
         case = peer.publisher(Float64, '/case_t')
@@ -112,7 +115,8 @@ def test_the_node_finds_the_type_while_it_runs(peer: Peer, unit: Path, is_file: 
 def test_topics_that_cannot_be(
     unit: Path, topics: str, text: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(['thermo_comp_node', '--ros-args', *arguments(unit, topics)]) == 1
+    command = ['thermo_comp_node', '--ros-args', *node_arguments(unit, f'topics:={topics}')]
+    assert main(command) == 1
     (line,) = capfd.readouterr().err.splitlines()
     assert text in line
 
@@ -122,10 +126,16 @@ def test_a_drivers_imu_data_raw_needs_another_output(
 ) -> None:
     calibration = replace(thermal_calibration(), unit=Unit('T-1', 'm/s^2', 160.0, 0.01))
     save_calibration(calibration, unit, overwrite=True)
-    assert main(['thermo_comp_node', '--ros-args', *arguments(unit, 'imu=/imu/data_raw')]) == 1
+    command = [
+        'thermo_comp_node',
+        '--ros-args',
+        *node_arguments(unit, 'topics:=imu=/imu/data_raw'),
+    ]
+    assert main(command) == 1
     said = '/imu/data_raw: is both input and output: remap imu/data_raw to another name'
     assert said in capfd.readouterr().err
-    with node_in_thread(*arguments(unit, 'imu=/imu/data_raw,output=/imu/compensated')) as node:
+    names = 'imu=/imu/data_raw,output=/imu/compensated'
+    with node_in_thread(*node_arguments(unit, f'topics:={names}')) as node:
         assert node.node.count_publishers('/imu/compensated') == 1
 
 

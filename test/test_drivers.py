@@ -5,22 +5,21 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from builders import axis_set, calibration, regime_set
-from conftest import ROOT
+from conftest import ROOT, Cli, parsed
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from thermo_comp.errors import RecordingError
-from thermo_comp.recording.overview import survey_recording
-from thermo_comp.recording.reader import open_recording
-from thermo_comp.recording.topics import Topics, read_names
-from thermo_comp.replay import replay
-from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.errors import ThermoCompError
+from thermo_comp.recording.topics import read_names
+from thermo_comp.unit.calibration import Axes, AxisReference, Calibration, Unit
+from thermo_comp.unit.calibration_file import save_calibration
 
 FILES = sorted((ROOT / 'config' / 'drivers').glob('*.yaml'))
 START_NS = 1_767_225_600 * 10**9
@@ -72,7 +71,13 @@ LAYOUTS = {
 }
 #: Those without a temperature.
 LACKS = {'ardupilot', 'realsense', 'mpu6050'}
-SECONDS, RATE = 60, 20
+#: Six faces and the first one again, each for REST_S, while the board warms [K/s].
+UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))
+RATE, REST_S, WARMING = 10, 75, 0.05
+SECONDS = len(UPS) * REST_S
+GRAVITY, MICRO_G = 9.80665, 9.80665e-6
+#: What the unit adds [m/s^2], also per K, and its noise: 4 ug in the mean of a minute.
+BIAS, SLOPE, NOISE = np.array([0.05, -0.03, 0.08]), np.array([1e-3, -2e-3, 3e-3]), 1e-3
 
 
 @pytest.fixture(scope='module')
@@ -83,22 +88,22 @@ def store() -> Any:
     return found
 
 
-def message(store: Any, kind: str, stamp_ns: int, second: float) -> Any:
-    """Make a message at rest that warms by 0.1 K/s."""
-    types, celsius, zeros = store.types, 20.0 + 0.1 * second, np.zeros(9)
+def message(store: Any, kind: str, stamp_ns: int, celsius: float, force: Any) -> Any:
+    """Make a message of a type."""
+    types, zeros = store.types, np.zeros(9)
     header = types['std_msgs/msg/Header'](
         types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 10**9)), 'imu_link'
     )
     vector = types['geometry_msgs/msg/Vector3']
-    force = vector(0.01 * np.sin(1e3 * second), 0.0, 9.80665)
     if kind == IMU:
         level = types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
-        return types[kind](header, level, zeros, vector(0.0, 0.0, 0.0), zeros, force, zeros)
+        still = vector(0.0, 0.0, 0.0)
+        return types[kind](header, level, zeros, still, zeros, vector(*force), zeros)
     if kind == MIP:
         own = types['microstrain_inertial_msgs/msg/MipHeader'](header, 0)
         return types[kind](own, celsius - 1.0, celsius + 1.0, celsius)
     if kind == PX4:
-        return types[kind](1, 1, 7, 0.0, 0.0, -9.8, celsius, 0, np.zeros(3, np.uint8), 1)
+        return types[kind](1, 1, 7, *force, celsius, 0, np.zeros(3, np.uint8), 1)
     if kind == MAGNETIC:
         return types[kind](header, vector(1e-5, 2e-5, 4e-5), zeros)
     if kind == VECTOR:
@@ -108,19 +113,23 @@ def message(store: Any, kind: str, stamp_ns: int, second: float) -> Any:
 
 @pytest.fixture
 def bag(request: Any, tmp_path: Path, store: Any) -> Path:
-    """Write a minute of a driver: samples at 20 Hz, all else at 1 Hz."""
-    path = tmp_path / 'bag'
+    """Write a tumble of a driver's: samples at 10 Hz, all else at 1 Hz."""
+    path, noise = tmp_path / 'bag', np.random.default_rng(40)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         links = {
             topic: (writer.add_connection(topic, kind, typestore=store), kind)
             for topic, kind in LAYOUTS[request.param].items()
         }
         for row in range(SECONDS * RATE):
-            stamp_ns = START_NS + row * 10**9 // RATE
+            stamp_ns, warmer = START_NS + row * 10**9 // RATE, WARMING * row / RATE
+            force = GRAVITY * UPS[row // (REST_S * RATE)] + BIAS + SLOPE * warmer
+            force += NOISE * noise.standard_normal(3)
             for link, kind in links.values():
                 if kind == IMU or row % RATE == 0:
-                    data = store.serialize_cdr(message(store, kind, stamp_ns, row / RATE), kind)
-                    writer.write(link, stamp_ns + 1, data)
+                    # A barometer lags.
+                    celsius = 20.0 + warmer - (2.0 if 'baro' in link.topic else 0.0)
+                    own = message(store, kind, stamp_ns, celsius, force)
+                    writer.write(link, stamp_ns + 1, store.serialize_cdr(own, kind))
     return path
 
 
@@ -136,59 +145,95 @@ def test_every_driver_has_a_layout_and_a_line_in_the_page() -> None:
 @pytest.mark.parametrize(
     ('path', 'bag'), [(path, path.stem) for path in FILES], indirect=['bag'], ids=str
 )
-def test_the_file_reads_the_drivers_bag(path: Path, bag: Path, tmp_path: Path) -> None:
-    names = {'imu': '/imu/uncompensated', **read_names(path)}
-    lacks = {'board'} if path.stem in LACKS else set()
-    topics = Topics.named(names)
-    with open_recording(bag, topics, require={'accel', 'board'} - lacks) as reader:
-        assert set(reader.topics) == ({'accel', 'board', *topics_of(names)} - lacks)
-        for role, topic in reader.topics.items():
-            assert topic == names['imu' if role == 'accel' else role].partition(':')[0]
-    survey = survey_recording(bag, topics)
-    if 'board' not in lacks:
-        board = survey.thermometers['board']
-        assert (board.n, board.rate_hz) == (pytest.approx(SECONDS, abs=1), pytest.approx(1.0))
-        assert board.lowest == pytest.approx(20.0, abs=0.2)
-        assert board.highest == pytest.approx(25.9, abs=1e-3)
-    for one in lacks:
-        with pytest.raises(RecordingError, match='no such topic'):
-            open_recording(bag, topics, require={one})
-    assert (survey.info.input, survey.n) == ('imu', SECONDS * RATE)
-    # 1 mm/s^2 per K along z: what is taken off says which temperature was read.
-    scale = calibration(
+def test_every_command_works_on_the_drivers_bag(
+    path: Path, bag: Path, tmp_path: Path, cli: Cli
+) -> None:
+    names, topics = read_names(path), ('--topics', path)
+    has_board = path.stem not in LACKS
+    told = cli('info', bag, *topics).stdout
+    assert f'{SECONDS * RATE} samples of imu, {RATE} Hz' in told
+    assert f'{len(UPS)} still intervals' in told
+    # The only thermometers are those of the file; another number of their message is none.
+    assert re.findall(r'^(board|case) +1\.000 +(\S+) +(\S+)', told, re.MULTILINE) == [
+        (name, f'{20.0 - lag:.2f}', f'{46.2 - lag:.2f}')
+        for name, lag in (('board', 0.0), ('case', 2.0))
+        if name in names
+    ]
+    assert 'is taken for board' not in told
+    assert ('no case temperature' in told) == ('case' not in names)
+    assert ('--topic case=TOPIC\n' in told) == ('case' not in names)
+
+    fitted = tmp_path / 'unit.yaml'
+    said = cli('fit', bag, *topics, '-o', fitted, '--gravity', str(GRAVITY))
+    assert ('no temperature was recorded' in said.stdout) == (not has_board)
+    # The noise of a minute's mean is 4 ug; constants alone leave 23 K of 1 mm/s^2 per K.
+    found = parsed(cli('evaluate', bag, '-c', fitted, *topics, '--json', code=None).stdout)
+    left = found['sections_m_s2']['all']['rms'] / MICRO_G
+    assert left < 10.0 if has_board else 500.0 < left < 2500.0
+
+    cli('replay', bag, '-c', fitted, '-o', tmp_path / 'out.csv', *topics)
+    with (tmp_path / 'out.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    # A sample is stamped as the first reading is, and stands in front of it: it waits for none.
+    assert len(rows) >= SECONDS * RATE - 1
+    if not has_board:
+        save_calibration(warming_unit(), tmp_path / 'warm.yaml')
+        command = 'replay', bag, '-c', tmp_path / 'warm.yaml', '-o', tmp_path / 'o.csv'
+        error = cli(*command, *topics, code=1).stderr
+        assert 'temperature/board: no such topic' in error
+
+
+def warming_unit() -> Calibration:
+    """Make a unit whose z grows by 1 mm/s^2 per K: what is taken off says what was read."""
+    return calibration(
         unit=Unit('T-1', 'm/s^2', 160.0, 1.0 / RATE),
         axes=Axes(*[AxisReference(1.0, 0.0)] * 3),
         static=regime_set(z=axis_set((0.0, 1e-3))),
         dynamic=regime_set(z=axis_set((0.0, 1e-3))),
     )
-    if 'board' in lacks:
-        with pytest.raises(RecordingError, match='temperature/board: no such topic'):
-            replay(bag, scale, tmp_path / 'out.csv', topics=topics)
-        return
-    replay(bag, scale, tmp_path / 'out.csv', topics=topics)
-    with (tmp_path / 'out.csv').open() as file:
-        last = list(csv.DictReader(file))[-1]
-    assert float(last['specific_force_z_m_s2']) == pytest.approx(9.80665 - 5.9e-3, abs=3e-4)
-
-
-def topics_of(names: dict[str, str]) -> set[str]:
-    return {one for one in names if one not in ('imu', 'counts', 'output')}
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
-def test_the_node_listens_where_the_file_says(path: Path, tmp_path: Path) -> None:
+def test_the_node_works_as_the_file_says(path: Path, tmp_path: Path) -> None:
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-    from ros_helpers import node_in_thread
+    from ros_helpers import Peer, node_in_thread, stamped
+    from sensor_msgs.msg import Imu, Temperature
+    from std_msgs.msg import Float64
 
-    from thermo_comp.unit.calibration_file import save_calibration
+    from thermo_comp.ros.fields import LiveField
 
-    names = read_names(path)
-    kind = 'm/s^2' if 'imu' in names else 'counts'
-    save_calibration(calibration(unit=Unit('T-1', kind, 1e3, 0.05)), tmp_path / 'unit.yaml')
-    words = [f'calibration_file:={tmp_path / "unit.yaml"}', f'topics:={path}']
+    names = {'imu': '/imu/uncompensated', 'board': '/temperature/board', **read_names(path)}
+    layout = LAYOUTS[path.stem]
+    save_calibration(warming_unit(), tmp_path / 'unit.yaml')
+    words = [f'calibration_file:={tmp_path / "unit.yaml"}', f'topics:={path}', 'input:=imu']
     with node_in_thread(*(word for one in words for word in ('-p', one))) as node:
-        heard = {one.topic_name for one in node.node.subscriptions}
-        assert {
-            topic.partition(':')[0] for name, topic in names.items() if name != 'output'
-        } <= heard
-        assert node.node.count_publishers(names.get('output', '/imu/data_raw')) == 1
+        heard_topics = {one.topic_name for one in node.node.subscriptions}
+        topics = {topic.partition(':')[0] for name, topic in names.items() if name != 'output'}
+        board, _, field = names['board'].partition(':')
+        if field:
+            # Its package is not here; with it, the type is found when the driver sends.
+            assert topics - {board} <= heard_topics
+            with pytest.raises(ThermoCompError, match=f'{board}: its type .* is not installed'):
+                LiveField(board, layout[board], field)
+            return
+        assert topics <= heard_topics | {board}
+        peer = Peer()
+        try:
+            heard = peer.listen(Imu, names.get('output', 'imu/data_raw'))
+            is_bare = layout.get(board) == FLOAT
+            reading = Float64(data=30.0) if is_bare else Temperature(temperature=30.0)
+            thermometer = peer.publisher(type(reading), board)
+            samples = peer.publisher(Imu, names['imu'])
+            peer.join(node)
+            for k in range(40):
+                message = stamped(Imu(), START_NS + k * 10**9 // RATE, 'imu_link')
+                message.linear_acceleration.x = 0.01 * (k % 3)
+                message.linear_acceleration.z = GRAVITY
+                if not is_bare:
+                    stamped(reading, START_NS + k * 10**9 // RATE)
+                thermometer.publish(reading)
+                samples.publish(message)
+            peer.wait_for(lambda: heard and abs(heard[-1].linear_acceleration.z - GRAVITY) > 5e-3)
+        finally:
+            peer.close()
+        assert heard[-1].linear_acceleration.z == pytest.approx(GRAVITY - 0.01, abs=1e-6)

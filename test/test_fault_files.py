@@ -208,3 +208,52 @@ def test_a_fit_of_a_bag_that_holds_nothing_any_more(folder: Path, cli: Cli) -> N
     finished = cli('fit', torn, FIT[1], *GRAVITY, '-o', 'new.yaml', code=1, cwd=folder)
     assert 'torn.mcap: ' in finished.stderr
     assert 'Traceback' not in finished.stderr
+
+
+#: Runs the command, and at each call that the package takes or has made looks at the output:
+#: what is there then is what a kill there leaves. Prints what it was, once for each change.
+WATCHED = """
+import os, sys, threading
+from thermo_comp.cli.app import run
+target, n, seen = sys.argv[1], 0, []
+def look(frame, event, _):
+    global n
+    if event not in ('call', 'c_return') or '/thermo_comp/' not in frame.f_code.co_filename:
+        return
+    n += 1
+    try:
+        with_what = os.stat(target)
+        state = with_what.st_ino, with_what.st_mtime_ns, with_what.st_size
+    except FileNotFoundError:
+        state = None
+    if not seen or seen[-1][0] != state:
+        handle = state and os.open(target, os.O_RDONLY)
+        seen.append((state, os.read(handle, 1 << 24).hex() if state else 'nothing'))
+        if state:
+            os.close(handle)
+threading.setprofile(look)
+sys.setprofile(look)
+code = run(sys.argv[2:])
+sys.setprofile(None)
+print(code, n, *(content for _, content in seen))
+"""
+
+
+def test_a_fit_that_is_killed_anywhere_leaves_the_old_file_or_the_new(folder: Path) -> None:
+    # WHY: the writing alone was tried; a command may touch its output before that, or behind.
+    target = folder / 'unit.yaml'
+    old = target.read_bytes()
+    words = ('fit', *FIT, *GRAVITY, '-f', '-q', '-o', target)
+    done = subprocess.run(
+        [sys.executable, '-c', WATCHED, *map(str, (target, *words))],
+        cwd=folder,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    code, n_looks, *contents = done.stdout.splitlines()[-1].split()
+    assert (code, int(n_looks) > 10_000) == ('0', True)
+    new = target.read_bytes()
+    assert new != old
+    assert [bytes.fromhex(content) for content in contents] == [old, new]

@@ -120,11 +120,25 @@ def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
     assert bag.n_still_cells > 0.98 * bag.n_cells
 
 
-@pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0])
-def test_a_jump_far_beyond_such_noise_is_found(rng, tau_s):
+@pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
+def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
+    # WHY: means over 10 s know a level to 3 mg there, so 20 mg within one sample were overlooked.
     rest = Rest(rng)
-    behind_a_low_pass(rng, rest, tau_s, 1.0 * MG)
+    behind_a_low_pass(rng, rest, tau_s, sd * MG)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)
-    (event,) = find_jumps(reduce_source(rest.source(), full_scale=None))
-    # Means of 10 s on each side of 10 s / (2 tau) independent samples beside a free drift: 4 sd.
-    assert event.along / MG == pytest.approx(20.0, abs=8.0 * np.sqrt(2.0 * 2.0 * tau_s / 10.0))
+    bag = reduce_source(rest.source(), full_scale=None)
+    assert len(bag.intervals) == 2
+    (event,) = find_jumps(bag)
+    assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
+    # To what is new in one sample, which no sample before it tells: 4 sd.
+    new = sd * np.sqrt(1.0 - np.exp(-2.0 / (rest.rate_hz * tau_s)))
+    assert event.along / MG == pytest.approx(20.0, abs=4.0 * new)
+
+
+@pytest.mark.parametrize('tau_s', [0.5, 3.0])
+def test_a_shock_that_the_low_pass_lets_die_away_is_no_jump(rng, tau_s):
+    rest = Rest(rng)
+    behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
+    since = rest.time - 301.0
+    rest.accel[:, 2] += np.where(since >= 0.0, 40.0 * MG * np.exp(-since.clip(0.0) / tau_s), 0.0)
+    assert find_jumps(reduce_source(rest.source(), full_scale=None)) == ()

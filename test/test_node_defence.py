@@ -35,8 +35,16 @@ from rcl_interfaces.srv import (
     SetParametersAtomically,
 )
 from rclpy.parameter import Parameter
-from ros_helpers import SECOND_NS, TIMEOUT, Peer, drive, node_in_thread, standing
-from sensor_msgs.msg import Imu
+from ros_helpers import (
+    CYCLE_NS,
+    START_NS,
+    TIMEOUT,
+    Peer,
+    Samples,
+    node_arguments,
+    node_in_thread,
+    status_with,
+)
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
@@ -44,9 +52,6 @@ from thermo_comp.ros.parameters import PARAMETERS_LIMIT, NodeConfig
 from thermo_comp.ros.reader import Reader, read_within
 from thermo_comp.text import one_line
 from thermo_comp.unit.calibration_file import save_calibration
-
-START_NS = 1_767_225_600 * SECOND_NS
-CYCLE_NS = 10_000_000
 
 
 @pytest.fixture
@@ -61,46 +66,6 @@ def unit(tmp_path: Path) -> Path:
     path = tmp_path / 'unit.yaml'
     save_calibration(calibration(), path)
     return path
-
-
-def arguments(unit: Path, *overrides: str) -> list[str]:
-    words = [f'calibration_file:={unit}', 'diagnostics_period:=0.05', *overrides]
-    return [word for override in words for word in ('-p', override)]
-
-
-class Samples:
-    """Sends samples of a unit that stands and hears what comes of them."""
-
-    def __init__(self, peer: Peer, node: Any) -> None:
-        self._peer = peer
-        self.heard = peer.listen(Imu, 'imu/data_raw')
-        self.driver = drive(peer, node)
-        self.n_sent = 0
-
-    def send(self, n: int = 20) -> None:
-        for k in range(self.n_sent, self.n_sent + n):
-            if k % 10 == 0:
-                self.driver.temperatures(START_NS + k * CYCLE_NS, 20.0, 20.0)
-            self.driver.counts(START_NS + k * CYCLE_NS, *standing(k))
-        self.n_sent += n
-
-    def go_on(self) -> None:
-        """All samples of a further burst come out."""
-        before = len(self.heard)
-        self.send()
-        self._peer.wait_for(lambda: len(self.heard) >= before + 20, '20 further samples')
-
-
-def status_with(peer: Peer, heard: list[DiagnosticArray], text: str) -> DiagnosticStatus:
-    del heard[:]
-    found: list[DiagnosticStatus] = []
-
-    def look() -> bool:
-        found.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
-        return bool(found)
-
-    peer.wait_for(look, f'{text!r} among {[a.status[0].message for a in heard][-3:]}')
-    return found[0]
 
 
 def odd(name: str, kind: int) -> ParameterMessage:
@@ -137,7 +102,7 @@ STRANGE: list[ParameterMessage] = [
 
 @pytest.mark.parametrize('together', [False, True], ids=['each', 'together'])
 def test_any_request_is_answered_and_samples_go_on(peer: Peer, unit: Path, together: bool) -> None:
-    with node_in_thread(*arguments(unit)) as node:
+    with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
         samples.go_on()
         kind = SetParametersAtomically if together else SetParameters
@@ -177,7 +142,7 @@ def test_questions_of_any_length_are_answered(
 ) -> None:
     # WHY: 100 000 names kept the samples waiting for more than a second.
     name = 'thermo_comp/' + re.sub('(?<!^)(?=[A-Z])', '_', kind.__name__).lower()
-    with node_in_thread(*arguments(unit)) as node:
+    with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
 
         def ask(*names: str) -> str:
@@ -196,7 +161,7 @@ def test_questions_of_any_length_are_answered(
 
 def test_a_callback_that_fails_is_logged_counted_and_survived(peer: Peer, unit: Path) -> None:
     # WHY: the class of fault: whatever nobody foresaw, in a service, a call or the relay itself.
-    with node_in_thread(*arguments(unit)) as node:
+    with node_in_thread(*node_arguments(unit)) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
         samples.go_on()
@@ -237,7 +202,7 @@ def test_nothing_of_a_file_that_is_no_calibration_is_told(
     peer: Peer, unit: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / 'other'
-    with node_in_thread(*arguments(unit)):
+    with node_in_thread(*node_arguments(unit)):
         for content, rule in NOT_CALIBRATIONS.items():
             other.write_text(content)
             (result,) = peer.set_parameters(calibration_file=str(other))
@@ -258,7 +223,7 @@ def test_calibrations_are_taken_from_one_folder_only(
     (folder / 'link.yaml').symlink_to(outside)
     (folder / 'up').symlink_to(tmp_path)
     (folder / 'good.yaml').symlink_to('unit.yaml')
-    with node_in_thread(*arguments(inside, f'calibration_directory:={folder}')):
+    with node_in_thread(*node_arguments(inside, f'calibration_directory:={folder}')):
         for name in (outside, folder / '../outside.yaml', folder / 'link.yaml', '/etc/shadow'):
             (result,) = peer.set_parameters(calibration_file=str(name))
             expected = 'must be in the folder that the parameter `calibration_directory` names'
@@ -314,7 +279,7 @@ def test_at_the_start_a_file_that_hangs_is_given_up(monkeypatch: Any) -> None:
 
 
 def test_while_a_file_hangs_the_other_parameters_go_on(peer: Peer, unit: Path) -> None:
-    with node_in_thread(*arguments(unit)) as node:
+    with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
         node._reader._limit_s = 3.0
@@ -386,7 +351,7 @@ def test_a_start_that_hangs_ends_with_one_signal() -> None:
 
 
 def test_what_param_dump_writes_param_load_sets(peer: Peer, unit: Path) -> None:
-    with node_in_thread(*arguments(unit)) as node:
+    with node_in_thread(*node_arguments(unit)) as node:
         names = [one for one in node.node._parameters]  # noqa: C416
         request = GetParameters.Request(names=names)
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values

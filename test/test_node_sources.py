@@ -10,7 +10,7 @@ import contextlib
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,25 @@ from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
+from ros_helpers import (
+    CYCLE_NS,
+    DEEP,
+    SECOND_NS,
+    START_NS,
+    Peer,
+    Samples,
+    drive,
+    node_arguments,
+    node_in_thread,
+    stamp_of,
+    stamped,
+    standing,
+    status_with,
+)
 from sensor_msgs.msg import Imu, Temperature
 
 from thermo_comp.ros.waitloop import Sources
 from thermo_comp.unit.calibration_file import save_calibration
-
-START_NS = 1_767_225_600 * SECOND_NS
-CYCLE_NS = 10_000_000
 
 
 @pytest.fixture
@@ -46,61 +57,39 @@ def unit(tmp_path: Path) -> Path:
     return path
 
 
-def arguments(unit: Path, *overrides: str) -> list[str]:
-    words = [f'calibration_file:={unit}', 'diagnostics_period:=0.05', *overrides]
-    return [word for override in words for word in ('-p', override)]
-
-
-class Samples:
-    """Sends samples of a unit that stands and hears what comes of them."""
-
-    def __init__(self, peer: Peer, node: Any) -> None:
-        self._peer = peer
-        self.heard = peer.listen(Imu, 'imu/data_raw')
-        self.driver = drive(peer, node)
-        self.n_sent = 0
-
-    def send(self, n: int = 20) -> None:
-        for k in range(self.n_sent, self.n_sent + n):
-            if k % 10 == 0:
-                self.driver.temperatures(START_NS + k * CYCLE_NS, 20.0, 20.0)
-            self.driver.counts(START_NS + k * CYCLE_NS, *standing(k))
-        self.n_sent += n
-
-    def go_on(self) -> None:
-        """All samples of a further burst come out."""
-        before = len(self.heard)
-        self.send()
-        self._peer.wait_for(lambda: len(self.heard) >= before + 20, '20 further samples')
-
-
-def status_with(peer: Peer, heard: list[DiagnosticArray], text: str) -> DiagnosticStatus:
-    del heard[:]
+def contested(
+    peer: Peer, heard: list[DiagnosticArray], topic: str, send: Callable[[], None]
+) -> DiagnosticStatus:
+    """Let both send, however slowly, until the node says that two do."""
+    text = f'2 publishers on {topic}, it is not used until one of them sends alone'
     found: list[DiagnosticStatus] = []
 
     def look() -> bool:
+        send()
         found.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
         return bool(found)
 
-    peer.wait_for(look, f'{text!r} among {[a.status[0].message for a in heard][-3:]}')
+    peer.poll(look, text)
+    assert found[0].level == DiagnosticStatus.ERROR
     return found[0]
 
 
 def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> None:
     # WHY: a second driver's samples, another attitude, went out as if they were the unit's.
-    with node_in_thread(*arguments(unit)) as node:
+    with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
         samples.go_on()
         other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', DEEP)
         peer.poll(other.get_subscription_count, 'the second publisher')
-        for k in range(50):
+
+        def both() -> None:
             samples.send(1)
             strange = stamped(Vector3Stamped(), START_NS + samples.n_sent * CYCLE_NS - 5)
-            strange.vector.x, strange.vector.y = 2000.0 + k % 3, -2000.0 + k % 5
+            strange.vector.x, strange.vector.y = 2000.0 + samples.n_sent % 3, -2000.0
             other.publish(strange)
-        status = status_with(peer, diagnostics, '2 publishers on /accel/counts')
-        assert status.level == DiagnosticStatus.ERROR
+
+        status = contested(peer, diagnostics, '/accel/counts', both)
         values = {one.key: one.value for one in status.values}
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
@@ -113,21 +102,22 @@ def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> N
         assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
 
 
-#: A driver as a process of its own: 100 Hz, in real time, each sample with its name.
+#: A driver as a process of its own: 100 Hz from its first subscriber on, its name in each sample.
 DRIVER = """
 import sys, time, rclpy
 from geometry_msgs.msg import Vector3Stamped
+from itertools import count
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Temperature
 rclpy.init()
 node = rclpy.create_node('driver_' + sys.argv[1])
 samples = node.create_publisher(Vector3Stamped, 'accel/counts', QoSProfile(depth=5000))
 kinds = {n: node.create_publisher(Temperature, 'temperature/' + n, 10) for n in ('board', 'case')}
-while not samples.get_subscription_count():
-    time.sleep(0.01)
-k = 0
-while True:
-    now = time.time_ns()
+numbers = count()
+def send():
+    if not samples.get_subscription_count():
+        return
+    now, k = time.time_ns(), next(numbers)
     message = Vector3Stamped()
     message.header.frame_id = sys.argv[1]
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
@@ -138,8 +128,8 @@ while True:
     samples.publish(message)
     if not k:
         print(now, flush=True)
-    k += 1
-    time.sleep(0.01)
+node.create_timer(0.01, send)
+rclpy.spin(node)
 """
 
 
@@ -159,7 +149,7 @@ def driver_process(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
 
 def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer: Peer, unit: Path) -> None:
     # WHY: for the 20 s of the dead one's lease nothing was published.
-    with node_in_thread(*arguments(unit)) as node:
+    with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         heard = peer.listen(Imu, 'imu/data_raw')
 
@@ -221,19 +211,19 @@ def test_without_numbers_two_publishers_are_two() -> None:
 
 
 def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> None:
-    with node_in_thread(*arguments(unit)) as node:
+    with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
         samples.go_on()
         other = peer.node.create_publisher(Temperature, 'temperature/board', DEEP)
         peer.poll(other.get_subscription_count, 'the second publisher')
-        for _ in range(10):
-            other.publish(
-                stamped(Temperature(temperature=20.5), START_NS + samples.n_sent * CYCLE_NS)
-            )
+
+        def both() -> None:
+            reading = Temperature(temperature=20.5)
+            other.publish(stamped(reading, START_NS + samples.n_sent * CYCLE_NS))
             samples.send(10)
-        status = status_with(peer, diagnostics, '2 publishers on /temperature/board')
-        assert status.level == DiagnosticStatus.ERROR
+
+        contested(peer, diagnostics, '/temperature/board', both)
         board = node._compensator.thermal.tracker.board
         assert board.temperature == pytest.approx(20.0, abs=1e-6)
         assert board.stamp_ns < START_NS + 20 * CYCLE_NS
@@ -241,7 +231,7 @@ def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> 
 
 def test_a_driver_that_cannot_be_heard_is_named(peer: Peer, unit: Path) -> None:
     reliable = 'qos_overrides./accel/counts.subscription.reliability:=reliable'
-    with node_in_thread(*arguments(unit, reliable)):
+    with node_in_thread(*node_arguments(unit, reliable)):
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         unheard = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
         peer.node.create_publisher(Vector3Stamped, 'accel/counts', unheard)
@@ -260,7 +250,7 @@ def test_reports_more_often_than_samples_are_no_silence(peer: Peer, tmp_path: Pa
     slow = tmp_path / 'slow.yaml'
     # Its samples may be 1.5 s late: more than a busy machine keeps the driver waiting.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)
-    with node_in_thread(*arguments(slow, 'diagnostics_period:=0.01')) as node:
+    with node_in_thread(*node_arguments(slow, 'diagnostics_period:=0.01')) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         driver = drive(peer, node)
         imu = peer.listen(Imu, 'imu/data_raw')
@@ -280,7 +270,7 @@ def test_reports_more_often_than_samples_are_no_silence(peer: Peer, tmp_path: Pa
 
 def test_a_reading_far_ahead_is_forgotten(peer: Peer, unit: Path) -> None:
     # WHY: one reading a day ahead kept WARN until a sample of that day came.
-    with node_in_thread(*arguments(unit)) as node:
+    with node_in_thread(*node_arguments(unit)) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
         samples.go_on()

@@ -15,6 +15,7 @@ sys.path.insert(0, str(ROOT / 'benchmarks'))
 
 import strangers
 import strangers_cases as cases
+from strangers_helpers import ATTITUDES, LEVEL, unit
 from strangers_limits import Result
 from strangers_units import (
     BOARD,
@@ -26,7 +27,6 @@ from strangers_units import (
     STILL_AIR,
     UG,
     Bag,
-    Unit,
     integrate,
     network,
     program,
@@ -35,25 +35,6 @@ from strangers_units import (
     rng_of,
     spread,
 )
-
-ZEROS = np.zeros((1, 3))
-LEVEL = np.array([0.0, 0.0, 1.0])
-#: Six faces and the twelve edges of a cube.
-ATTITUDES = np.array([
-    (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)
-    if 0 < abs(x) + abs(y) + abs(z) < 3
-])  # fmt: skip
-ATTITUDES = ATTITUDES / np.linalg.norm(ATTITUDES, axis=1)[:, None]
-
-
-def unit(**given):
-    """Make a unit without errors, noise and rounding."""
-    perfect = {
-        'bias': np.zeros(3), 'gain': np.zeros(3), 'skew': np.zeros(3), 'bias_curve': ZEROS,
-        'scale_curve': ZEROS, 'counts': 0.0, 'density': 0.0, 'reading_sd': 0.0,
-        'reading_step': 1e-9, 'heat_k': 0.0,
-    }  # fmt: skip
-    return Unit(**{**perfect, **given})
 
 
 def ramp(given, rate, hours, environment=CHAMBER):

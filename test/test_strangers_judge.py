@@ -18,21 +18,12 @@ sys.path.insert(0, str(ROOT / 'benchmarks'))
 import strangers
 import strangers_cases as cases
 from strangers_baselines import Minutes, by_drift, by_norm, minutes
+from strangers_helpers import ATTITUDES, LEVEL, ZEROS, unit
 from strangers_limits import LIMITS, Limit, Result, Score, best_baseline, misses, rows_of
 from strangers_recorded import blocks_of, part, rests_of
 from strangers_units import GRAVITY, UG, Bag, rng_of
-from test_strangers import unit
 
 from thermo_comp.unit.calibration import Axes, AxisReference
-
-ZEROS = np.zeros((1, 3))
-LEVEL = np.array([0.0, 0.0, 1.0])
-#: Six faces and the twelve edges of a cube.
-ATTITUDES = np.array([
-    (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)
-    if 0 < abs(x) + abs(y) + abs(z) < 3
-])  # fmt: skip
-ATTITUDES = ATTITUDES / np.linalg.norm(ATTITUDES, axis=1)[:, None]
 
 
 def of_attitudes(given, board):

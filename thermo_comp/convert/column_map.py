@@ -39,7 +39,8 @@ _STEPS_S = (5e-5, 0.5)
 #: between, which lasts milliseconds otherwise.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
-_GIVE_MAP = 'give a column map: --columns MAP'
+_A_MAP = 'a column map: --columns MAP'
+_GIVE_MAP = f'give {_A_MAP}'
 
 
 @dataclass(frozen=True)
@@ -147,8 +148,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
     thermometers |= {one.name: one for one in columns.further}
     said = {name: one for name, one in thermometers.items() if one is not None}
     wanted = [*accel.columns, *(gyro.columns if gyro else ()), *(t.column for t in said.values())]
-    read = read_parquet if path.suffix.lower() in ('.parquet', '.pq') else read_text
-    table = read(path, list(dict.fromkeys(wanted)), columns.stamp, columns.format)
+    table = _read(path, list(dict.fromkeys(wanted)), columns.stamp, columns.format)
     stamp_ns = table.stamp_ns
     known = stamp_ns != NO_STAMP
     temperatures = {}
@@ -178,12 +178,19 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
     )
 
 
+def _read(
+    path: Path, columns: Sequence[Column] | None, stamp: Stamp, style: Format | None = None
+) -> Table:
+    read = read_parquet if path.suffix.lower() in ('.parquet', '.pq') else read_text
+    return read(path, columns, stamp, style)
+
+
 def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
-    """Tell the columns of a table; `rate_hz` is for one without headings and times."""
-    table = read_text(path, None, Stamp(rate_hz=1.0))
+    """Tell the columns of a table; `rate_hz` is for one without times."""
+    table = _read(path, None, Stamp(rate_hz=1.0))
     width = len(table.values)
     if table.headings:
-        return _by_headings(path, table)
+        return _by_headings(path, table, rate_hz)
     if width not in (3, 4, 6, 7):
         raise RecordingError(
             f'{width} columns without headings do not say what they are: {_GIVE_MAP}', path=path
@@ -206,31 +213,39 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     return ColumnMap(stamp, accel_map, gyro=gyro, format=Format(header=False))
 
 
-def _by_headings(path: Path, table: Table) -> ColumnMap:
+def _by_headings(path: Path, table: Table, rate_hz: float | None) -> ColumnMap:
     """Tell the columns by their headings, and the units that these do not state by the numbers."""
     named = read_headings(table.headings)
-    if named is None:
+    if named is None or not (named.time or rate_hz):
         listed = ', '.join(map(repr, table.headings[:20]))
+        lacks = 'accelerometer' if named is None else 'time'
+        instead = '' if named is None else '--rate-hz, or '
         raise RecordingError(
-            f'its headings name no time or no accelerometer: {listed}; {_GIVE_MAP}', path=path
+            f'its headings name no {lacks}: {listed}; give {instead}{_A_MAP}', path=path
         )
+    if named.time and rate_hz is not None:
+        raise RecordingError(f'--rate-hz: its column {named.time!r} has the times', path=path)
     place = {name: number for number, name in reversed(list(enumerate(table.headings)))}
 
     def values(columns: Sequence[str]) -> Floats:
         return np.column_stack([table.values[place[one]] for one in columns])
 
-    accel, stamp = values(named.accel), None
+    accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
         unit, reason = believed_unit(still.magnitude)
         if unit == 'unknown':
             raise RecordingError(f'{reason}: {_GIVE_MAP}', path=path)
-    times = table.values[place[named.time]]
-    if not np.isfinite(times).any():
+    times = table.values[place[named.time]] if named.time else None
+    if times is None:
+        stamp = Stamp(rate_hz=rate_hz)
+    elif not np.isfinite(times).any():
         stamp = Stamp(named.time, 'iso')
     elif named.time_unit:
         stamp = build(Stamp, {'column': named.time, 'unit': named.time_unit})
+    else:
+        stamp = replace(_stamp(path, times, None, accel), column=named.time)
     gyro = None
     if named.gyro is not None and unit != 'counts':
         is_fast = np.nanquantile(np.abs(values(named.gyro)), 0.999) > _FASTEST_RAD_S
@@ -242,7 +257,7 @@ def _by_headings(path: Path, table: Table) -> ColumnMap:
         for name, (column, degrees) in named.thermometers.items()
     }
     return ColumnMap(
-        stamp or replace(_stamp(path, times, None, accel), column=named.time),
+        stamp,
         build(Accel, {'columns': list(named.accel), 'unit': unit, 'output': output}),
         thermometers.pop('board', None),
         thermometers.pop('case', None),

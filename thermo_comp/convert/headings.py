@@ -42,15 +42,15 @@ class Headings:
 
 
 def read_headings(headings: Sequence[str]) -> Headings | None:
-    """Find the columns by their names; None where time or accelerometer are not among them."""
+    """Find the columns by their names; None where no accelerometer is among them."""
     names = {_plain(one): one for one in reversed(headings)}
     times = [one for name, one in names.items() if _TIME.search(name)]
     triads = dict(_triads(names))
     accel = next((key for key in triads if _ACCEL.search(key)), '' if '' in triads else None)
-    if not times or accel is None:
+    if accel is None:
         return None
     gyro = next((key for key in triads if _GYRO.search(key)), None)
-    time, found = times[-1], triads[accel]
+    time, found = times[-1] if times else '', triads[accel]
     thermometers: dict[str, tuple[str, str]] = {}
     for heading in headings:
         if _TEMPERATURE.search(_plain(heading)):
@@ -72,7 +72,9 @@ def read_headings(headings: Sequence[str]) -> Headings | None:
 def map_lines(columns: Any) -> Iterator[str]:
     """Write a column map as its file has it."""
     stamp, accel, gyro = columns.stamp, columns.accel, columns.gyro
-    yield f'stamp: {{column: {stamp.column!r}, unit: {stamp.unit}}}'
+    is_timed = stamp.column is not None
+    times = f'column: {stamp.column!r}, unit: {stamp.unit}' if is_timed else None
+    yield f'stamp: {{{times or f"rate_hz: {stamp.rate_hz:g}"}}}'
     yield f'accel: {{columns: {list(accel.columns)}, unit: {accel.unit}, output: {accel.output}}}'
     if gyro is not None:
         yield f'gyro: {{columns: {list(gyro.columns)}, unit: {gyro.unit}}}'

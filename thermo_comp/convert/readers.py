@@ -62,8 +62,6 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
         raise ValueError('`rate_hz`: a column map says that')
     if columns is not None:
         return column_map.table_log(path, column_map.load_column_map(columns))
-    if path.suffix.lower() in ('.parquet', '.pq'):
-        raise ValueError('a Parquet table needs `columns`')
     guessed = column_map.guess_columns(path, rate_hz)
     return replace(column_map.table_log(path, guessed), guessed=guessed)
 

@@ -263,9 +263,12 @@ def _iso_ns(text: str) -> int:
 
 
 def read_parquet(
-    path: Path, columns: Sequence[Column], stamp: Stamp, _style: Format | None = None
+    path: Path, columns: Sequence[Column] | None, stamp: Stamp, _style: Format | None = None
 ) -> Table:
-    """Read columns of a Parquet file as of text; its own timestamps state their unit."""
+    """
+    Read columns of a Parquet file as of text; its own timestamps state their unit. Of all columns,
+    None, those that hold no numbers are NaN.
+    """
     pq = library('pyarrow.parquet', 'parquet', 'a Parquet file', path)
     import pyarrow as pa
 
@@ -275,7 +278,8 @@ def read_parquet(
             if found.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
                 raise RecordingError(f'it claims {found.metadata.num_rows} rows', path=path)
             headings = list(found.schema_arrow.names)
-            names = [*columns] if stamp.column is None else [*columns, stamp.column]
+            wanted = range(len(headings)) if columns is None else columns
+            names = [*wanted] if stamp.column is None else [*wanted, stamp.column]
             places = {name: _place(path, name, headings, len(headings)) for name in names}
             table = found.read(columns=[headings[i] for i in sorted(set(places.values()))])
     except RecordingError:
@@ -287,10 +291,13 @@ def read_parquet(
         raise RecordingError('the table is empty', path=path)
     cells: dict[Column, Any] = {name: table.column(headings[i]) for name, i in places.items()}
     values = {}
-    for name in columns:
+    for name in wanted:
         try:
             column = cells[name].cast(pa.float64(), safe=False).to_numpy()
         except (pa.ArrowException, ValueError) as failure:
+            if columns is None:
+                values[name] = np.full(table.num_rows, nan)
+                continue
             said = f'column {name!r} holds {cells[name].type}'
             raise RecordingError(said, path=path) from failure
         values[name] = np.asarray(column, dtype=np.float64)
@@ -301,4 +308,4 @@ def read_parquet(
             unit, stamps = stamps.type.unit, stamps.cast(pa.int64())
         stamp_ns = np.array([exact_ns(cell, unit) for cell in stamps.to_pylist()])
     line = np.arange(1, table.num_rows + 1, dtype=np.int64)
-    return Table(line, values, stamp_ns)
+    return Table(line, values, stamp_ns, headings=tuple(headings))

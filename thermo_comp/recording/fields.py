@@ -29,6 +29,7 @@ _KINDS = {
     'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4', 'int64': 'i8', 'uint64': 'u8',
     'float32': 'f4', 'float64': 'f8',
 }  # fmt: skip
+_EXTREME = re.compile('(^|_)(min|max)(_|$)')
 _HEADER = 'std_msgs/msg/Header'
 _IDL = '=' * 80 + '\nIDL: '
 
@@ -65,7 +66,7 @@ def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitio
 
 
 def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[str]:
-    """List the numbers of a type whose name says temperature."""
+    """List the numbers of a type whose name says temperature, but for extremes of another."""
     try:
         fields = definitions_of(kind, known)[kind][1]
     except RecordingError:
@@ -73,7 +74,10 @@ def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[
     return [
         name
         for name, (node, content) in fields
-        if 'temp' in name.lower() and node == _BASE and content[0] in _KINDS
+        if 'temp' in name.lower()
+        and not _EXTREME.search(name.lower())
+        and node == _BASE
+        and content[0] in _KINDS
     ]
 
 

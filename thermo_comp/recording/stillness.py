@@ -19,6 +19,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
+from .colour import roughest_at_rest, spread_of_variances
 
 #: How many times the quiet level a cell's variance, of n >= 30 samples, may be: 4 is exceeded by
 #: chance with probability below 1e-11, and vibration worth cutting out is far above.
@@ -29,10 +30,6 @@ STILL_SD = 0.05
 # drifts with temperature and is taken over stretches [rad/s, s].
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
-# Quantiles in sd: a tenth, and what chance exceeds once in 1e11; degrees of freedom, as a part of
-# the samples', from which on noise is coloured, and the fewest of a cell.
-_TENTH, _NEVER = -1.2816, 6.7
-_COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
 # A drift is the median step of so many around, and no faster than this [parts of g per s].
@@ -54,7 +51,8 @@ class Cells:
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
     Dropped are samples that are not finite or whose stamp does not rise. `quantum` is their step,
     0 without one; `middle` that of words of 16 bits without a sign, or 0; rates are in rad/s.
-    `roughness` is half the mean square change from sample to sample: the variance of white noise.
+    `roughness` is half the mean square change from sample to sample: the variance of white noise;
+    `seam` the change to a cell's first sample from the last one of the cell right before it.
     """
 
     start_ns: int
@@ -70,12 +68,13 @@ class Cells:
     mean: Floats
     variance: Floats
     roughness: Floats
+    seam: Floats
     rate: Floats
     rate_variance: Floats
 
     def part(self, which: slice) -> Cells:
         """Choose a run of them."""
-        names = 'time count index mean variance roughness rate rate_variance'
+        names = 'time count index mean variance roughness seam rate rate_variance'
         return replace(self, **{name: getattr(self, name)[which] for name in names.split()})
 
 
@@ -96,10 +95,11 @@ class CellAccumulator:
         self._asked_cell_s, self._window_s, self._full_scale = cell_s, window_s, full_scale
         self._cell_ns = self._start_ns = 0
         self._last_ns: int | None = None
+        self._last = np.zeros((0, 3))  # the sample before
         self._shift = np.zeros(3)
-        # Number, samples, time, sums, sums of squares, and of squared changes of each cell; the
-        # last one is open.
-        self._sums: list[Floats] = [np.empty((0, 12))]
+        # Number, samples, time, sums, sums of squares, change from the cell before, and sums of
+        # squared changes of each cell; the last one is open.
+        self._sums: list[Floats] = [np.empty((0, 15))]
         self._n_dropped = self._n_saturated = self._n_looked_at = 0
         self._is_integer, self._is_negative = True, False
         self._middle, self._quantum = 0.0, np.zeros(3)
@@ -124,7 +124,7 @@ class CellAccumulator:
             return
         if self._last_ns is None:
             self._begin(stamp_ns, samples)
-            self._sums = [np.empty((0, 12 if rate is None else 18))]
+            self._sums = [np.empty((0, 15 if rate is None else 21))]
         self._last_ns = int(stamp_ns[-1])
         if self._n_looked_at < _QUANTUM_SAMPLES:
             found = _quantum_of(samples[: _QUANTUM_SAMPLES - self._n_looked_at])
@@ -145,7 +145,7 @@ class CellAccumulator:
         sums = np.concatenate(self._sums)
         self._sums = [sums]  # whoever asks again asks for little more
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
-        total, square = np.split(sums[:, 3:-3], 2, axis=1)
+        total, square = np.split(sums[:, 3:-6], 2, axis=1)
         pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)
         mean = total / count[:, None]
         spread = np.maximum(square - count[:, None] * mean**2, 0.0)
@@ -160,6 +160,7 @@ class CellAccumulator:
             *(self._is_integer, self._quantum, self._middle),
             *(sums[:, 2] / count + index * cell_s, count.astype(np.int64), index),
             *(mean[:, :3] + self._shift, variance[:, :3], sums[:, -3:] / pairs),
+            sums[:, -6:-3],
             *(rate, rate_variance),
         )
 
@@ -182,18 +183,23 @@ class CellAccumulator:
         ids = since // self._cell_ns
         first = np.flatnonzero(np.concatenate(([True], ids[1:] != ids[:-1])))
         columns = np.zeros((len(since), self._sums[0].shape[1]))
-        n = columns.shape[1] // 2 - 3
+        n = (columns.shape[1] - 9) // 2
         columns[:, 1] = 1.0
         columns[:, 2] = (since - ids * self._cell_ns) * 1e-9
         columns[:, 3:6] = samples - self._shift
         if n > 3 and rate is not None:
             columns[:, 6:9] = np.where(np.abs(rate) < _LARGEST, rate, 0.0)
-        columns[:, 3 + n : -3] = columns[:, 3 : 3 + n] ** 2
-        columns[1:, -3:] = np.diff(samples, axis=0) ** 2
-        columns[first, -3:] = 0.0  # from the cell before
+        columns[:, 3 + n : -6] = columns[:, 3 : 3 + n] ** 2
+        last = self._sums[-1]
+        before = np.concatenate((last[-1:, 0] if len(last) else ids[:1], ids[:-1]))
+        change = np.diff(
+            np.concatenate((self._last if len(last) else samples[:1], samples)), axis=0
+        )
+        columns[:, -3:] = np.where((ids == before)[:, None], change**2, 0.0)
+        columns[:, -6:-3] = np.where((ids == before + 1)[:, None], change, 0.0)
+        self._last = samples[-1:]
         sums = np.add.reduceat(columns, first, axis=0)
         sums[:, 0] = ids[first]
-        last = self._sums[-1]
         if len(last) and sums[0, 0] == last[-1, 0]:
             sums[0, 1:] += last[-1, 1:]
             self._sums[-1] = last[:-1]
@@ -251,13 +257,17 @@ def still_intervals(
     # variance lies a little below its mean; 1.3 covers it for cells of 32 samples.
     drift = _drift(cells, believable)
     level = np.quantile(cells.variance[believable], 0.1, axis=0)
-    level = level * _spread_of_variances(cells, believable, level)
-    limit = ratio * np.maximum(1.3 * level, 0.25 * cells.quantum**2)
+    wider = spread_of_variances(cells, believable, level)
+    limit = ratio * np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12, give or take what noise makes of it.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
     limit = limit + within**2 / 6.0 if len(within) else limit
     quiet = believable & (cells.variance <= limit).all(axis=1)
-    broken = ~_is_joined(cells, quiet, drift)
+    roughest = roughest_at_rest(cells, quiet, wider > 1.0, ratio)
+    quiet &= (cells.roughness <= roughest).all(axis=1)
+    # A single change of so many sd is one as rough as a whole cell.
+    is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
+    broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
     # A cell beside a moving one, or on either side of a step, holds the edge of the motion.
     moved = ~quiet
     near = moved.copy()
@@ -270,35 +280,6 @@ def still_intervals(
         for start, stop in zip(edges[::2], edges[1::2], strict=True)
         if stop - start >= min_cells
     ]
-
-
-def _spread_of_variances(cells: Cells, believable: Bools, level: Floats) -> Floats:
-    """
-    How much further the variances of cells at rest spread than those of white noise, per axis.
-
-    Behind a low pass a cell holds few independent samples. With a correlation r from one to the
-    next they are worth (1 - r) / (1 + r) of their number, and the roughness is 1 - r of the
-    variance; that follows from the tenth percentile `level` for as many degrees of freedom.
-    """
-    n_free = float(np.median(cells.count[believable])) - 1.0
-    quiet = believable & (cells.variance <= level).any(axis=1)
-    rough = np.median(cells.roughness[quiet], axis=0)
-    result = np.ones(3)
-    for axis in range(3):
-        n = n_free
-        for _ in range(_ITERATIONS if level[axis] > 0.0 else 0):
-            white = min(rough[axis] / level[axis] * _part_of_mean(n, _TENTH), 1.0)
-            n = max(n_free * white / (2.0 - white), _FEWEST_FREE)
-        if n < _COLOURED * n_free:
-            tails = [_part_of_mean(k, _NEVER) / _part_of_mean(k, _TENTH) for k in (n, n_free)]
-            result[axis] = tails[0] / tails[1]
-    return result
-
-
-def _part_of_mean(n_free: float, sigmas: float) -> float:
-    """Quantile of a chi-square variance in parts of its mean (Wilson and Hilferty)."""
-    width = 2.0 / (9.0 * n_free)
-    return float((1.0 - width + sigmas * np.sqrt(width)) ** 3)
 
 
 def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:

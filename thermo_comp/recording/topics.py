@@ -174,9 +174,8 @@ def shown(name: str) -> str:
 def said_choice(name: str, key: str, wanted: str, among: str = 'only') -> str:
     """Say that a topic was taken for an input by its type; nothing where it is the one wanted."""
     kind = _TYPES[key].rpartition('/')[2]
-    return (
-        '' if is_called(name, wanted) else f'{shown(name)}, its {among} {kind}, is taken for {key}'
-    )
+    is_named = is_called(name, split_field(wanted)[0])
+    return '' if is_named else f'{shown(name)}, its {among} {kind}, is taken for {key}'
 
 
 def select_topics(

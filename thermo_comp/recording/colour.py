@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what coloured noise does to cells at rest: how far their variances and changes may spread.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..typing import Bools, Floats
+
+if TYPE_CHECKING:
+    from .stillness import Cells
+
+# Quantiles in sd: a tenth, and what chance exceeds once in 1e11; degrees of freedom, as a part of
+# the samples', from which on noise is coloured, and the fewest of a cell.
+_TENTH, _NEVER = -1.2816, 6.7
+_COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
+
+
+def spread_of_variances(cells: Cells, believable: Bools, level: Floats) -> Floats:
+    """
+    How much further the variances of cells at rest spread than those of white noise, per axis.
+
+    Behind a low pass a cell holds few independent samples. With a correlation r from one to the
+    next they are worth (1 - r) / (1 + r) of their number, and the roughness is 1 - r of the
+    variance; that follows from the tenth percentile `level` for as many degrees of freedom.
+    """
+    n_free = float(np.median(cells.count[believable])) - 1.0
+    quiet = believable & (cells.variance <= level).any(axis=1)
+    rough = np.median(cells.roughness[quiet], axis=0)
+    result = np.ones(3)
+    for axis in range(3):
+        n = n_free
+        for _ in range(_ITERATIONS if level[axis] > 0.0 else 0):
+            white = min(rough[axis] / level[axis] * _part_of_mean(n, _TENTH), 1.0)
+            n = max(n_free * white / (2.0 - white), _FEWEST_FREE)
+        if n < _COLOURED * n_free:
+            tails = [_part_of_mean(k, _NEVER) / _part_of_mean(k, _TENTH) for k in (n, n_free)]
+            result[axis] = tails[0] / tails[1]
+    return result
+
+
+def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: float) -> Floats:
+    """
+    Say how rough a cell at rest is at most, per axis; of coloured noise, which hides a step from a
+    cell's mean and variance, but not from the changes from sample to sample.
+
+    How far these spread follows from the tenth percentile and the median, as of a chi-square.
+    """
+    result = np.full(3, np.inf)
+    for axis in np.flatnonzero(is_coloured) if quiet.any() else ():
+        tenth, median = np.quantile(cells.roughness[quiet, axis], (0.1, 0.5))
+        n_free = float(np.median(cells.count[quiet])) - 1.0
+        frees = np.geomspace(_FEWEST_FREE, n_free, _ITERATIONS) if n_free > _FEWEST_FREE else ()
+        shares = [_part_of_mean(n, _TENTH) / _part_of_mean(n, 0.0) for n in frees]
+        n = float(np.interp(tenth / max(median, 1e-300), shares, frees)) if shares else n_free
+        widest = _part_of_mean(n, _NEVER) / _part_of_mean(n, 0.0)
+        usual = _part_of_mean(n_free, _NEVER) / _part_of_mean(n_free, 0.0)
+        floor = 0.25 * cells.quantum[axis] ** 2
+        result[axis] = ratio * max(median * max(widest / usual, 1.0), floor)
+    return result
+
+
+def _part_of_mean(n_free: float, sigmas: float) -> float:
+    """Quantile of a chi-square variance in parts of its mean (Wilson and Hilferty)."""
+    width = 2.0 / (9.0 * n_free)
+    return float((1.0 - width + sigmas * np.sqrt(width)) ** 3)
