@@ -74,7 +74,7 @@ def regress(
         scale_sd=SCALE_SD,
         misalignment_sd=MISALIGNMENT_SD,
         column_sd=np.zeros_like(candidates.typical),
-        offset_sd=sigma,
+        offset_sd=_SIGMA,
         sigma=np.full(3, sigma),
         offset_scale=_mounting_scale(windows, start),
     )

@@ -134,9 +134,9 @@ def informative_priors(
     for known, more in tried:
         diagonal = np.diag(known)
         floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
-        root = np.sqrt(floor)
-        scaled, correlation = to_file / root[:, None], known / np.outer(root, root)
-        wider = correlation + (_EXACT + more) * np.eye(len(root))
+        sd = np.sqrt(floor)
+        scaled, correlation = to_file / sd[:, None], known / np.outer(sd, sd)
+        wider = correlation + (_EXACT + more) * np.eye(len(sd))
         # Parameters that are almost one, as the levels of both sets, would drown in a product.
         whitened = solve_triangular(np.linalg.cholesky(wider), scaled, lower=True)
         root: Floats = np.asarray(np.linalg.qr(whitened, mode='r'))

@@ -117,7 +117,12 @@ def select(
     forced = tuple(dict.fromkeys(names[candidates.forced & may].tolist()))
     asked = [name for name in dict.fromkeys(names[may].tolist()) if name not in forced]
     grow = _Growth(regression, candidates, names)
-    constants = chosen = grow.fit(forced, state, prior, candidates.typical)
+    # Without curves drift looks like mountings, or like noise: the likelier of two beginnings.
+    begun = [prior]
+    if prior.offset_scale > 0.0:
+        begun.append(replace(prior, offset_sd=float(prior.sigma.mean())))
+    fits = [grow.fit(forced, state, one, candidates.typical) for one in begun]
+    constants = chosen = max(fits, key=lambda fit: fit.posterior.log_evidence)
     trials, round_number = [constants], 0
     if CURVE in asked:
         # All else is relative to a curve, which may help only together with it.
