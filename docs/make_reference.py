@@ -59,7 +59,7 @@ gravity_m_s2: 9.80665                                     # given to the fit
 axes:                                                     # at the reference temperature
   x: {scale_factor: 299.1, bias: 4.2}                     # counts per m/s^2, counts
 static:                                                   # the set of the static regime
-  temperature_range_c: [4.0, 37.0]                        # outside: held at the edge
+  temperature_range_c: [4.0, 37.0]                        # outside: along the tangent
   x:
     bias_function: {kind: polynomial, coefficients: [0.0, 0.0031]}       # Fs(t), 0 at t = 0
     scale_function: {kind: polynomial, coefficients: [1.0, 7.7e-05]}     # Fc(t), 1 at t = 0
@@ -153,7 +153,8 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | no board temperature, and a calibration that knows nothing of temperature | its constants are published, with what 10 K may do in the covariance |
 | board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
 | case temperature older than `case_timeout` | the board decides the regime, WARN, larger covariance |
-| temperature or rate outside the calibrated range | held at the edge, larger covariance, WARN with how far |
+| board temperature outside the calibrated range | curves go on along their tangent for a quarter of the range, then are held; larger covariance, WARN with how far |
+| gradient or rate outside the calibrated range | held at the edge, larger covariance, WARN with how far |
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
 | a temperature that jumps as no part can | its readings are not used until they are possible again or the sensor has been lost |
 | a temperature that stands still while the other moves | its readings are not used: held, then lost |

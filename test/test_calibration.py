@@ -283,6 +283,8 @@ def test_files_that_are_no_files(tmp_path):
             'static.x.bias_function',
             'must be finite over its range',
         ),
+        # 1 - 0.05 t is 0.15 at 37 degC, and less than nothing along its tangent.
+        ('[1.0, 7.7e-05]', '[1.0, -0.05]', 'static.x.scale_function', 'must stay above 0.1'),
     ],
 )
 def test_functions_that_overflow_are_refused(old, new, key, message):

@@ -247,7 +247,7 @@ def test_axes_are_treated_alike():
     assert run((2, 0, 1), sample) == (plain[2], plain[0], plain[1])
 
 
-def test_beyond_the_range_the_edge_holds_and_the_covariance_grows():
+def test_beyond_the_range_curves_go_on_along_their_tangent_and_the_covariance_grows():
     one = axis_set((0.0, 0.5), (1.0, 1e-4), residual_sd_m_s2=1e-5)
     two = axis_set((0.0, 0.6), (1.0, 1e-4), residual_sd_m_s2=1e-5)
     unit = calibration(static=regime_set(one, one, one), dynamic=regime_set(two, two, two))
@@ -262,7 +262,10 @@ def test_beyond_the_range_the_edge_holds_and_the_covariance_grows():
     assert inside.excess.temperature == pytest.approx(0.0, abs=1e-6)
     assert outside.excess.temperature == pytest.approx(6.0, abs=1e-6)
     assert outside.excess.relative == pytest.approx(6.0 / 15.0, rel=1e-6)
-    assert out[:3] == pytest.approx(edge[:3], abs=1e-8)
+    for axis, raw in enumerate((10.0, 20.0, 3000.0)):
+        # Straight lines are their tangents: at 41 degC t is 21 K.
+        bias, scale = 0.5 * 21.0, 300.0 * (1.0 + 1e-4 * 21.0)
+        assert out[axis] == pytest.approx((raw - bias) / scale, abs=1e-8)
     # At the least the slope at the edge times the excess: 0.5 counts/K * 6 K / 300 counts.
     assert math.sqrt(out[3]) > 0.5 * 6.0 / 300.0
     assert out[3] - NOISE > 100.0 * (edge[3] - NOISE)

@@ -27,11 +27,18 @@ from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.memory import start_covariance
-from thermo_comp.thermal.state import BOARD, Layout
+from thermo_comp.thermal.state import BOARD, WEIGHT, Layout
 from thermo_comp.thermal.tracker import ThermalTracker
-from thermo_comp.unit.calibration import Axes, AxisReference, ResponseTerm, parameter_layout
+from thermo_comp.unit.calibration import (
+    Axes,
+    AxisReference,
+    AxisSet,
+    ResponseTerm,
+    parameter_layout,
+)
 from thermo_comp.unit.columns import bank
 from thermo_comp.unit.correction import Correction
+from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial
 from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.prediction import SlowUncertainty
 
@@ -73,13 +80,13 @@ def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
     return replace(unit, posterior=posterior_of(root @ root.T + 1e-10 * np.eye(n)))
 
 
-def run_of(rng, seconds=240, rate=4):
+def run_of(rng, seconds=240, rate=4, swing_k=12.0):
     """Any messages in order: samples, three thermometers that jitter and drop out."""
     events = []
     for k in range(seconds * rate):
         stamp = k * SECOND_NS // rate + int(rng.integers(0, 1_000_000))
         if k % rate == 0:
-            wave = 12.0 * math.sin(k / rate / 150.0)
+            wave = swing_k * math.sin(k / rate / 150.0)
             for name, ahead in (('board', 0.0), ('case', 3.0), ('tip', -1.0)):
                 if rng.random() > 0.1 and not (name == 'tip' and 60 < k / rate < 160):
                     late = int(rng.integers(-30_000_000, 2_000_000))
@@ -115,8 +122,10 @@ def assert_same(blocks, rows):
 def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
-    events = run_of(rng, seconds=50)
+    # Of 5 .. 35 degC, along the tangent, and beyond the quarter that this goes on for.
+    events = run_of(rng, seconds=50, swing_k=75.0)
     rows = stream(Compensator(unit, UNCHECKED), events)
+    assert max(value for kind, _, value in events if kind == 'board') > 45.0
     whole, cut = Compensator(unit, UNCHECKED), Compensator(unit, UNCHECKED)
     assert_same([process_block(whole, columns_from_events(events))], rows)
     pieces = [events[k : k + chunk] for k in range(0, len(events), chunk)]
@@ -366,6 +375,107 @@ def test_beyond_the_range_slopes_that_cancel_are_no_knowledge():
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
     assert sd_at(unit, 41.0) == pytest.approx(math.hypot(bends, 0.8) * 6.0 / 300.0 * far, rel=0.05)
+
+
+def curves_at(unit, celsius):
+    """Evaluate bias and relative scale of x in both sets at temperatures, shape (2, 2, n)."""
+    return Correction(unit).curves.values(np.array(celsius))[:, ::3]
+
+
+BENT, WAVY = (0.0, 0.5, 0.01), (0.0, -0.3, 0.02, 1e-3)
+
+
+def test_beyond_the_range_curves_go_on_along_their_tangent_for_a_quarter_of_the_span():
+    one, two = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
+    unit = calibration(static=regime_set(one), dynamic=regime_set(two))
+    for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
+        at_edge, *found = np.moveaxis(
+            curves_at(unit, edge + sign * np.array([0.0, 1e-9, 3.0, 7.5, 7.5 + 1e-9, 300.0])), 2, 0
+        )
+        t = edge - 20.0
+        slopes = [
+            [np.polynomial.Polynomial(c).deriv()(t) for c in rows]
+            for rows in ((BENT, (1.0, 1e-4, 2e-6)), (WAVY, (1.0, 5e-5)))
+        ]
+        for value, beyond in zip(found, (1e-9, 3.0, 7.5, 7.5, 7.5), strict=True):
+            expected = at_edge + sign * beyond * np.array(slopes)
+            np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
+    # The dynamic set ends 5 K below and begins 5 K below the static one.
+    unit = calibration(
+        static=regime_set(axis_set(BENT)),
+        dynamic=regime_set(axis_set(WAVY, delta=2.0), temperature_range_c=(0.0, 30.0)),
+    )
+    celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
+    static, dynamic = curves_at(unit, celsius)[:, 0]
+    # What the sets differ by at the last temperature that both have seen.
+    np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
+    np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
+    wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
+    lower, upper = wavy.deriv()(-20.0), bent.deriv()(15.0)
+    np.testing.assert_allclose(dynamic[:4] - dynamic[3], lower * np.array([-7.5, -7.5, -3, 0]))
+    np.testing.assert_allclose(static[6:] - static[6], upper * np.array([0, 3, 7.5, 7.5]))
+
+
+def test_two_kelvins_beyond_the_range_a_bent_unit_is_wrong_by_the_second_order_alone():
+    unit = calibration(static=regime_set(axis_set(BENT)), dynamic=regime_set(axis_set(BENT)))
+    ((at_edge, found),) = curves_at(unit, [35.0, 37.0])[:1, 0]
+    truth = 0.5 * 17.0 + 0.01 * 17.0**2
+    # 0.01 (2 K)^2, where what is held at the edge is wrong by 1.64.
+    assert truth - found == pytest.approx(0.04)
+    assert truth - at_edge == pytest.approx(1.64)
+
+
+def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng):
+    # Correction and regressors are linear in the parameters: what any change of them makes of the
+    # one is what the others say. The dynamic set ends first above, the static one below.
+    spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
+    exponential = Exponential(-1.0, (1.0,), (18.0,))
+    one = AxisSet(spline, Polynomial((1.0, 1e-4)))
+    two = AxisSet(exponential, Polynomial((1.0, 1e-4, 1e-6)))
+    unit = calibration(
+        static=regime_set(one, two, axis_set(BENT)),
+        dynamic=regime_set(two, one, axis_set(WAVY), temperature_range_c=(0.0, 30.0)),
+    )
+    layout = parameter_layout(unit)
+    change = 1e-3 * rng.standard_normal(layout.n_parameters)
+    change[[level for block in layout.scale for level in (block.static, block.dynamic)]] = 0.0
+    states = np.zeros((Layout(Correction(unit).memory).width, 9))
+    states[BOARD] = -40.0, -5.0, 3.0, 20.0, 33.0, 36.0, 42.0, 43.0, 90.0
+    states[WEIGHT] = 0.0, 1.0, 0.3, 0.5, 1.0, 0.3, 0.0, 0.7, 1.0
+    moved, nominal = (
+        Correction(each).bias_scale(states) for each in (drawn(unit, layout, change), unit)
+    )
+    regressors = Correction(unit).curves.regressors(states, np.zeros((0, 9)))
+    found = moved - nominal
+    found[1] /= 300.0
+    for axis in range(3):
+        for block, of, row in (
+            (layout.bias[axis], regressors[axis], found[0, axis]),
+            (layout.scale[axis], regressors[axis + 3], found[1, axis]),
+        ):
+            expected = change[block.static : block.end] @ of
+            np.testing.assert_allclose(row, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_the_claim_grows_all_the_way_out_of_the_range():
+    unit = rich_calibration()
+    correction = Correction(unit)
+    slow = SlowUncertainty(unit, correction)
+    nobody = [0.0] * len(correction.memory.lags)
+    for sign in (1.0, -1.0):
+        variances = []
+        for beyond in (0.0, 0.1, 1.0, 3.0, 7.4, 7.6, 15.0, 40.0):
+            state = [0.0] * Layout(correction.memory).width
+            state[BOARD] = 20.0 + sign * (15.0 + beyond)
+            line = correction.line(state, state, np.array(slow.at(state, nobody)), 0.0)
+            variances.append(line[12:].reshape(3, 3)[:, 0])
+        assert (np.diff(variances, axis=0) > 0.0).all()
+        # At the least the error of a curve that had turned flat at the edge.
+        slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]
+        assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 
 
 def test_a_part_that_is_still_outside_is_paid_for():

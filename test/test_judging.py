@@ -19,7 +19,7 @@ from thermo_comp.judging.judgement import Judgement, judge
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.judging.windows import Windows, columns_of
 from thermo_comp.online.batch import process_block
-from thermo_comp.online.compensator import SWAPPED, Compensator
+from thermo_comp.online.compensator import CONTINUED, SWAPPED, Compensator
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter, table_writer
@@ -409,7 +409,7 @@ def test_thermometers_in_doubt_are_told_offline_too(root: Path, tmp_path: Path) 
     _, upper = CLAIMING.static.temperature_range_c
     hot = resting(tmp_path / 'hot', upper + 2.0)
     (note,) = replay(hot, CLAIMING, tmp_path / 'hot.mcap').notes
-    assert note == 'board temperature +2.00 K outside the calibrated range, held at its edge'
+    assert note == f'board temperature +2.00 K {CONTINUED}'
 
 
 def test_windows_as_a_table(tmp_path: Path) -> None:

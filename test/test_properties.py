@@ -242,7 +242,9 @@ configs = st.builds(
 def largest(axis: int, regime: RegimeSet, of: Calibration) -> tuple[float, float]:
     """Bound an axis' |bias| without the reference's, and the distance of its scale from 1."""
     edges = (*of.static.temperature_range_c, *of.dynamic.temperature_range_c)
+    # Curves go on along their tangents for a quarter of the span, or of the other set's.
     t = max(abs(edge - of.reference_temperature_c) for edge in edges)
+    t += 0.25 * (max(edges) - min(edges))
     curves = regime.axes()[axis]
 
     def terms(name: str) -> float:

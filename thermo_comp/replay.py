@@ -26,7 +26,7 @@ from . import __version__
 from .errors import CalibrationError, OutputError
 from .files import shown_name
 from .online.batch import CompensatedBlock, process_block
-from .online.compensator import HELD, SWAPPED, Compensator
+from .online.compensator import CONTINUED, SWAPPED, Compensator
 from .online.status import CompensatorConfig, Counters
 from .recording.blocks import Block, ImuColumns, Messages, RecordingInfo, Role
 from .recording.reader import RecordingReader, open_recording
@@ -142,7 +142,7 @@ def replay(
                     progress(compensator.counters.n_in / max(total, 1))
         notes = [SWAPPED] if is_swapped else []
         if beyond:
-            notes.append(f'board temperature {beyond:+.2f} K {HELD}')
+            notes.append(f'board temperature {beyond:+.2f} K {CONTINUED}')
         counters, told = compensator.counters, switches(flags)
         return ReplayResult(reader.info, Path(output), counters, len(flags), told, notes)
 

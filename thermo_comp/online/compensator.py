@@ -22,6 +22,7 @@ from ..thermal.regime import Regime
 from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.correction import Excess, is_sound
+from ..unit.functions import TANGENT_SPANS
 from .checks import GravityCheck, StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
@@ -41,6 +42,10 @@ SWAPPED: Final = (
     'it heated from inside?'
 )
 HELD: Final = 'outside the calibrated range, held at its edge'
+CONTINUED: Final = (
+    'outside the calibrated range: curves continued along their tangent for '
+    f'{TANGENT_SPANS:g} of the range, then held'
+)
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]

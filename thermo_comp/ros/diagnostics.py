@@ -20,7 +20,7 @@ from rclpy.qos import QoSCompatibility, qos_check_compatible
 from rclpy.subscription import Subscription
 
 from ..online.checks import RATE_TOLERANCE
-from ..online.compensator import HELD, SWAPPED, Compensator, CompensatorStatus
+from ..online.compensator import CONTINUED, HELD, SWAPPED, Compensator, CompensatorStatus
 from ..text import one_line
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
@@ -279,13 +279,13 @@ def _findings(
     is_expected = loaded.calibration.needs_case or math.isfinite(status.case_age_s)
     if status.state and status.is_case_lost and needs_board and is_expected:
         yield _WARN, 'case temperature lost, the board sensor decides the regime'
-    for excess, what in (
-        (status.excess.gradient, 'case minus board {:+.2f} K'),
-        (status.excess.temperature, 'board temperature {:+.2f} K'),
-        (60.0 * status.excess.rate, 'temperature rate {:+.2f} K/min'),
+    for excess, what, follows in (
+        (status.excess.gradient, 'case minus board {:+.2f} K', HELD),
+        (status.excess.temperature, 'board temperature {:+.2f} K', CONTINUED),
+        (60.0 * status.excess.rate, 'temperature rate {:+.2f} K/min', HELD),
     ):
         if excess:
-            yield _WARN, f'{what.format(excess)} {HELD}'
+            yield _WARN, f'{what.format(excess)} {follows}'
     calibrated = 1.0 / unit.cycle_time_s
     if rate is not None and abs(rate / calibrated - 1.0) > RATE_TOLERANCE:
         yield _WARN, f'{rate:.4g} samples/s, calibrated for {calibrated:.4g}'

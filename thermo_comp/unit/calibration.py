@@ -131,7 +131,10 @@ class LackOfFit:
 
 @dataclass(frozen=True)
 class RegimeSet:
-    """The set of one regime; outside its ranges it is held, and the covariance grows."""
+    """
+    The set of one regime. Outside `temperature_range_c` its curves go on along their tangents for
+    a quarter of the span and are held from there on; the covariance grows.
+    """
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Board temperature [degC].']
     rate_range_k_min: Annotated[tuple[_RateEdge, _RateEdge], 'dT_board/dt [K/min].']

@@ -26,8 +26,12 @@ Even is what does not ask for the direction of a change, so ``q_s = g_s - rest``
 at rest, where the board's own heat makes it warmer than the case, in *change*, and g_s in *even*.
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u held at the edges of the column's range
-and t at those of the calibrated temperatures. The groups of the bank are its kinds; *product* and
-*mixed* are board, and now and neighbour, of a power: coefficients that change with temperature.
+and t at those of the calibrated temperatures. Curves go on along their tangent beyond them, the
+powers of t do not: with power p the tangent of a product would be u p t^(p - 1), and no recording
+tells how a coefficient that changes with temperature goes on.
+
+The groups of the bank are its kinds; *product* and *mixed* are board, and now and neighbour, of a
+power: coefficients that change with temperature.
 
 This is the one table of columns: tracker, fit, correction, covariance and file take theirs from
 here, so that another regressor is an entry of `bank` and, if it is of a new kind, of `_FORMS`.

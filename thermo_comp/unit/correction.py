@@ -19,11 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..thermal.memory import BOARD_INPUT, MemorySpec
-from ..thermal.state import BOARD, GRADIENT, RATE, UNKNOWN, VAR_BOARD, VAR_GRADIENT, WEIGHT, Layout
+from ..thermal.state import BOARD, GRADIENT, UNKNOWN, VAR_BOARD, VAR_GRADIENT, WEIGHT, Layout
 from ..typing import Floats
 from .calibration import Calibration
 from .columns import ColumnTable, memory_of
-from .functions import Functions, hold
+from .curves import Curves
+from .functions import hold
 from .gravity import MICRO_G
 
 #: While the sets cross over, the output moves no faster than this [m/s^3] (1 ug per second) ...
@@ -51,99 +52,6 @@ class Excess(NamedTuple):
     rate: float  # the same [K/s]
     gradient: float  # the one that is farthest outside, signed [K]
     relative: float  # all sizes in half ranges, added
-
-
-class Curves:
-    """
-    What the two sets make of the board temperature alone: in a result, row 0 is the static set's.
-
-    Beyond its own range a set goes on as the other does, as far as that one was calibrated: what
-    the two differ by is held, not what they have in common.
-    """
-
-    def __init__(self, calibration: Calibration) -> None:
-        self._reference = calibration.reference_temperature_c
-        sets = calibration.regime_sets()
-        edges = np.array([(one.temperature_range_c, one.rate_range_k_min) for one in sets])
-        # Of each set lower and upper edge, shape (2, 2, 1), first lower.
-        self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
-        self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
-        rows = [
-            [one.bias_function for one in axes] + [one.scale_function for one in axes]
-            for axes in (one.axes() for one in sets)
-        ]
-        self._functions, self._others = Functions(rows), Functions(rows[::-1])
-        biases = [axis.bias for axis in calibration.axes]
-        deltas = [[axis.delta for axis in one.axes()] for one in sets]
-        self._levels = np.add(biases, deltas)[:, :, np.newaxis]
-        self._residuals = np.array(
-            [[[axis.residual_sd_m_s2**2] for axis in one.axes()] for one in sets]
-        )
-        self._lacks = [
-            (
-                np.array([point.temperature_c for point in one.lack_of_fit]),
-                np.array([point.sd_m_s2 for point in one.lack_of_fit]).T ** 2,
-            )
-            for one in sets
-        ]
-        self._has_lacks = any(one.lack_of_fit for one in sets)
-
-    def excess(self, states: Floats) -> tuple[Floats, Floats, Floats]:
-        """
-        Say how far outside the sets' ranges states lie, shape (2, n): [K], [K/s], and both in half
-        ranges, added.
-        """
-        t, rate = states[BOARD] - self._reference, states[RATE]
-        over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
-        if not (over.any() or too_fast.any()):
-            return over, too_fast, np.zeros_like(over)
-        half, half_rate = (one[1] - one[0] for one in (self._t_range, self._rate_range))
-        relative = np.abs(over) / (half / 2.0) + np.abs(too_fast) / (half_rate / 2.0)
-        return over, too_fast, relative
-
-    def values(self, board: Floats) -> Floats:
-        """Evaluate bias [input units] and relative scale at board temperatures, (2, 6, n)."""
-        t = board - self._reference
-        held = hold(t, *self._t_range)
-        result = self._functions.evaluate(held)
-        result[:, :3] += self._levels
-        if (held != t).any():
-            here, edge = (hold(one, *self._t_range[:, ::-1]) for one in (t, held))
-            result += self._others.evaluate(here) - self._others.evaluate(edge)
-        return result
-
-    def unexplained(self, board: Floats) -> Floats:
-        """Evaluate what each axis' set leaves unexplained, a variance [m^2/s^4], (2, 3, n)."""
-        if not self._has_lacks:
-            return self._residuals
-        result = np.repeat(self._residuals, len(board), axis=2)
-        for regime, (at, variance) in enumerate(self._lacks):
-            if len(at) == 1:
-                result[regime] += variance
-            elif len(at):
-                held = hold(board, at[0], at[-1])
-                left = np.minimum(np.searchsorted(at, held, side='right') - 1, len(at) - 2)
-                share = (held - at[left]) / (at[left + 1] - at[left])
-                change = variance[:, left + 1] - variance[:, left]
-                result[regime] += variance[:, left] + change * share
-        return result
-
-    def slopes(self, board: Floats) -> Floats:
-        """Differentiate what `values` gives, by the board temperature [per K], (2, 6, n)."""
-        held = hold(board - self._reference, *self._t_range)
-        return self._functions.evaluate(held, 'slope')
-
-    def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
-        """Give what multiplies each parameter of each of the six, in the posterior's order."""
-        held = hold(states[BOARD] - self._reference, *self._t_range)
-        weight = states[WEIGHT]
-        result = []
-        for functions in zip(*self._functions.rows, strict=True):
-            found = []
-            for share, t, one in zip((1.0 - weight, weight), held, functions, strict=True):
-                found += [share, *(share * value for value in one.basis(t))]
-            result.append(np.array([*found, *phi]))
-        return result
 
 
 class Correction:

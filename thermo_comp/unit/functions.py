@@ -27,6 +27,9 @@ from ..typing import Floats
 #: A temperature, or many.
 Kelvins: TypeAlias = float | Floats
 
+#: How far curves go on along their tangent beyond their range, in spans of that range. There
+#: a parabola is a sixteenth as far from that tangent as it is at the other end of the range.
+TANGENT_SPANS = 0.25
 #: How exactly a function must meet its value at the reference.
 NORMALISATION_TOLERANCE = 1e-9
 #: Knots of any use [K]; what is closer or farther away overflows.
@@ -253,6 +256,12 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:
         raise ValueError(f'`{name}` must be {expected:g} at the reference, got {value:g}')
+
+
+def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:
+    """Differentiate what `basis` gives by the temperature, at `t` [per K]."""
+    units = np.eye(function.n_free).tolist()
+    return [float(function.with_free(tuple(unit), 0.0).slope(t)) for unit in units]
 
 
 def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:

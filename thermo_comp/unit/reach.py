@@ -19,7 +19,7 @@ import numpy as np
 from ..quantities import QUANTITIES
 from ..typing import Floats
 from .columns import Column
-from .functions import TemperatureFunction
+from .functions import TANGENT_SPANS, TemperatureFunction
 from .posterior import Block, Posterior
 
 #: A scale function, with every term at its worst, stays within these parts of the reference.
@@ -30,6 +30,8 @@ FULL_SCALES = 2.0
 WORST = 1e6
 #: At so many temperatures of its range a function is looked at.
 _GRID = 513
+#: How far beyond its range a function is looked at.
+_AROUND = f'and along its tangents, {TANGENT_SPANS:g} of the range on each side'
 _DIFFERENCE_K = QUANTITIES['temperature span'].at_most or 0.0
 _RATE_K_S = (QUANTITIES['temperature rate'].at_most or 0.0) / 60.0
 
@@ -58,6 +60,7 @@ class Reach:
         self, range_c: tuple[float, float], edges_c: Sequence[float], reference: float, most: float
     ) -> None:
         self._t = np.linspace(*range_c, _GRID) - reference
+        self._beyond_k = TANGENT_SPANS * (range_c[1] - range_c[0])
         self._farthest_k = max(abs(edge - reference) for edge in edges_c)
         self._most = most
 
@@ -69,12 +72,12 @@ class Reach:
             )
         least, largest = self._extremes(function)
         if not math.isfinite(largest - least):
-            raise ValueError(f'`{key}.bias_function` must be finite over its range')
+            raise ValueError(f'`{key}.bias_function` must be finite over its range {_AROUND}')
         if max(-least, largest) > self._most:
             reached = largest if largest > -least else least
             raise ValueError(
-                f'`{key}.bias_function` must stay within {self._most:g} over its range, '
-                f'reaches {reached:g}'
+                f'`{key}.bias_function` must stay within {self._most:g} over its range '
+                f'{_AROUND}, reaches {reached:g}'
             )
 
     def check_scale(self, key: str, function: TemperatureFunction, lost: float) -> None:
@@ -83,12 +86,12 @@ class Reach:
         if not least - lost > SMALLEST_RELATIVE_SCALE:
             raise ValueError(
                 f'`{key}.scale_function` must stay above {SMALLEST_RELATIVE_SCALE:g} over its '
-                f'ranges, reaches {least - lost:.4g}'
+                f'ranges {_AROUND}, reaches {least - lost:.4g}'
             )
         if not largest + lost < LARGEST_RELATIVE_SCALE:
             raise ValueError(
                 f'`{key}.scale_function` must stay below {LARGEST_RELATIVE_SCALE:g} over its '
-                f'ranges, reaches {largest + lost:.4g}'
+                f'ranges {_AROUND}, reaches {largest + lost:.4g}'
             )
 
     def check_terms(self, key: str, terms: Sequence[Term]) -> None:
@@ -113,6 +116,10 @@ class Reach:
         try:
             with np.errstate(all='ignore'):
                 values = function.value(self._t)
+                slopes = function.slope(self._t[[0, -1]])
+                # The curve goes on along its tangents.
+                ends = values[[0, -1]] + slopes * np.array([-self._beyond_k, self._beyond_k])
+                values = np.append(values, ends)
         except OverflowError:
             return -math.inf, math.inf
         if not np.isfinite(values).all():

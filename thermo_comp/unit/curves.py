@@ -1,0 +1,161 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the curves of the two sets over the board temperature, within their ranges and beyond.
+
+States and rows are laid out as in `correction`; each state is evaluated alone.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from ..thermal.state import BOARD, RATE, WEIGHT
+from ..typing import Floats
+from .calibration import Calibration
+from .functions import TANGENT_SPANS, Functions, basis_slopes, hold
+
+
+class Curves:
+    """
+    What the two sets make of the board temperature alone: in a result, row 0 is the static set's.
+
+    Beyond its own range a set goes on as the other does, as far as that one was calibrated: what
+    the two differ by is held, not what they have in common. Beyond both ranges curves go on along
+    their tangent at the edge for `TANGENT_SPANS` of the span, and are held from there on; a set
+    that followed the other follows its tangent.
+    """
+
+    def __init__(self, calibration: Calibration) -> None:
+        self._reference = calibration.reference_temperature_c
+        sets = calibration.regime_sets()
+        edges = np.array([(one.temperature_range_c, one.rate_range_k_min) for one in sets])
+        # Of each set lower and upper edge, shape (2, 2, 1), first lower.
+        self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
+        self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
+        rows = [
+            [one.bias_function for one in axes] + [one.scale_function for one in axes]
+            for axes in (one.axes() for one in sets)
+        ]
+        self._functions, self._others = Functions(rows), Functions(rows[::-1])
+        # Which set's tangent a set follows at the lower and at the upper end, shape (2, 2).
+        own, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
+        self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - own, own)
+        self._ends = lower.min(), upper.max()
+        self._reaches = TANGENT_SPANS * (upper - lower)[self._leads][:, :, np.newaxis]
+        biases = [axis.bias for axis in calibration.axes]
+        deltas = [[axis.delta for axis in one.axes()] for one in sets]
+        self._levels = np.add(biases, deltas)[:, :, np.newaxis]
+        self._residuals = np.array(
+            [[[axis.residual_sd_m_s2**2] for axis in one.axes()] for one in sets]
+        )
+        self._lacks = [
+            (
+                np.array([point.temperature_c for point in one.lack_of_fit]),
+                np.array([point.sd_m_s2 for point in one.lack_of_fit]).T ** 2,
+            )
+            for one in sets
+        ]
+        self._has_lacks = any(one.lack_of_fit for one in sets)
+
+    def excess(self, states: Floats) -> tuple[Floats, Floats, Floats]:
+        """
+        Say how far outside the sets' ranges states lie, shape (2, n): [K], [K/s], and both in half
+        ranges, added.
+        """
+        t, rate = states[BOARD] - self._reference, states[RATE]
+        over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
+        if not (over.any() or too_fast.any()):
+            return over, too_fast, np.zeros_like(over)
+        half, half_rate = (one[1] - one[0] for one in (self._t_range, self._rate_range))
+        relative = np.abs(over) / (half / 2.0) + np.abs(too_fast) / (half_rate / 2.0)
+        return over, too_fast, relative
+
+    def values(self, board: Floats) -> Floats:
+        """Evaluate bias [input units] and relative scale at board temperatures, (2, 6, n)."""
+        t = board - self._reference
+        held = hold(t, *self._t_range)
+        result = self._functions.evaluate(held)
+        result[:, :3] += self._levels
+        if (held != t).any():
+            here, edge = (hold(one, *self._t_range[:, ::-1]) for one in (t, held))
+            result += self._others.evaluate(here) - self._others.evaluate(edge)
+            for slopes, beyond in zip(self._tangents, self._beyond(t), strict=True):
+                result += slopes * beyond[:, np.newaxis]
+        return result
+
+    @cached_property
+    def _tangents(self) -> Floats:
+        """Slopes at the lower and at the upper end, as `slopes` has them, shape (2, 2, 6, 1)."""
+        ends = zip(self._t_range, self._leads, strict=True)
+        return np.array([self._functions.evaluate(t, 'slope')[leads] for t, leads in ends])
+
+    @cached_property
+    def _basis_slopes(self) -> list[list[list[Floats]]]:
+        """What multiplies the parameters of each function in its slope at lower and upper end."""
+        rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
+        return [
+            [[np.reshape(basis_slopes(one, end), (-1, 1)) for end in ends] for one in row]
+            for row, ends in rows
+        ]
+
+    def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
+        """How far each set goes along its lower and its upper tangent [K], each (2, n)."""
+        (lower, upper), (below, above) = self._ends, self._reaches
+        return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
+
+    def unexplained(self, board: Floats) -> Floats:
+        """Evaluate what each axis' set leaves unexplained, a variance [m^2/s^4], (2, 3, n)."""
+        if not self._has_lacks:
+            return self._residuals
+        result = np.repeat(self._residuals, len(board), axis=2)
+        for regime, (at, variance) in enumerate(self._lacks):
+            if len(at) == 1:
+                result[regime] += variance
+            elif len(at):
+                held = hold(board, at[0], at[-1])
+                left = np.minimum(np.searchsorted(at, held, side='right') - 1, len(at) - 2)
+                share = (held - at[left]) / (at[left + 1] - at[left])
+                change = variance[:, left + 1] - variance[:, left]
+                result[regime] += variance[:, left] + change * share
+        return result
+
+    def slopes(self, board: Floats) -> Floats:
+        """Differentiate what `values` gives, by the board temperature [per K], (2, 6, n)."""
+        held = hold(board - self._reference, *self._t_range)
+        return self._functions.evaluate(held, 'slope')
+
+    def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
+        """Give what multiplies each parameter of each of the six, in the posterior's order."""
+        t, weight = states[BOARD] - self._reference, states[WEIGHT]
+        held, shares = hold(t, *self._t_range), np.array([1.0 - weight, weight])
+        is_outside = bool((held != t).any())
+        result = []
+        for place, functions in enumerate(zip(*self._functions.rows, strict=True)):
+            found = []
+            for regime, one in enumerate(functions):
+                basis = shares[regime] * np.reshape(one.basis(held[regime]), (-1, len(t)))
+                if is_outside:
+                    basis += self._followed(regime, place, t, shares)
+                found += [shares[regime], *basis]
+            result.append(np.array([*found, *phi]))
+        return result
+
+    def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
+        """
+        Give what multiplies the parameters of one function beyond the ranges, shape (n_free, n):
+        its tangent in each set that follows it, and itself in the other set as far as it goes.
+        """
+        function = self._functions.rows[regime][place]
+        own, other = (edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]])
+        here, edge = (
+            np.reshape(function.basis(hold(one, *own)), (-1, len(t)))
+            for one in (t, hold(t, *other))
+        )
+        result = shares[1 - regime] * (here - edge)
+        ends = zip(self._basis_slopes[regime][place], self._leads, self._beyond(t), strict=True)
+        for slopes, leads, beyond in ends:
+            result += slopes * (shares * beyond)[leads == regime].sum(axis=0)
+        return np.asarray(result)
