@@ -46,6 +46,8 @@ _NOISE_STEP, _NOISE_ROUNDS = 3.0, 2
 _LEAST_GAIN = 1.0
 # Logarithms of mean squares that differ by less than this are equal: 5 % of an RMS.
 _EQUAL = 0.1
+# A gain of the drift below this is worth no group: 1 % of an RMS.
+_LEAST_DRIFT = 0.02
 # Norms of left-out positions alone decide for a group if they gain so many standard errors.
 _SURE_ERRORS = 2.0
 
@@ -339,8 +341,9 @@ def _gain(before: Score, after: Score) -> float:
     drift = [one for one in (positions, sections) if one]
     if norms and norms[0] < -norms[1]:
         return 0.0
-    if drift and all(gain > error for gain, error in drift):
-        return sum(gain for gain, _ in drift)
+    total = sum(gain for gain, _ in drift)
+    if total > _LEAST_DRIFT and all(gain > error for gain, error in drift):
+        return total
     is_sure = norms is not None and norms[0] > _SURE_ERRORS * norms[1]
     if is_sure and norms and all(abs(gain) < _EQUAL for gain, _ in drift):
         return norms[0]
