@@ -66,8 +66,7 @@ class Fault(Enum):
 class SensorCheck:
     """
     Judges one sensor's readings by its past and by the other sensor, which it follows with a lag
-    of `lag_s` (0 for the leading sensor). `is_revived`: the reading just admitted ends a halt
-    or jump.
+    of `lag_s` (0 for the leading sensor). `is_revived`: the reading just admitted ends a fault.
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
