@@ -270,7 +270,7 @@ class TestTopics:
         ('given', 'said'),
         [
             ('/t1', 'expected INPUT=TOPIC, got /t1'),
-            ('bord=/t1', '`bord` is no input; expected counts, imu, board, case or temp'),
+            ('bord=/t1', '`bord` is not an input; expected counts, imu, board, case or temp'),
             ('board=', '`board` needs the name of a topic'),
         ],
     )
@@ -281,7 +281,7 @@ class TestTopics:
         profile = named.with_name('lab.yaml')
         profile.write_text('board: [1]\n')
         refused = cli('info', named, '--topics', profile, code=1).stderr
-        assert f'{profile}: expected INPUT: TOPIC, one a line' in refused
+        assert f'{profile}: expected lines of INPUT: TOPIC' in refused
         assert 'cannot be read' in cli('info', named, '--topics', named, code=1).stderr
 
 
