@@ -269,7 +269,7 @@ class McapOutput:
 
 
 def _offered_qos(topic: str) -> dict[str, Any]:
-    """Give the QoS profile that is recorded as offered: reliable, so that any reader matches."""
+    """Return the QoS profile recorded as offered: reliable, so that any reader matches."""
     is_flag = topic.endswith(_LATCHED)
     return {
         'history': 'keep_last',

@@ -20,13 +20,13 @@ from ..text import one_line
 from ..topics import BOARD, CASE, COUNTS, FLAGS, IMU_IN, IMU_OUT, INPUTS, TEMPERATURE, thermometer
 from .blocks import Input, Role
 
-#: What a thermometer may be without naming a field, and the field that it is then.
+#: Types accepted for a thermometer without a named field, and the field read.
 PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {key: topic.type for key, topic in INPUTS.items()}
 #: The driver's topic in REP 145, and the node's output: what is beside it tells which.
 _RAW = IMU_OUT.name
-#: Words in the names of vector topics that are no specific force.
+#: Words in the names of vector topics that are not a specific force.
 _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
 
 #: Names of further thermometers; the names of roles are reserved.

@@ -31,7 +31,7 @@ from .fields import LiveField, live_field
 from .messages import message_class
 from .waitloop import RawSubscription, WaitLoop, own_node
 
-#: Time between two looks at what is published, and between two blocks [s].
+#: Interval of the search for publishers, and of the blocks [s].
 LOOK_S, BLOCK_S = 0.5, 1.0
 
 _ALL = HistoryPolicy.KEEP_ALL
@@ -199,7 +199,7 @@ class LiveTopics(_Listener):
             and (chosen is None or chosen.type == usual.type)
         }
         if not any(self._hear('accel', name, kind, problems) for name, kind in inputs.items()):
-            problems.append(f'nobody publishes {" or ".join(map(resolved, inputs))}')
+            problems.append(f'no publisher on {" or ".join(map(resolved, inputs))}')
         front = resolved(thermometer('name')).removesuffix('name')
         further = {
             name.removeprefix(front): name

@@ -85,7 +85,7 @@ class CompensationNode:
         self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
         self._report_every(config.diagnostics_period)
         topics = [self.node.resolve_topic_name(one.name) for one in SAMPLES.values()]
-        # The input that is not open may be opened later, with these.
+        # QoS overrides of the input that is not open: it may be opened later.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
         for name in overrides(self.node):
             if not (self.node.has_parameter(name) or name.startswith(known)):

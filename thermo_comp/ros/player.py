@@ -181,7 +181,7 @@ class Player:
 
 
 def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> list[str]:
-    """Give the ROS arguments under which a node loses nothing, at the price of latency."""
+    """Return ROS arguments under which a node loses no message, at the price of latency."""
     inputs = [*(one.name for one in SAMPLES.values()), *map(thermometer, thermometers)]
     overrides = [
         *(f'{topic}.subscription.reliability:=reliable' for topic in inputs),

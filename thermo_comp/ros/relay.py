@@ -40,8 +40,8 @@ from .parameters import NodeConfig, named_topics
 from .reader import LoadedCalibration
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, readings take effect but for those not older than the newest by this [ns]: a
-#: sample that Fast DDS has to repeat can be 3 s late.
+#: Without samples, readings take effect once they are older than the newest by this [ns]: a sample
+#: that Fast DDS has to repeat can be 3 s late.
 IDLE_NS = 1_000_000_000
 
 #: Compensates a sample: stamp and three components in, force and covariance out; None = dropped.
@@ -193,7 +193,7 @@ class Relay:
         self._newest_reading_ns: int | None = None
 
     def _topic(self, name: str) -> str:
-        """Give the topic of a thermometer, with the field of its messages if one is named."""
+        """Return the topic of a thermometer, with the field of its messages if named."""
         usual = thermometer(name)
         return self._names.get(name, self._names.get(usual, usual))
 
