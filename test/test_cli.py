@@ -181,7 +181,7 @@ class TestPlay:
             f'/here{name}': count for name, (_, count) in info.topics.items()
         }
         assert data['unheard'] == sorted(data['unheard'])
-        assert 'nobody listened to /here/accel/counts' in finished.stderr
+        assert '/here/accel/counts had no subscriber' in finished.stderr
 
     def test_ros_arguments_end_where_ros_says(self) -> None:
         words = ['play', 'a', '--ros-args', '-r', 'x:=y', '--', '-q']

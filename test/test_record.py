@@ -217,7 +217,7 @@ def test_what_a_crash_has_left_is_told_and_finished(
     assert leftovers(bags) == {left: 1}
     arguments = ('record', session, '--positions', '1', '--soak', '80s', '-o', bags)
     told = cli(*arguments, code=None).stderr
-    assert f'{left} was left by a run that did not end in order, as bag 1; --finish' in told
+    assert f'{left} is bag 1 of a run that crashed; --finish' in told
     assert left.exists()
     for one in numbered_bags(bags):
         one.unlink()
@@ -233,7 +233,7 @@ def test_what_a_crash_has_left_is_told_and_finished(
     broken = bags / '.07.999999999-abcdef.partial.mcap'
     broken.write_bytes(b'no bag')
     said = cli(*arguments, '--finish', code=None).stderr
-    assert 'no bag can be made of it' in said
+    assert 'it cannot be completed' in said
     assert broken.exists()
 
 
