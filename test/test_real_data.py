@@ -117,10 +117,14 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
     assert result.residuals[-1].fitted.rms / MG < 0.75
 
 
-def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(real_data, work):
-    # After the last jump, in parts of 71 s: each half is corrected by a fit of the other half.
+@pytest.mark.parametrize(
+    ('length', 'n_sets', 'mg'), [(71.0, 2, 0.3), (142.0, 2, 0.5), (284.0, 5, 0.8)]
+)
+def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(real_data, work, length, n_sets, mg):
+    # After the last jump, 1420 s in parts: each set of parts is corrected by a fit of the others.
     bag = freezer_bag(real_data, work)
-    parts = [Part(518.5 + 71.0 * k, 518.5 + 71.0 * (k + 1)) for k in range(20)]
+    starts = np.arange(518.5, 1938.5, length).tolist()
+    parts = [Part(start, start + length) for start in starts]
     raw, left = [], []
     for first in (0, 1):
         seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts[first::2]]
