@@ -214,7 +214,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
 
 
 def _by_headings(path: Path, table: Table, rate_hz: float | None) -> ColumnMap:
-    """Tell the columns by their headings, and the units that these do not state by the numbers."""
+    """Guess the columns by their headings, and missing units by the numbers."""
     named = read_headings(table.headings)
     if named is None or not (named.time or rate_hz):
         listed = ', '.join(map(repr, table.headings[:20]))

@@ -74,7 +74,7 @@ class Cells:
     rate_variance: Floats
 
     def part(self, which: slice) -> Cells:
-        """Choose a run of them."""
+        """Select consecutive cells."""
         names = 'time count index mean variance roughness seam rate rate_variance'
         return replace(self, **{name: getattr(self, name)[which] for name in names.split()})
 
@@ -259,7 +259,7 @@ def still_intervals(
     level = np.quantile(cells.variance[believable], 0.1, axis=0)
     wider = spread_of_variances(cells, believable, level)
     limit = ratio * np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
-    # A drift of d within a cell has a variance of d^2 / 12, give or take what noise makes of it.
+    # A drift of d within a cell has a variance of d^2 / 12; twice that allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
     limit = limit + within**2 / 6.0 if len(within) else limit
     quiet = believable & (cells.variance <= limit).all(axis=1)
@@ -268,7 +268,7 @@ def still_intervals(
     # A single change of so many sd is one as rough as a whole cell.
     is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
     broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
-    # A cell beside a moving one, or on either side of a step, holds the edge of the motion.
+    # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.
     moved = ~quiet
     near = moved.copy()
     near[1:] |= moved[:-1] | broken
