@@ -249,13 +249,16 @@ HUGE = 1 << 60
     ('record', 'reason'),
     [
         (chunk_record(b'x' * 50, '', HUGE), 'declare a content of'),
-        (chunk_record(zstandard.compress(bytes(1000)), 'zstd', HUGE), 'claim to hold'),
-        (chunk_record(lz4.frame.compress(bytes(1000)), 'lz4', HUGE), 'claim to hold'),
+        (chunk_record(zstandard.compress(bytes(1000)), 'zstd', HUGE), 'declare a content of'),
+        (chunk_record(lz4.frame.compress(bytes(1000)), 'lz4', HUGE), 'declare a content of'),
         (
             chunk_record(zstandard.compress(bytes(1 << 22)), 'zstd', 1000),
             'exceeds the limit of 1000',
         ),
-        (chunk_record(lz4.frame.compress(bytes(1 << 22)), 'lz4', 1000), 'more than the 1000'),
+        (
+            chunk_record(lz4.frame.compress(bytes(1 << 22)), 'lz4', 1000),
+            'exceeds the limit of 1000',
+        ),
         (chunk_record(zstandard.compress(bytes(100)), 'zstd', 2000), '100 bytes after'),
         (chunk_record(b'not zstd at all', 'zstd', 100), 'zstd'),
         (chunk_record(b'not lz4 at all', 'lz4', 100), 'lz4'),

@@ -59,7 +59,7 @@ def test_a_conversion_tells_what_the_bag_lacks(tmp_path: Path, cli: Cli) -> None
         database.execute('delete from messages where id > 400')
     topics = ('--topic', f'board={BOARD}', '--topic', f'case={CASE}')
     done = cli('convert', tmp_path / 'bag', '-o', tmp_path / 'o.mcap', *topics, code=1)
-    assert 'messages promised are there' in done.stderr
+    assert 'messages listed are there' in done.stderr
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
@@ -73,7 +73,7 @@ def test_a_topic_that_metadata_promise_and_nobody_has(tmp_path: Path, storage: s
     one['message_count'] = 7
     topics.append(one)
     path.write_text(yaml.safe_dump(content))
-    assert inspect_recording(bag).truncated == '/gone: 0 of the 7 messages promised are there'
+    assert inspect_recording(bag).truncated == '/gone: 0 of the 7 messages listed are there'
 
 
 def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path: Path) -> None
         reader.info = replace(reader.info, topics={**reader.info.topics, ACCEL: (kind, 64)})
         for _ in range(2):  # told once, however often it is read
             assert sum(map(len, reader.blocks())) == 40
-        assert reader.info.truncated == f'{ACCEL}: 40 of the 64 messages promised are there'
+        assert reader.info.truncated == f'{ACCEL}: 40 of the 64 messages listed are there'
 
 
 def test_a_compressed_file_is_read_up_to_its_damage(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_a_chunk_of_a_ros1_bag_expands_within_limits(
             assert columns.temperatures['board'].celsius.tolist() == [20.5]
         else:
             with pytest.raises(
-                RecordingError, match='damaged: it holds more than the 4194304 bytes'
+                RecordingError, match='damaged: its content exceeds the limit of 4194304 bytes'
             ):
                 read_recording(path, require=('board',))
 

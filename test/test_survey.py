@@ -75,7 +75,7 @@ def test_span(tmp_path: Path, low: float, high: float, message: str) -> None:
 
 def test_thousandths_of_a_degree_are_no_degrees(tmp_path: Path) -> None:
     findings = survey(tmp_path / 'bag', up_and_down(5000.0, 35000.0)).findings
-    assert [f for f in findings if 'no degC' in f] == [
+    assert [f for f in findings if 'not degC' in f] == [
         f'{name} reads 5000 .. 3.5e+04: that is not degC' for name in ('board', 'case')
     ]
 
