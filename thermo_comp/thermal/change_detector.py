@@ -81,7 +81,7 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        self._doubt = self.swing  # of the baseline, which may begin at a crest
+        self._doubt = self.swing  # of the baseline, which may begin at a crest of the ripple
         self._trend = 0.0
         self._is_above = False
         self._turned_s = 0.0
