@@ -104,40 +104,40 @@ stamps are carried through; the node never stamps with its own clock and needs n
 Each QoS policy can be overridden at start with the usual `qos_overrides./topic.subscription.reliability`
 parameters.
 
-With Fast DDS the node brings one setting that ROS has no word for, a profile with `nackSupressionDuration`
-20 ms for its publishers: under the default of 0 s each sample for a reliable subscriber wakes a thread of
-the middleware some four times, a quarter of the node's CPU time. A sample lost on the way is repeated up to
-20 ms later than by default. A profile of yours (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
-`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) takes its place; repeat the setting there.
+With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, which has no ROS QoS setting:
+with the default of 0 s each sample for a reliable subscriber wakes a thread of the middleware about four times, a quarter
+of the node's CPU time. A lost sample is repeated up to 20 ms later than by default. Another profile
+(`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces it; repeat the
+setting there.
 
-`linear_acceleration_covariance` is a full 3x3: noise of the sample plus what is uncertain about the
-calibration at this thermal state. Without angular rate or orientation in the input, the first element
-of their covariance is -1 (REP 145). Where the calibration has a `gyroscope`, `angular_velocity` is less its bias at this
-thermal state, and `angular_velocity_covariance` is ours: the noise of one message and what is uncertain of that bias.
+`linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at this thermal
+state. Without angular rate or orientation in the input, the first element of their covariance is -1 (REP 145). If the
+calibration has a `gyroscope`, its bias at this thermal state is subtracted from `angular_velocity`, and
+`angular_velocity_covariance` is the noise of a message plus the uncertainty of that bias.
 
 ## A driver's own topics
 
-The parameter `topics` names the inputs where the driver has them, as `--topic` does offline:
-`topics:=imu=/imu/data,board=/fmu/out/sensor_accel:temperature`, or a file of such lines, of which [config/drivers](drivers.md)
-has some. `TOPIC:FIELD` is a number inside a message, written as for `ros2 topic echo --field`; its type is asked of the
-publisher while the node runs, and only the messages of the driver's package have to be installed. A message without a
-header has no stamp: its reading counts from the newest sample that came before it. `output=TOPIC` names the output, for
-a driver that publishes `imu/data_raw` itself; the node refuses an output that is its input.
+The parameter `topics` names the driver's topics, like `--topic` offline:
+`topics:=imu=/imu/data,board=/fmu/out/sensor_accel:temperature`, or a file of such lines, as in [config/drivers](drivers.md).
+`TOPIC:FIELD` is a number inside a message, written as for `ros2 topic echo --field`. The node learns its type from the
+publisher; only the messages of the driver's package must be installed. A reading without a header gets the stamp of the
+newest sample before it. `output=TOPIC` names the output, for a driver that publishes `imu/data_raw` itself; the node refuses
+an output that is its input.
 
 ## Recording a test
 
-`thermo_comp record` is a node of its own, `thermo_comp_record`: it subscribes to the inputs above, and to every other
-`temperature/<name>`, once somebody publishes them, reliable where that is offered. It publishes nothing.
-[Recording](recording.md#recording) says what for.
+`thermo_comp record` is a separate node, `thermo_comp_record`: it subscribes to the inputs above, and to every other
+`temperature/<name>`, once they have a publisher, reliably if offered. It publishes nothing. See
+[Recording](recording.md#recording).
 
 ## Parameters
 
 {parameters}
 
-A change is checked as a whole before anything is applied. A calibration is read and checked beside the
-samples, by a process of its own; what is left for theirs is to exchange one reference. A `calibration_file` that
-cannot be used is refused in the response, with the reason, and the running calibration stays. The coefficients are in the
-file and not in parameters, because parameters arrive one at a time and half a polynomial is a wrong one.
+A change is checked as a whole before anything is applied. A separate process reads and checks a calibration while samples
+flow; the node then exchanges one reference. An invalid `calibration_file` is refused in the response, with the reason, and
+the running calibration stays. The coefficients are not parameters, because parameters arrive one at a time, and a polynomial
+with half of its coefficients is wrong.
 
 ```console
 $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
@@ -150,26 +150,26 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | NaN or infinite counts | dropped, counted, WARN |
 | counts at full scale | dropped, counted, ERROR while it lasts |
 | no board temperature yet | nothing is published, ERROR |
-| no board temperature, and a calibration that knows nothing of temperature | its constants are published, with what 10 K may do in the covariance |
+| no board temperature, and a calibration without temperature correction | its constants are applied, and the covariance allows for 10 K |
 | board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
 | case temperature older than `case_timeout` | the board decides the regime, WARN, larger covariance |
 | board temperature outside the calibrated range | curves go on along their tangent for a quarter of the range, then are held; larger covariance, WARN with how far |
 | gradient or rate outside the calibrated range | held at the edge, larger covariance, WARN with how far |
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
-| a temperature that jumps as no part can | its readings are not used until they are possible again or the sensor has been lost |
-| a temperature that stands still while the other moves | its readings are not used: held, then lost |
-| both temperatures the same to the bit for 5 s | used, with a covariance that grows, WARN |
+| a temperature that jumps faster than any part can | its readings are not used until they are plausible again or the sensor is lost |
+| a temperature that is constant while the other changes | its readings are not used: held, then lost |
+| both temperatures constant for 5 s | used, with a growing covariance, WARN |
 | a board that leads the case in ramps (swapped topics) | larger covariance, ERROR |
-| counts the same to the bit for `stuck_timeout`, or all zero | dropped, counted, ERROR |
+| counts constant for `stuck_timeout`, or all zero | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude at rest that misses gravity by `gravity_tolerance` | nothing is published, ERROR |
-| a second publisher of a topic | nothing of that topic is used until one is left, or until one alone has sent for a second (the other was killed: the middleware knows it for 20 s yet, WARN); ERROR |
-| a sample of which a calibration makes nothing finite | dropped, counted, ERROR |
-| a message of more than 1 kB (a `frame_id` without end) | dropped, counted |
+| a second publisher of a topic | the topic is not used, ERROR, until only one publisher is left, or only one has sent for a second (after a kill the middleware lists the other for 20 s, WARN) |
+| a sample without a finite correction | dropped, counted, ERROR |
+| a message of more than 1 kB (a very long `frame_id`) | dropped, counted |
 | a temperature stamped more than 5 s after the next one of its sensor | not used |
 | a stamp that repeats or goes back a little | dropped, counted |
 | a stamp more than 15 s (or ten cycles) ahead, which no reading and no second sample confirms | dropped, counted |
-| a stamp that goes back by more than a second | the estimators start anew, said once |
+| a stamp that goes back by more than a second | the estimators restart, reported once |
 
 Every fault with its test: [faults](faults.md).
 """

@@ -181,7 +181,7 @@ class TestPlay:
             f'/here{name}': count for name, (_, count) in info.topics.items()
         }
         assert data['unheard'] == sorted(data['unheard'])
-        assert 'nobody listened to /here/accel/counts' in finished.stderr
+        assert '/here/accel/counts had no subscriber' in finished.stderr
 
     def test_ros_arguments_end_where_ros_says(self) -> None:
         words = ['play', 'a', '--ros-args', '-r', 'x:=y', '--', '-q']
@@ -270,7 +270,7 @@ class TestTopics:
         ('given', 'said'),
         [
             ('/t1', 'expected INPUT=TOPIC, got /t1'),
-            ('bord=/t1', '`bord` is no input; expected counts, imu, board, case or temp'),
+            ('bord=/t1', '`bord` is not an input; expected counts, imu, board, case or temp'),
             ('board=', '`board` needs the name of a topic'),
         ],
     )
@@ -281,7 +281,7 @@ class TestTopics:
         profile = named.with_name('lab.yaml')
         profile.write_text('board: [1]\n')
         refused = cli('info', named, '--topics', profile, code=1).stderr
-        assert f'{profile}: expected INPUT: TOPIC, one a line' in refused
+        assert f'{profile}: expected lines of INPUT: TOPIC' in refused
         assert 'cannot be read' in cli('info', named, '--topics', named, code=1).stderr
 
 

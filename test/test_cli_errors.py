@@ -82,7 +82,10 @@ class TestUsage:
                 ('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', 'nan'),
                 r'--reference-temperature: must be at least -273.15, got nan',
             ),
-            (('play', 'a', '--rate', 'inf'), r'--rate must be finite; 0 is as fast as it is'),
+            (
+                ('play', 'a', '--rate', 'inf'),
+                r'--rate must be finite; 0 is as fast as subscribers',
+            ),
             (('fit', 'a', '-o', 'b', '--latitude', '60'), r'--latitude and --height'),
             (('evaluate', 'a', '-c', 'b', '--window', '0'), r"'--window': .*(greater|range)"),
             (('evaluate', 'a', '-c', 'b', '--tolerance', '9'), r'--tolerance: expected .*, got'),

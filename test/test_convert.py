@@ -274,7 +274,7 @@ class TestColumnMap:
                 None,
                 'two thermometers of one',
             ),
-            ({'stamp': {'column': 't'}}, 'stamp.unit', 'iso where there is a column'),
+            ({'stamp': {'column': 't'}}, 'stamp.unit', 'iso if `column` is given'),
             ({'stamp': {}}, 'stamp', 'give either `column` and `unit`, or `rate_hz`'),
             ({'stamp': {'column': 't', 'unit': 's', 'rate_hz': 1.0}}, 'stamp', 'give either'),
             (

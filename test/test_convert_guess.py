@@ -107,13 +107,13 @@ def test_what_does_not_tell_itself_is_asked_for(tmp_path: Path, rng: np.random.G
         guess_columns(write(path, rng, 9.8))
     with pytest.raises(RecordingError, match='its first column has the times'):
         guess_columns(write(path, rng, 9.8, time=time), 100.0)
-    with pytest.raises(RecordingError, match='is no time that rises'):
+    with pytest.raises(RecordingError, match='is not a rising time'):
         guess_columns(write(path, rng, 9.8, time=time[::-1]))
-    with pytest.raises(RecordingError, match=r'gravity in no unit known here: give a column map'):
+    with pytest.raises(RecordingError, match=r'not gravity in any known unit: give a column map'):
         guess_columns(write(path, rng, 3.3, time=time))
     path.write_text('t,a,b,c\n' + '0,0,0,9.8\n' * 100)
     with pytest.raises(RecordingError, match='its headings name no accelerometer'):
         guess_columns(path)
     path.write_text('0 0 0 9.8 20\n' * 100)
-    with pytest.raises(RecordingError, match='5 columns without headings do not say'):
+    with pytest.raises(RecordingError, match='5 columns without headings cannot be identified'):
         guess_columns(path)

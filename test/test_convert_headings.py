@@ -181,7 +181,7 @@ def test_the_guessed_map_is_printed(tmp_path: Path, rng: np.random.Generator, cl
     (tmp_path / 'log.csv').write_text('\n'.join(['time (s),ax,ay,az', *rows]))
     said = cli('convert', tmp_path / 'log.csv', '-o', tmp_path / 'bag').stdout
     head, *lines = said.splitlines()
-    assert 'taken as this column map; edit it and give it as --columns if not so' in head
+    assert 'guessed column map; if it is wrong, edit it and give it as --columns' in head
     own = yaml.safe_load('\n'.join(line for line in lines[:2]))
     assert own['stamp'] == {'column': 'time (s)', 'unit': 's'}
     assert own['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}

@@ -70,7 +70,7 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk: Path, cli
     (line,) = finished.stderr.strip().splitlines()
     found = re.fullmatch(
         rf'thermo_comp: error: {small_disk}/01.mcap: cannot be written: No space left on device; '
-        r'what was written is (\S+)',
+        r'the part written is in (\S+)',
         line,
     )
     assert found, line

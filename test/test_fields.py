@@ -107,9 +107,9 @@ def test_any_field_of_any_layout(
     [
         ('temp', r'has the fields header, names, parts.*, no `temp`'),
         ('last.celsius.x', 'a number has the fields none, no `x`'),
-        ('names', 'is no number'),
-        ('header', 'is no number'),
-        ('last[0]', 'of what is no array'),
+        ('names', 'is not a number'),
+        ('header', 'is not a number'),
+        ('last[0]', 'of a field that is not an array'),
         ('raw[', 'no `raw\\['),
     ],
 )

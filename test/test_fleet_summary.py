@@ -194,7 +194,7 @@ class TestTable:
 
     def test_what_is_no_fleet_table(self, tmp_path: Path) -> None:
         (tmp_path / 'x.parquet').write_bytes(b'PAR1 not')
-        with pytest.raises(ThermoCompError, match=r'x\.parquet: no fleet table'):
+        with pytest.raises(ThermoCompError, match=r'x\.parquet: not a fleet table'):
             read_parquet(tmp_path / 'x.parquet')
         from pyarrow import parquet
 
@@ -227,5 +227,5 @@ def test_no_name_leads_out_of_the_results(name: str, tmp_path: Path) -> None:
 
 def test_results_need_a_folder(tmp_path: Path) -> None:
     (tmp_path / 'file').touch()
-    with pytest.raises(ThermoCompError, match='file: cannot be made'):
+    with pytest.raises(ThermoCompError, match='file: cannot be created'):
         Results(tmp_path / 'file')

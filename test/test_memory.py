@@ -13,7 +13,7 @@ import pytest
 from builders import SECOND_NS
 
 from thermo_comp.thermal.memory import (
-    START_APART,
+    START_JITTER,
     LagBank,
     MemorySpec,
     ThermalMemory,
@@ -122,9 +122,9 @@ def test_a_play_on_a_lag_follows_the_lag():
 def test_start_prior():
     lags = (('board', 60.0), ('board', 3600.0), ('case', 3600.0), ('tip', 3600.0))
     P = start_covariance(lags)
-    assert math.sqrt(P[1, 1]) == pytest.approx(3.0, rel=START_APART)
+    assert math.sqrt(P[1, 1]) == pytest.approx(3.0, rel=START_JITTER)
     assert math.sqrt(P[0, 0]) == pytest.approx(0.39, abs=0.005)
-    assert math.sqrt(P[2, 2]) == pytest.approx(1.0, rel=START_APART)
+    assert math.sqrt(P[2, 2]) == pytest.approx(1.0, rel=START_JITTER)
     assert P[0, 1] == pytest.approx(0.005 * 60.0 * 3600.0 / 3660.0)
     assert not P[:2, 2:].any()
     assert P[2, 3] == 0.0

@@ -256,7 +256,9 @@ def test_a_subscriber_that_takes_nothing_is_not_waited_for_without_end(
     peer.node.create_subscription(Vector3Stamped, 'accel/counts', block, UNLIMITED)
     monkeypatch.setattr(player, 'PATIENCE', 0.5)
     try:
-        with pytest.raises(ThermoCompError, match='/accel/counts: a subscriber took nothing'):
+        with pytest.raises(
+            ThermoCompError, match='/accel/counts: a subscriber acknowledged nothing'
+        ):
             play(tmp_path / 'bag', rate=0.0)
         assert held.is_set()
     finally:

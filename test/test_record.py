@@ -217,7 +217,7 @@ def test_what_a_crash_has_left_is_told_and_finished(
     assert leftovers(bags) == {left: 1}
     arguments = ('record', session, '--positions', '1', '--soak', '80s', '-o', bags)
     told = cli(*arguments, code=None).stderr
-    assert f'{left} was left by a run that did not end in order, as bag 1; --finish' in told
+    assert f'{left} is bag 1 of a run that crashed; --finish' in told
     assert left.exists()
     for one in numbered_bags(bags):
         one.unlink()
@@ -233,7 +233,7 @@ def test_what_a_crash_has_left_is_told_and_finished(
     broken = bags / '.07.999999999-abcdef.partial.mcap'
     broken.write_bytes(b'no bag')
     said = cli(*arguments, '--finish', code=None).stderr
-    assert 'no bag can be made of it' in said
+    assert 'it cannot be completed' in said
     assert broken.exists()
 
 
@@ -281,7 +281,7 @@ class TestLive:
         bags = tmp_path / 'bags'
         options = ('--positions', f'{N_POSITIONS}', '--soak', '80s', '--serial', 'lab-7')
         recording = Recording(*options, '-o', bags, '--json')
-        recording.wait_for('nobody publishes /accel/counts or /imu/uncompensated')
+        recording.wait_for('no publisher on /accel/counts or /imu/uncompensated')
         play(session, rate=0.0, wait_s=30.0)
         code, result, _ = recording.end()
         assert code == 0
@@ -300,7 +300,7 @@ class TestLive:
     ) -> None:
         bags, session = tmp_path / 'bags', write_session(tmp_path / 'session.mcap', UPS[:2])
         recording = Recording('--soak', '80s', '-o', bags, '--json')
-        recording.wait_for('nobody publishes')
+        recording.wait_for('no publisher on')
         play(session, rate=0.0, wait_s=30.0)
         recording.wait_for('position 2: good')
         code, result, _ = recording.end(signal.SIGTERM)
@@ -325,7 +325,7 @@ class TestLive:
         recording = Recording(
             '--positions', '1', '--soak', '30s', *topics, '-o', tmp_path / 'bags', '--json'
         )
-        recording.wait_for('nobody publishes /left/imu/driver')
+        recording.wait_for('no publisher on /left/imu/driver')
         play(bag, rate=0.0, wait_s=30.0, ros_args=remap)
         code, result, said = recording.end()
         assert (code, result['n_good']) == (0, 1), said

@@ -248,11 +248,17 @@ HUGE = 1 << 60
 @pytest.mark.parametrize(
     ('record', 'reason'),
     [
-        (chunk_record(b'x' * 50, '', HUGE), 'claim to hold'),
-        (chunk_record(zstandard.compress(bytes(1000)), 'zstd', HUGE), 'claim to hold'),
-        (chunk_record(lz4.frame.compress(bytes(1000)), 'lz4', HUGE), 'claim to hold'),
-        (chunk_record(zstandard.compress(bytes(1 << 22)), 'zstd', 1000), 'more than the 1000'),
-        (chunk_record(lz4.frame.compress(bytes(1 << 22)), 'lz4', 1000), 'more than the 1000'),
+        (chunk_record(b'x' * 50, '', HUGE), 'declare a content of'),
+        (chunk_record(zstandard.compress(bytes(1000)), 'zstd', HUGE), 'declare a content of'),
+        (chunk_record(lz4.frame.compress(bytes(1000)), 'lz4', HUGE), 'declare a content of'),
+        (
+            chunk_record(zstandard.compress(bytes(1 << 22)), 'zstd', 1000),
+            'exceeds the limit of 1000',
+        ),
+        (
+            chunk_record(lz4.frame.compress(bytes(1 << 22)), 'lz4', 1000),
+            'exceeds the limit of 1000',
+        ),
         (chunk_record(zstandard.compress(bytes(100)), 'zstd', 2000), '100 bytes after'),
         (chunk_record(b'not zstd at all', 'zstd', 100), 'zstd'),
         (chunk_record(b'not lz4 at all', 'lz4', 100), 'lz4'),
@@ -261,7 +267,7 @@ HUGE = 1 << 60
         (chunk_record(b'\x05' + struct.pack('<Q', HUGE) + bytes(91), '', 100), 'ends too early'),
         (chunk_record(b'\x05' + struct.pack('<Q', 3) + bytes(91), '', 100), '3 bytes'),
         (chunk_record(b'\x0f' + struct.pack('<Q', 91) + bytes(91), '', 100, 99), 'checksum'),
-        (chunk_record(bytes(10), '', (1 << 26) + 1), 'a chunk may have 67108864'),
+        (chunk_record(bytes(10), '', (1 << 26) + 1), 'limit 67108864'),
         (struct.pack('<BQ', Opcode.CHUNK, 10) + bytes(10), 'damaged head'),
         (struct.pack('<BQ', Opcode.CHUNK, 40) + bytes(28) + b'\xff' * 12, 'damaged head'),
         (struct.pack('<BQ', Opcode.CHUNK, HUGE) + bytes(10), 'not whole'),
@@ -327,7 +333,7 @@ def test_false_times_of_a_chunk_are_found(tmp_path: Path) -> None:
     start, end = struct.unpack_from('<QQ', content, position + 9)
     changed = content.replace(struct.pack('<QQ', start, end), struct.pack('<QQ', start + 5, end))
     path.write_bytes(changed)
-    with pytest.raises(RecordingError, match='outside the time it claims'):
+    with pytest.raises(RecordingError, match='outside its declared time'):
         read(path)
 
 

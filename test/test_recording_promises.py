@@ -40,7 +40,7 @@ def test_rows_deleted_from_a_database_are_missed(tmp_path: Path, cli: Cli) -> No
         (topic,) = database.execute('select id from topics where name = ?', (ACCEL,)).fetchone()
         query = 'delete from messages where id > 100 and topic_id = ?'
         n_left = 400 - database.execute(query, (topic,)).rowcount
-    told = f'{ACCEL}: {n_left} of the 400 messages promised are there'
+    told = f'{ACCEL}: {n_left} of the 400 messages listed are there'
     assert inspect_recording(bag).truncated == told
     assert told in cli('info', bag, code=1).stdout
     calibration = Path(__file__).parent.parent / 'config' / 'calibration.example.yaml'
@@ -59,7 +59,7 @@ def test_a_conversion_tells_what_the_bag_lacks(tmp_path: Path, cli: Cli) -> None
         database.execute('delete from messages where id > 400')
     topics = ('--topic', f'board={BOARD}', '--topic', f'case={CASE}')
     done = cli('convert', tmp_path / 'bag', '-o', tmp_path / 'o.mcap', *topics, code=1)
-    assert 'messages promised are there' in done.stderr
+    assert 'messages listed are there' in done.stderr
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
@@ -73,7 +73,7 @@ def test_a_topic_that_metadata_promise_and_nobody_has(tmp_path: Path, storage: s
     one['message_count'] = 7
     topics.append(one)
     path.write_text(yaml.safe_dump(content))
-    assert inspect_recording(bag).truncated == '/gone: 0 of the 7 messages promised are there'
+    assert inspect_recording(bag).truncated == '/gone: 0 of the 7 messages listed are there'
 
 
 def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path: Path) -> None
         reader.info = replace(reader.info, topics={**reader.info.topics, ACCEL: (kind, 64)})
         for _ in range(2):  # told once, however often it is read
             assert sum(map(len, reader.blocks())) == 40
-        assert reader.info.truncated == f'{ACCEL}: 40 of the 64 messages promised are there'
+        assert reader.info.truncated == f'{ACCEL}: 40 of the 64 messages listed are there'
 
 
 def test_a_compressed_file_is_read_up_to_its_damage(tmp_path: Path) -> None:
@@ -100,9 +100,9 @@ def test_a_compressed_file_is_read_up_to_its_damage(tmp_path: Path) -> None:
         for topic, n_all in ((ACCEL, 8000), (BOARD, 1000), (CASE, 1000)):
             n_read = recording.info.topics[topic][1]
             assert f'{topic}: {n_read} of the {n_all} messages' in told
-    assert f'{packed.name} is unreadable behind' in told
+    assert f'{packed.name} is unreadable after' in told
     packed.write_bytes(data[:8])
-    with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: it holds nothing'):
+    with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: it has no content'):
         read_recording(bag)
 
 
@@ -119,7 +119,7 @@ def test_a_compressed_file_expands_within_limits_and_leaves_nothing(
     with packed.open('wb') as out, zstandard.ZstdCompressor(19).stream_writer(out) as writer:
         for _ in range(128):
             writer.write(bytes(1 << 20))
-    with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: it holds more than'):
+    with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: its content exceeds'):
         read_recording(bag)
     assert not list(temporary.iterdir())
 
@@ -130,7 +130,7 @@ def test_a_compressed_message_expands_within_limits(tmp_path: Path) -> None:
         bomb = zstandard.compress(bytes(1 << 28))
         database.execute('update messages set data = ? where id = 1', (bomb,))
     with pytest.raises(
-        RecordingError, match=r'bag\.db3: damaged: it holds more than the 67108864 bytes'
+        RecordingError, match=r'bag\.db3: damaged: its content exceeds the limit of 67108864 bytes'
     ):
         read_recording(bag)
 
@@ -162,7 +162,7 @@ def test_a_chunk_of_a_ros1_bag_expands_within_limits(
             assert columns.temperatures['board'].celsius.tolist() == [20.5]
         else:
             with pytest.raises(
-                RecordingError, match='damaged: it holds more than the 4194304 bytes'
+                RecordingError, match='damaged: its content exceeds the limit of 4194304 bytes'
             ):
                 read_recording(path, require=('board',))
 

@@ -379,7 +379,7 @@ def test_topics_by_the_names_of_their_inputs(tmp_path: Path) -> None:
         open_recording(path, Topics.named({**names, 'temperature/magnet': '/raw'}))
     for wrong in ('bord', 'temperature/', 'temperature/A b', 'magnet'):
         with pytest.raises(
-            ValueError, match=f'`{wrong}` is no input; expected counts, imu, board'
+            ValueError, match=f'`{wrong}` is not an input; expected counts, imu, board'
         ):
             Topics.named({wrong: '/t1'})
     with pytest.raises(ValueError, match='`case` needs the name of a topic'):

@@ -146,13 +146,13 @@ def test_page_has_each_id_once_and_refers_to_ids_it_has(page):
 
 def test_bag_says_whether_its_fit_has_seen_it(opened):
     calibration = fitted().calibration
-    assert 'positions in bags of its own fit' in Page(certificate()).text
+    assert 'positions in bags of the fit' in Page(certificate()).text
     unseen = evidence_of_bags(opened, calibration)
-    assert '1 position in bags that the fit has not seen' in words_of(unseen).text
+    assert '1 position in bags that the fit did not use' in words_of(unseen).text
     sources = (replace(calibration.provenance.sources[0], sha256=unseen.bags[0].source.sha256),)
     provenance = replace(calibration.provenance, sources=sources)
     seen = evidence_of_bags(opened, replace(calibration, provenance=provenance))
-    assert '1 position in bags of its own fit' in words_of(seen).text
+    assert '1 position in bags of the fit' in words_of(seen).text
 
 
 def test_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):

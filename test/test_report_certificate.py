@@ -287,7 +287,7 @@ def test_command_takes_the_statements(cli, tmp_path):
     page = (tmp_path / 'fit.html').read_text(encoding='utf-8')
     assert 'Inertial Lab' in page
     assert 'class="simulated"' in page
-    assert '1 position in bags of its own fit' in page
+    assert '1 position in bags of the fit' in page
     assert '--report' in cli(*fit, lab(tmp_path), '--force', code=2).stderr
     refused = cli('report', *given, lab(tmp_path, 'number: 17'), '--force', code=1)
     assert 'lab.yaml: number: must be a valid text, got 17' in refused.stderr

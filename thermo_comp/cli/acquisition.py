@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the account of a test while it is recorded: positions, what they are worth, what is missing.
+Owns the progress of a test during recording: positions, resulting accuracy, what is missing.
 
-Fed with blocks as they come. A rest that points elsewhere than the position so far begins the next
-position; knocks and handling in between belong to the one before.
+Blocks are added as they come. A rest in another direction than the present position begins the
+next position; knocks and handling in between belong to the previous position.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from ..recording.overview import ThermometerSurvey, survey_thermometer, thermal_
 from ..recording.stillness import CellAccumulator, Cells, still_intervals
 from ..typing import Floats, Ints
 
-# What is still for so long, or for a soak that is shorter, is a rest [s].
+# Shortest rest that counts, or the soak if that is shorter [s].
 _REST_S = 10.0
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
-# Cells that are looked at again for where a rest begins.
+# Number of earlier cells that are searched again for the begin of a rest.
 _LOOKED_BACK = 200
-# However long it lasts, hysteresis, mounting and drift leave this of a position [g].
+# Sd of a position by hysteresis, mounting and drift, however long it lasts [g].
 _FLOOR_SD = 2e-5
-# A rest with so many times the noise of the others is none to be proud of; with so many times that
-# of the one before it is a hand's.
+# Noise of a rest / noise of the others above which it is 'restless'; noise / that of the previous
+# rest above which the unit is held by hand.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 _STEP_BACK_NS = 10**9
-# Before any stamp; its opposite is after all of them.
+# Earlier than any stamp.
 _EVER_NS = -(1 << 62)
 
-#: By the name of the thermometer.
+#: Surveys by thermometer.
 Surveys = Mapping[str, ThermometerSurvey]
 
 
 @dataclass(frozen=True)
 class Position:
     """
-    One position: where it points (NaN before it rests), how long and in how many pieces it rests,
-    the noise of its mean, its temperatures, and why it is not good ('' = it is).
+    A position: direction of the force (NaN before a rest), duration and number of its rests, noise
+    of its mean, temperatures, and the reason why it is not good ('' = good).
     """
 
     up: Floats
@@ -57,12 +57,12 @@ class Position:
 @dataclass(frozen=True)
 class Account:
     """
-    What a test has and what it still lacks.
+    State of a test, and what is missing.
 
-    The last of the positions goes on. `worst_sd_g` is what the constants leave of the force in the
-    worst attitude, `constants_sd` is of bias [g], relative scale and M [rad], as in `coverage`. It
-    is to be turned to `next_up`, by `next_deg` from `now`, the newest reading's direction (NaN
-    before any); `hole` is farthest from all positions. Findings say what is missing.
+    The last position is unfinished. `worst_sd_g` is the sd of the force in the worst attitude,
+    `constants_sd` that of bias [g], relative scale and M [rad], as in `coverage`. `next_up` is the
+    recommended next direction, `next_deg` away from `now`, the direction of the newest reading
+    (NaN before any); `hole` is farthest from all positions. `findings` list what is missing.
     """
 
     positions: tuple[Position, ...]
@@ -82,7 +82,7 @@ class Account:
 
 @dataclass(frozen=True)
 class _Rest:
-    """What the still cells of one position say, in input units, and its thermometers."""
+    """Statistics of a position's still cells, in input units, and its thermometers."""
 
     surveys: Surveys
     mean: Floats = field(default_factory=lambda: np.full(3, np.nan))
@@ -93,7 +93,7 @@ class _Rest:
 
 
 class Acquisition:
-    """The test so far: positions wanted, each at rest for `soak_s`, and the word of no force."""
+    """The test so far; `soak_s` is the wanted rest, `offset` the reading without a force."""
 
     def __init__(self, n_positions: int, soak_s: float, offset: float = 0.0) -> None:
         self._n_wanted, self._soak_s, self._offset = n_positions, soak_s, offset
@@ -103,19 +103,19 @@ class Acquisition:
         self._start()
 
     def _start(self) -> None:
-        """Begin with another clock."""
+        """Restart, possibly with another clock."""
         self._accumulator = CellAccumulator(_CELL_S, None)
-        # The length of a cell follows from the first samples: there must be some.
+        # Samples kept until there are enough to choose the length of a cell.
         self._held: list[tuple[Ints, Floats]] | None = []
         self._readings: dict[str, list[Readings]] = {}
-        #: Before this stamp no position begins any more.
+        #: No later position begins before this stamp.
         self.settled_ns = self._newest_ns = self._begin_ns = _EVER_NS
         self._n_looked = 0
-        # Mean of the position's first rest, which a quieter one later may hide.
+        # Mean of the position's first rest, which a later, quieter rest may exclude.
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:
-        """Take what came; return the stamps [ns] at which further positions begin."""
+        """Take a block; return the stamps [ns] at which further positions begin."""
         for name, one in block.temperatures.items():
             self._readings.setdefault(name, []).append(one)
         if not len(block):
@@ -123,7 +123,7 @@ class Acquisition:
         begins: list[int] = []
         stamp_ns, samples = block.accel_stamp_ns, block.accel - self._offset
         if self._newest_ns - int(stamp_ns[0]) > _STEP_BACK_NS:
-            # A driver that began anew, with another clock.
+            # The driver restarted, with another clock.
             self.begin()
             begins.append(int(stamp_ns[0]))
         self._newest_ns = int(stamp_ns[-1])
@@ -147,25 +147,25 @@ class Acquisition:
         return begins
 
     def begin(self) -> None:
-        """End the position; what comes next may have another clock."""
+        """End the position; later blocks may have another clock."""
         self._close(-_EVER_NS)
         self._start()
 
     def _cells(self) -> Cells:
-        """Give the cells of the position."""
+        """Return the cells of the position."""
         cells = self._accumulator.finish()
         begin_s = (self._begin_ns - cells.start_ns) * 1e-9
         return cells.part(slice(int(np.searchsorted(cells.time, begin_s)), None))
 
     def _turn(self, cells: Cells) -> int | None:
         """Find where the sensor first rests in another direction than before [ns]."""
-        # What was looked at before is over, but for its end.
+        # Search only new cells and the end of the earlier ones.
         n_looked, self._n_looked = self._n_looked, len(cells.count)
         cells = cells.part(slice(max(n_looked - _LOOKED_BACK, 0), None))
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # After a quiet position a less quiet one is at rest by its own measure.
+        # After a quiet position, judge the rest of a noisier position by its own noise.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [
@@ -185,7 +185,7 @@ class Acquisition:
         return cells.start_ns + round(float(cells.index[lower]) * cells.cell_s * 1e9)
 
     def _close(self, end_ns: int) -> None:
-        """End the position; what came since belongs to the next one."""
+        """End the position at a stamp; later samples belong to the next position."""
         self._rests.append(self._rest(self._cells(), end_ns))
         self._readings = {
             name: [part for one in own if len((part := _part(one, end_ns, -_EVER_NS)).stamp_ns)]
@@ -196,7 +196,7 @@ class Acquisition:
         self._centre = coverage.rough_centre(means)
 
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
-        """Put the rests of the position together, up to where the next one begins."""
+        """Combine the rests of the position, up to the begin of the next."""
         found = {
             name: survey_thermometer([_part(one, _EVER_NS, end_ns) for one in own])
             for name, own in self._readings.items()
@@ -220,7 +220,7 @@ class Acquisition:
         return coverage.directions(means, self._centre)
 
     def account(self) -> Account:
-        """Say what there is and what is missing."""
+        """Return the state of the test, and what is missing."""
         cells = self._cells()
         rests = [*self._rests, self._rest(cells, -_EVER_NS)]
         means = np.array([one.mean for one in rests])
@@ -262,7 +262,7 @@ class Acquisition:
         )
 
     def _reason(self, rest: _Rest, up: Floats, noise: float, before: Sequence[Position]) -> str:
-        """Say why a position is not good; nothing where it is."""
+        """Return why a position is not good; '' if it is good."""
         if not rest.n_rests:
             return 'not at rest yet'
         if np.isnan(up).any():
@@ -286,7 +286,7 @@ class Acquisition:
             return np.full(3, np.nan), False
         cells = cells.part(slice(-_LOOKED_BACK, None))
         ranges = still_intervals(cells, 0.0)
-        # The last cell is still filling, the one before may be beside a motion.
+        # The last cell is incomplete, and the previous cell may be adjacent to a motion.
         is_still = bool(ranges) and ranges[-1][1] >= len(cells.count) - 1
         last = cells.mean[-2:-1] if len(cells.count) > 1 else cells.mean
         return self._directions(last)[0], is_still

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the one door of the command line: which commands there are and what an exit code means.
+Owns the entry point of the command line: its commands and exit codes.
 
-0: done. 1: the data or the result is bad. 2: the command line is wrong. 70: a mistake of this
-program's; its traceback goes into a file. Whatever it is, it is one line on stderr.
+0: done. 1: the data or the result is bad. 2: the command line is wrong. 70: a bug of this program,
+whose traceback goes into a file. Every error is one line on stderr.
 
-Heavy libraries are imported by the commands when they run, so that ``--help`` is quick.
+Heavy libraries are imported by the commands when they run, so that ``--help`` is fast.
 """
 
 import os
@@ -24,13 +24,13 @@ from ..text import hold_standard_streams
 from . import bags, convert, demo, fit, judge, output, record, simulate
 from .shared_options import expanded, option
 
-# The base of every mistake in a command line; typer gives its children names, but not itself.
+# Base class of all errors in a command line, which typer does not export.
 _UsageMistake: Any = typer.BadParameter.__mro__[2]
 
-#: How typer says that the value of an option is no number: the option's names, the kind of number.
+#: Typer's message for an option whose value is not a number: option names, kind of number.
 _NO_NUMBER = re.compile(r"'(-[\w-]+)'(?: / '(-[\w-]+)')?: .*\b(?:a )?valid (number|float|integer)")
 
-# The bounds of a number on a line of their own: beside its name they cut the longest option names.
+# Print the bounds of a number on a separate line: otherwise long option names are cut.
 rich_utils.RANGE_STRING = '\n[{}]'
 
 app = typer.Typer(
@@ -72,9 +72,9 @@ app.add_typer(_fleet)
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and leave the process with its exit code."""
     hold_standard_streams()
-    # Threads over small matrices wait for each other: 16 times as long where the cores are busy.
+    # Threads over small matrices wait for each other: up to 16 times slower on busy cores.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what was begun is cleared away
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that clean-up code runs
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -90,7 +90,7 @@ def run(arguments: list[str]) -> int:
     except _UsageMistake as mistake:
         context = getattr(mistake, 'ctx', None)
         command = 'thermo_comp' if context is None else context.command_path
-        if said := mistake.format_message():  # nothing where typer has printed the help
+        if said := mistake.format_message():  # empty if typer has printed the help
             output.error(f'{_plain(said, arguments)} (see: {command} --help)')
         return int(mistake.exit_code)
     except typer.Abort:
@@ -102,8 +102,7 @@ def run(arguments: list[str]) -> int:
         output.error(f'this command needs {failure.name}: pip install thermo_comp')
         return 1
     except BrokenPipeError:
-        # The reader of a pipe has seen enough (`... | head`); the interpreter must not complain
-        # about it while it shuts down.
+        # The reader closed the pipe (`... | head`): avoid the interpreter's message at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as failure:
@@ -116,7 +115,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _plain(message: str, arguments: list[str]) -> str:
-    """Say what typer says of a value in this program's words, with the value."""
+    """Rewrite a message of typer about a value, and add the value."""
     message = message.replace('Value error, ', '').replace('Input should be', 'must be')
     option = _NO_NUMBER.search(message)
     if option is None:
@@ -132,7 +131,7 @@ def _plain(message: str, arguments: list[str]) -> str:
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Give a command's own arguments and ROS's, which stand from ``--ros-args`` up to ``--``."""
+    """Split arguments into a command's and those of ROS (from ``--ros-args`` up to ``--``)."""
     own: list[str] = []
     ros: list[str] = []
     target = own
@@ -147,7 +146,7 @@ def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _unexpected(failure: Exception) -> int:
-    """Keep the traceback of what nobody has foreseen, say where, return its exit code."""
+    """Save the traceback of an unexpected error, print its file, return the exit code."""
     import tempfile
     import traceback
 
@@ -160,6 +159,6 @@ def _unexpected(failure: Exception) -> int:
         name = f'not written ({error.strerror})'
     reason = f'{type(failure).__name__}: {failure}'
     output.error(
-        f'unexpected {reason:.300}; this is a mistake of the program, its traceback is {name}'
+        f'unexpected {reason:.300}; this is a bug of the program, its traceback is {name}'
     )
     return 70  # EX_SOFTWARE of sysexits.h

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what is done with one bag: ``info`` (or with a calibration), ``replay`` and ``play``."""
+"""Owns the commands for a single bag: ``info`` (also for a calibration), ``replay``, ``play``."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -25,10 +25,10 @@ def info(
     out: Output = options.out,
 ) -> None:
     """
-    Say what is in a bag or a calibration.
+    Describe a bag or a calibration.
 
-    Of a bag: topics, rate, temperature span and ramps, gaps, and whether
-    it is fit for a fit. Of a calibration: unit, ranges, sets, residuals.
+    Bag: topics, rate, temperature span and ramps, gaps, and whether a fit
+    can use it. Calibration: unit, ranges, sets, residuals.
 
     Example:
       thermo_comp info chamber.mcap
@@ -63,7 +63,7 @@ def info(
         )
     out.points(survey.findings)
     if not survey.findings:
-        out.line('fit for a fit, together with other positions')
+        out.line('a fit can use it, together with other positions')
     out.end(
         int(bool(found.truncated)),
         path=path,
@@ -129,12 +129,8 @@ def replay(
     bag: Path = _BAG,
     calibration: Path = option('Calibration of the unit (YAML).', ..., '--calibration', '-c'),
     output: Path = option('*.mcap, a folder, *.csv or *.parquet.', ..., '--output', '-o'),
-    keep_inputs: bool = option(
-        'Copy the input messages beside the output.', False, '--keep-inputs'
-    ),
-    all_topics: bool = option(
-        'Copy all other topics beside the output, too.', False, '--all-topics'
-    ),
+    keep_inputs: bool = option('Also copy the input messages.', False, '--keep-inputs'),
+    all_topics: bool = option('Also copy all other topics.', False, '--all-topics'),
     serial: str | None = options.SERIAL,
     frame_id: str = option("Frame of the output; empty keeps the input's.", ''),
     transition_time: float = option(_AS_THE_NODE, CompensatorConfig.transition_time_s, min=0.0),
@@ -149,8 +145,7 @@ def replay(
 
     Writes imu/data_raw (sensor_msgs/Imu), regime/dynamic (std_msgs/Bool)
     and regime/stamped (the same with its stamp); the log time of each
-    message is its stamp. Or a table of the corrected samples, which leaves
-    the other topics out.
+    message is its stamp. A table holds the corrected samples only.
 
     Example:
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
@@ -209,7 +204,7 @@ def play(
     context: typer.Context,
     bag: Path = _BAG,
     rate: float = option(
-        'Seconds of the bag per second; 0 = as fast as it is taken.', 1.0, min=0.0
+        'Speed relative to real time; 0 = as fast as subscribers take it.', 1.0, min=0.0
     ),
     wait: float = option('Longest wait for a subscriber on every topic, in s.', 10.0, min=0.0),
     topics: Any = options.reading,
@@ -218,17 +213,17 @@ def play(
     """
     Play a bag onto the live topics of the node, with /clock.
 
-    Whatever the topics are called in the bag, they go out as accel/counts
-    (or imu/uncompensated), temperature/board and temperature/case; remap
-    them after --ros-args. It ends when every reliable subscriber has got
-    everything. For other topics, pauses and loops there is ros2 bag play.
+    The topics are published as accel/counts (or imu/uncompensated),
+    temperature/board and temperature/case, whatever their names in the bag;
+    remap them after --ros-args. It ends when every reliable subscriber has
+    received everything. For other topics, pauses and loops use ros2 bag play.
 
     Example:
       thermo_comp play chamber.mcap --rate 20
       thermo_comp play chamber.mcap --ros-args -r __ns:=/imu0
     """
     if not rate < float('inf'):
-        raise options.usage('--rate must be finite; 0 is as fast as it is taken')
+        raise options.usage('--rate must be finite; 0 is as fast as subscribers take it')
     options.require_ros()
     from ..ros.player import play as run
 
@@ -237,7 +232,7 @@ def play(
             bag, rate=rate, wait_s=wait, topics=topics, ros_args=context.obj, progress=done
         )
     for name in report.unheard:
-        out.note(f'nobody listened to {name}')
+        out.note(f'{name} had no subscriber')
     for name in report.lossy:
         out.note(f'{name} has a best-effort subscriber, which can lose messages')
     out.told([(bag, report.info.chosen, report.info.truncated)])

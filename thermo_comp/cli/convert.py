@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``convert``, others' logs into bags; ``export``, ``import``, a calibration to and fro."""
+"""Owns ``convert`` (logs into bags), and ``export`` and ``import`` of calibrations."""
 
 import re
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
-#: What rows of a log have in common, by the findings of its conversion.
+#: Texts of the findings of a conversion.
 _FINDINGS = {
     'short_rows': 'rows left out, too short',
     'non_numeric': 'rows left out, no number',
@@ -30,7 +30,7 @@ _FINDINGS = {
     'backwards': 'rows whose time goes back, kept',
     'repeated': 'rows whose time stands still, kept',
 }
-# Bytes; all parameters of a vehicle are some 60 kB.
+# Largest file [bytes]; all parameters of a vehicle are about 60 kB.
 _LIMIT = 4 << 20
 
 
@@ -40,28 +40,27 @@ def convert(
         metavar='FILE',
     ),
     output: Path = option('Bag to write; *.mcap makes a bare file.', ..., '--output', '-o'),
-    columns: Path | None = option('Column map of a table (YAML): what is where, in which unit.'),
+    columns: Path | None = option('Column map of a table (YAML): columns and their units.'),
     rate_hz: float | None = options.TABLE_RATE,
     imu: int | None = option('IMU of a log, counted from 0.'),
     baro: int | None = option('Barometer of a log, for the case temperature.'),
     allow_compensated: bool = option(
-        'Take a log that INS_TCAL or TC_A has corrected.', False, '--allow-compensated'
+        'Accept samples that INS_TCAL or TC_A has corrected.', False, '--allow-compensated'
     ),
     names: dict[str, str] = options.names,
-    unit: Literal['m/s^2', 'g', 'mg'] = option('What the Imu topic of a bag is in.', 'm/s^2'),
+    unit: Literal['m/s^2', 'g', 'mg'] = option('Unit of the Imu topic of a bag.', 'm/s^2'),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
     """
-    Make a bag of a table of numbers or of an autopilot's log.
+    Convert a table of numbers, an autopilot's log or a bag.
 
-    A column map says which column is what, in which unit; what the sensor
-    reads at rest must agree with it. config/columns has examples. Without
-    one, it is guessed from the headings and printed; a table of [t] ax ay az
-    [wx wy wz] needs no headings. Of a PX4 or
-    ArduPilot log the IMU's own temperature becomes the board's, the
-    barometer's the case's. Of a bag the thermometer beside the Imu topic
-    becomes the board's, one beside a barometer the case's.
+    A column map names the columns and their units; the readings at rest must
+    agree with it. config/columns has examples. Without a map it is guessed
+    from the headings and printed; a table of [t] ax ay az [wx wy wz] needs no
+    headings. In a PX4 or ArduPilot log the IMU's temperature becomes the
+    board's, the barometer's the case's. In a bag the thermometer in the
+    namespace of the Imu becomes the board's, of a barometer the case's.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -98,8 +97,8 @@ def convert(
     out.line(f'unit: {found.unit}; {report.believed}')
     if report.rate_hz < SLOW_HZ:
         out.line(
-            f'{report.rate_hz:.3g} Hz: good for soaks of minutes; rests by hand are too short for '
-            'it, and it sees neither vibration nor a knock between two samples'
+            f'{report.rate_hz:.3g} Hz: good for soaks of minutes; too slow for short rests by '
+            'hand, and for detecting vibration or a knock between two samples'
         )
     if found.hint:
         out.line(found.hint)
@@ -129,7 +128,7 @@ def convert(
 
 @contextmanager
 def flags_named() -> Iterator[None]:
-    """Take a ValueError of the block for a mistake in the command line, its `names` for flags."""
+    """Turn a ValueError of the block into a usage error, with `names` as flags."""
     with options.usage_of():
         try:
             yield
@@ -139,35 +138,35 @@ def flags_named() -> Iterator[None]:
 
 
 def tell_guess(out: Output, log: 'ForeignLog') -> None:
-    """Say what the columns of a table were taken for, where nobody did."""
+    """Print a guessed column map."""
     from ..convert.column_map import spoken_columns
     from ..convert.headings import map_lines
 
     if log.guessed is None:
         return
-    if log.guessed.format is None:  # told by its headings
+    if log.guessed.format is None:  # recognised by its headings
         out.line(
-            f'{log.path}: taken as this column map; edit it and give it as --columns if not so'
+            f'{log.path}: guessed column map; if it is wrong, edit it and give it as --columns'
         )
         for line in map_lines(log.guessed):
             out.line(f'  {line}')
     else:
-        out.line(f'{log.path}: taken as {spoken_columns(log.guessed)}; --columns says otherwise')
+        out.line(f'{log.path}: guessed {spoken_columns(log.guessed)}; --columns overrides it')
 
 
 def export(
     path: Path = argument('Calibration of the unit.', metavar='YAML'),
-    to: Tool = option('Whose file to write.', ...),
+    to: Tool = option('Tool whose file to write.', ...),
     output: Path = option('File to write.', ..., '--output', '-o'),
     number: int | None = option(
-        'Which set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
+        'Number of the set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
         'Kalibr (0).',
         min=0,
     ),
-    device_id: int = option("PX4's id of the sensor (TC_An_ID), which it matches by.", 0),
+    device_id: int = option("PX4's id of the sensor (TC_An_ID), used to match it.", 0),
     up: tuple[float, float, float] | None = option(
-        'Direction of +g in the sensor frame, at which the drift of the scale is folded '
-        'into the offset.',
+        'Direction of +g in the sensor frame, for which the drift of the scale is added to the '
+        'offset.',
         metavar='X Y Z',
     ),
     force: bool = options.FORCE,
@@ -178,8 +177,8 @@ def export(
 
     PX4 and ArduPilot keep a cubic of temperature per axis' offset; imu_tk
     (.calib), imu_calib and Kalibr (YAML) keep bias, scale and misalignment at
-    one temperature, the reference. What the calibration holds beyond that is
-    lost, and said with what it costs.
+    the reference temperature. The other parts of the calibration are lost;
+    they are listed with the resulting error.
 
     Example:
       thermo_comp export unit42.yaml --to px4 -o unit42.params
@@ -209,8 +208,8 @@ def import_(
         metavar='FILE',
     ),
     output: Path = options.NEW_CALIBRATION,
-    serial: str = option('Serial to give the unit.', ..., callback=options.check_serial),
-    number: int | None = option('Which set, where there are several (TC_A0, INS_TCAL1, imu0).'),
+    serial: str = option('Serial of the unit.', ..., callback=options.check_serial),
+    number: int | None = option('Number of the set, if several (TC_A0, INS_TCAL1, imu0).'),
     gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY),
     rate_hz: float = option('Samples per second of the unit.', 200, min=0.1),
     full_scale_g: float = option('Full scale in g.', 16.0, min=0.1),
@@ -221,13 +220,13 @@ def import_(
     out: Output = options.out,
 ) -> None:
     """
-    Make a calibration of a file of another tool.
+    Convert a file of another tool into a calibration.
 
     Thermal parameters of PX4 and ArduPilot give the bias over temperature;
     the files of imu_tk, imu_calib and Kalibr give bias, scale and
-    misalignment. One set stands for both regimes. It is for the readings that
-    the file is for: m/s^2 (node: input:=imu), or counts. Fit bags of a
-    thermal test to get the rest.
+    misalignment. Both regimes get the same set. The input unit is that of
+    the file: m/s^2 (node: input:=imu), or counts. Fit bags of a thermal test
+    to get the rest.
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml

@@ -18,34 +18,32 @@ from .shared_options import option
 if TYPE_CHECKING:
     from ..ros.player import PlayReport
 
-#: Samples that the node may be behind the player; its middleware holds 5000.
+#: Largest number of samples that the node may be behind the player; its middleware holds 5000.
 _IN_FLIGHT = 2000
-#: How long node, player and recorder may take to find each other, or to take what comes last: a
-#: message that Fast DDS has to repeat is 3 s late, on a busy machine several times [s].
+#: Time limit for discovery, and for the last messages [s]: a message that Fast DDS repeats is
+#: 3 s late, on a busy machine several times.
 _PATIENCE_S = 30.0
-# Groups of the fit by column headings: a curve for all regimes; that and its difference in the
-# dynamic regime; all that the evidence wants, which is what the node runs.
+# Groups of the fits by column heading: one curve for both regimes; two curves; all groups that the
+# evidence supports, as the node runs.
 _MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
 
 
 def demo(
     bags: Path | None = option('Folder of the sample bags.', metavar='DIR'),
-    output: Path = option(
-        'Folder for what the demo makes.', Path('out'), '--out', '-o', metavar='DIR'
-    ),
+    output: Path = option('Folder for the results.', Path('out'), '--out', '-o', metavar='DIR'),
     out: Output = options.out,
 ) -> None:
     """
     Run the main job on the sample bags, end to end.
 
-    The bag that the fit has not seen goes through the real path: player,
-    DDS, the node, DDS, recorder.
+    A bag that the fit did not use goes through the real path: player, DDS,
+    the node, DDS, recorder.
 
     Example:
       thermo_comp demo --out out
     """
     options.require_ros()
-    # Before the first import of ROS: on this machine only.
+    # Before the first import of ROS: restrict discovery to this machine.
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     from ..api import fit
     from ..judging.evaluation import evaluate
@@ -54,7 +52,6 @@ def demo(
     from ..report.page import write_report
     from ..unit.calibration_file import save_calibration
 
-    # Where the user says, here, or in the source tree.
     places = [bags] if bags else [Path('bags'), Path(__file__).parents[2] / 'bags']
     folder = next((one for one in places if (one / 'held_out.mcap').is_file()), None)
     if folder is None:
@@ -125,8 +122,8 @@ def through_the_node(
     """
     Play a bag into the node and record what it publishes, without loss.
 
-    Returns what was played and how many messages were recorded, by topic. Only the QoS differs
-    from a robot's: reliable, without a limit of depth. And the player waits for the node.
+    Returns the player's report and the number of recorded messages by topic. Differences to a
+    robot: the QoS is reliable with unlimited depth, and the player waits for the node.
     """
     from ..ros.listener import Recorder
     from ..ros.node import node_in_thread
@@ -146,7 +143,7 @@ def through_the_node(
     ):
 
         def is_joined() -> bool:
-            """Tell whether both ends of every topic know each other."""
+            """Whether every topic has discovered both ends."""
             heard = {one.topic_name for one in node.node.subscriptions}
             sent = {one.topic_name for one in player.node.publishers}
             results = {f'{namespace}/{topic.name}' for topic in OUTPUTS}

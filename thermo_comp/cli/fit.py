@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``fit``, bags to a calibration; ``prior``, calibrations to their type's; ``fleet fit``."""
+"""Owns ``fit`` (bags to a calibration), ``prior`` (calibrations to a prior), ``fleet fit``."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -30,15 +30,13 @@ def fit(
     output: Path = options.NEW_CALIBRATION,
     settings: dict[str, Any] = options.fitting,
     static_curve: Curve | None = option(
-        "Bias and scale over temperature; else the model's own.", metavar='CURVE'
+        "Bias and scale over temperature; default: the model's.", metavar='CURVE'
     ),
-    dynamic_curve: Curve | None = option(
-        'The same of the dynamic set, by itself.', metavar='CURVE'
-    ),
-    groups: str | None = option('Groups that may take part, by commas.', metavar='A,B'),
+    dynamic_curve: Curve | None = option('The same for the dynamic set alone.', metavar='CURVE'),
+    groups: str | None = option('Groups allowed in the fit.', metavar='A,B'),
     force_groups: str = option('Groups kept regardless of the evidence.', '', metavar='A,B'),
     prior: Path | None = option(
-        'Calibration to begin with: of the type, or an old one.', metavar='YAML'
+        'Prior: a calibration of the type, or an old one of the unit.', metavar='YAML'
     ),
     ageing_bias: str | None = option(
         'Assumed bias change (1 sd) since the prior calibration, as 50ug; default: estimated from '
@@ -55,16 +53,16 @@ def fit(
     rate_hz: float | None = options.TABLE_RATE,
     topics: Any = options.reading_part,
     force: bool = options.FORCE,
-    verbose: bool = option('List the positions that were found, too.', False, '--verbose', '-v'),
+    verbose: bool = option('Also list the positions.', False, '--verbose', '-v'),
     out: Output = options.out,
 ) -> None:
     """
     Fit a calibration to bags of a thermal test.
 
-    The unit rests in unknown positions while the chamber goes through its
-    program: six faces give bias and scale, nine or more well spread positions
-    the misalignment, too. What the bags do not show stays at its prior, with
-    the prior's uncertainty. Local gravity is yours to give.
+    The unit rests in unknown positions while the chamber runs its program:
+    six faces give bias and scale, nine or more well spread positions also the
+    misalignment. Parameters that the bags do not determine keep their prior
+    and its uncertainty. Local gravity must be given.
 
     Groups: curve, set, now, board, neighbour, product, mixed, square, even,
     change, play. A group stays if data that took no part are corrected better
@@ -136,10 +134,10 @@ def prior(
     out: Output = options.out,
 ) -> None:
     """
-    Make the prior of a type of unit from the calibrations of some.
+    Make the prior of a type of unit from calibrations of several units.
 
-    Mean and scatter of what the units' calibrations say; `fit --prior` begins
-    with it, so that a further unit of the type needs less time in the chamber.
+    The prior is the mean and scatter of the calibrations. With `fit --prior`
+    a further unit of the type needs less time in the chamber.
 
     Example:
       thermo_comp prior unit01.yaml unit02.yaml unit03.yaml -o type.yaml
@@ -157,18 +155,22 @@ def prior(
 
 def fleet_fit(
     folder: str = argument('DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR'),
-    output: Path = option('Folder of the results; goes on where it was.', ..., '--output', '-o'),
+    output: Path = option(
+        'Folder of the results; an earlier run is continued.', ..., '--output', '-o'
+    ),
     settings: dict[str, Any] = options.fitting,
     scheduler: str | None = option(
         'Address of a running Dask scheduler, as tcp://host:8786; default: this machine alone.',
         metavar='URL',
     ),
-    workers: int | None = option('Processes on this machine; all processors.', min=1),
+    workers: int | None = option('Processes on this machine; default: all processors.', min=1),
     no_certificates: bool = option(
         'Write no certificates, which halves the work.', False, '--no-certificates'
     ),
     with_prior: bool = option(
-        'Fit the units that lack data again with what the others share.', False, '--with-prior'
+        'Fit units with incomplete data again, with the prior of the others.',
+        False,
+        '--with-prior',
     ),
     earlier: list[Path] | None = option(
         'fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'
@@ -179,12 +181,12 @@ def fleet_fit(
     """
     Fit every unit below a folder.
 
-    Each folder of bags is one thermal test of one unit; bags that lie in
-    DIR itself are sorted by the serial in them. Results go to OUT/units,
-    the table of all to OUT/fleet.parquet and .csv, what it tells to
-    OUT/fleet.html, what the units that hold have in common to OUT/prior.yaml,
-    a prior as `thermo_comp prior` makes it. A second run does only what is missing or has changed.
-    Exit code 1 if a unit has no valid calibration, or not of all of its bags.
+    Each folder of bags is a thermal test of a unit; bags directly in DIR are
+    sorted by the serial in them. Results go to OUT/units, the table to
+    OUT/fleet.parquet and .csv, its statistics to OUT/fleet.html, the prior of
+    the valid units (as by `thermo_comp prior`) to OUT/prior.yaml. A second
+    run only does what is missing or has changed. Exit code 1 if a unit has no
+    valid calibration from all of its bags.
 
     Example:
       thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates

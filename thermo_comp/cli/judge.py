@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``evaluate`` and ``report``: what a calibration leaves of |f|, as table and page."""
+"""Owns ``evaluate`` and ``report``: the residuals of a calibration, as table and page."""
 
 from collections.abc import Callable, Mapping
 from math import isfinite
@@ -27,10 +27,10 @@ def evaluate(
     """
     Judge a calibration on new bags: |f| - g at rest, raw and corrected.
 
-    The verdict holds the RMS residual against your --tolerance or, without
-    one, against what the calibration claims for the same windows; six
-    positions or more tell which axis has moved. Exit code 0 only where the
-    calibration is shown to be valid.
+    The verdict compares the RMS residual with your --tolerance or, without
+    one, with the uncertainty that the calibration claims for the same
+    windows; six positions or more show which axis has moved. Exit code 0
+    only if the calibration is shown to be valid.
 
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
@@ -99,7 +99,7 @@ def evaluate(
 
 
 def tell_sections(out: Output, judgements: Mapping[str, Any]) -> None:
-    """Print what each calibration leaves of |f|."""
+    """Print the residuals of |f| of each calibration."""
     (window_s,) = {one.windows.window_s for one in judgements.values()}
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
@@ -111,7 +111,7 @@ def tell_sections(out: Output, judgements: Mapping[str, Any]) -> None:
 def _sections(
     judgements: Mapping[str, Any], shown: Callable[[float], str | None]
 ) -> list[tuple[Cell, ...]]:
-    """Give what each calibration leaves in each section, below what there was."""
+    """Return the residuals of each calibration by section, after the raw ones."""
     from ..judging.verdicts import SECTIONS
 
     rows: list[tuple[Cell, ...]] = []

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns how the command line speaks: tables, JSON, progress, and one line per error.
+Owns the output of the command line: tables, JSON, progress, and one line per error.
 
 Results go to stdout, everything about the run (progress, notes, errors) to stderr, so that a pipe
-carries results only. Everything goes through `_print`: what somebody else chose (serials, topics,
+carries results only. Everything goes through `_print`: text from outside (serials, topics,
 metadata, file names) can neither forge a line nor move the cursor, and any terminal can show it.
 """
 
@@ -23,7 +23,7 @@ from ..text import one_line
 from ..unit.gravity import MICRO_G
 
 Cell = str | int | float | None
-# Or a dash, for none.
+# A number, or a dash for none.
 _NUMBER = re.compile(r'-|[-+]?\d+\.?\d*(e[-+]\d+)?')
 
 
@@ -45,13 +45,13 @@ class Output:
             _print(f'thermo_comp: {text}', sys.stderr)
 
     def told(self, bags: Iterable[tuple[object, str | None, str | None]]) -> None:
-        """Say of bags what was chosen in them, once for alike ones, and what is missing."""
+        """Print the topics chosen in bags, once for equal choices, and the missing parts."""
         alike: dict[str, list[object]] = {}
         for bag, chosen, missing in bags:
             if chosen:
                 alike.setdefault(chosen, []).append(bag)
             if missing:
-                # What sets the exit code is said even to those who want errors alone.
+                # It sets the exit code, so it is printed even with --quiet.
                 _print(f'thermo_comp: {bag}: {missing}', sys.stderr)
                 self._is_torn = True
         for said, names in alike.items():
@@ -59,14 +59,14 @@ class Output:
             self.note(f'{names[0]}{more}: {said}')
 
     def end(self, code: int = 0, /, **data: Any) -> None:
-        """End a command: its result as JSON where asked for; an exit code, 1 of a torn bag."""
+        """End a command: print its JSON if requested; exit with `code`, or 1 for a torn bag."""
         if self.as_json:
             print(json.dumps(plain(data), indent=2, allow_nan=False))
         if code or self._is_torn:
             raise typer.Exit(code or 1)
 
     def points(self, found: Iterable[object]) -> None:
-        """Print findings, one a line."""
+        """Print findings, one per line."""
         for one in found:
             self.line(f'- {one}')
 
@@ -78,7 +78,7 @@ class Output:
 
     @contextmanager
     def live(self) -> Iterator[Callable[..., None] | None]:
-        """Yield what shows a table with lines below it anew, None where stderr is no terminal."""
+        """Yield a function that redraws a table with lines below it; None without a terminal."""
         if self.quiet or not sys.stderr.isatty():
             yield None
             return
@@ -92,7 +92,7 @@ class Output:
             def show(
                 columns: Sequence[str], rows: Sequence[Sequence[Cell]], lines: Sequence[str]
             ) -> None:
-                # The lines are what it is looked at for, and then the newest rows.
+                # The lines are most important, then the newest rows.
                 newest = rows[-max(1, console.height - len(lines) - 3) :]
                 shown = [*aligned(columns, newest), '', *lines]
                 view.update(Text('\n'.join(_shown(x, sys.stderr) for x in shown)), refresh=True)
@@ -101,7 +101,7 @@ class Output:
 
     @contextmanager
     def progress(self, what: str, total: float | None = 1.0) -> Iterator[Callable[[float], None]]:
-        """Show a progress bar on a terminal; yields what is to be told how much is done so far."""
+        """Show a progress bar on a terminal; yields a function that takes the progress so far."""
         if self.quiet or not sys.stderr.isatty():
             yield lambda _done: None
             return
@@ -116,7 +116,7 @@ class Output:
 
 
 def error(message: str) -> None:
-    """Print the one line that a failed command leaves behind."""
+    """Print the error of a failed command on one line."""
     _print(f'thermo_comp: error: {" ".join(message.split())}', sys.stderr)
 
 
@@ -125,13 +125,13 @@ def _print(text: str, stream: TextIO) -> None:
 
 
 def _shown(text: str, file: TextIO) -> str:
-    """Return a line as the stream can carry it."""
+    """Replace characters that the stream cannot encode."""
     encoding = file.encoding or 'utf-8'
     return one_line(text).encode(encoding, 'backslashreplace').decode(encoding)
 
 
 def text(cell: Cell) -> str:
-    """Return a table cell as text: at most four significant digits, a dash for nothing."""
+    """Return a table cell as text: at most four significant digits, a dash for None."""
     if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
         return '-'
     if isinstance(cell, float):
@@ -173,7 +173,7 @@ def aligned(head: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''
 
 
 def picked(value: object, names: str) -> dict[str, Any]:
-    """Give attributes by their names, for JSON."""
+    """Return attributes by their names, for JSON."""
     return {name: getattr(value, name) for name in names.split()}
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``thermo_comp record``: a test recorded position by position, with what is missing told."""
+"""Owns ``thermo_comp record``: records a test by positions, and reports what is missing."""
 
 import re
 import shlex
@@ -31,7 +31,7 @@ _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
 def record(
     context: typer.Context,
     output: Path = option(
-        'Folder of the bags; one that has some is gone on with.', ..., '--output', '-o'
+        'Folder of the bags; existing bags are continued.', ..., '--output', '-o'
     ),
     bag: Path | None = argument(
         'Bag that another recorder writes, instead of topics.', None, metavar='[BAG]'
@@ -41,18 +41,18 @@ def record(
     serial: str | None = option(
         'Serial of the unit, for the bags.', callback=options.check_serial
     ),
-    finish: bool = option('Make bags of what a run that crashed has left, first.', False),
+    finish: bool = option('First finish the bags that a crashed run has left.', False),
     offset: float | None = options.OFFSET,
     topics: Any = options.reading,
     out: Output = options.out,
 ) -> None:
     """
-    Record a test, a bag per position, and say what is still missing.
+    Record a test, a bag per position, and show what is still missing.
 
-    Listens beside the driver (or follows a growing bag): whether it rests,
-    for how long, over which temperatures and ramps, how well the positions
-    so far will tell bias, scale and misalignment, and which way to turn it
-    next. Ends when all is there, or with Ctrl-C; the same command goes on.
+    Listens to the driver (or follows a growing bag). Shows rests, their
+    temperatures and ramps, the expected accuracy of bias, scale and
+    misalignment, and the direction for the next position. Ends when the test
+    is complete, or with Ctrl-C; the same command continues.
 
     Example:
       thermo_comp record --positions 18 --soak 45min -o bags/unit43
@@ -66,7 +66,7 @@ def record(
     test = Acquisition(positions, _duration(soak), offset or 0.0)
     _tell_leftovers(out, output, finish)
     known = numbered_bags(output)
-    # Each bag that is there is a position, and says whose it is.
+    # Each existing bag is a position, and holds the serial of its unit.
     with out.progress('reading what is there', total=len(known)) as done:
         for number, path in enumerate(known, 1):
             with open_recording(path, require=()) as reader:
@@ -94,8 +94,8 @@ def record(
 
             live = stack.enter_context(LiveTopics(topics=topics, ros_args=context.obj))
             news, problems = live.blocks(over.wait), lambda: live.problems
-            out.line('listening; Ctrl-C ends it with whole bags')
-            sys.stdout.flush()  # whoever reads this through a pipe waits for it
+            out.line('listening; Ctrl-C ends it with complete bags')
+            sys.stdout.flush()  # the reader of a pipe waits for this line
         show = stack.enter_context(out.live())
         for new in news:
             if new is not None:
@@ -144,20 +144,17 @@ def record(
 
 
 def _tell_leftovers(out: Output, folder: Path, is_finishing: bool) -> None:
-    """Say what crashes have left in a folder, or make bags of it."""
+    """Report unfinished bags in a folder, or finish them."""
     from ..recording import growing
 
     for path, number in growing.leftovers(folder).items():
         if not is_finishing:
-            out.note(
-                f'{path} was left by a run that did not end in order, as bag {number}; '
-                '--finish makes a bag of it'
-            )
+            out.note(f'{path} is bag {number} of a run that crashed; --finish completes it')
             continue
         try:
             made = growing.finish(path, number)
         except RecordingError as error:
-            out.note(f'{error}: no bag can be made of it')
+            out.note(f'{error}: it cannot be completed')
         else:
             out.note(f'{made or "nothing"} is what was in {path.name}')
 
@@ -171,14 +168,14 @@ def _duration(text: str) -> float:
 
 
 def _tell(out: Output, account: 'Account', problems: Sequence[str], told: dict[str, str]) -> None:
-    """Say in a line what has changed since it was last told."""
+    """Print each change since the last call on a line."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         told.pop('problem', None)
     for number, one in enumerate(account.positions, 1):
         if one.n_rests:
             news[f'position {number}'] = f'{one.reason or "good"}; {_reading(one.up)}'
-    # What a rest reads moves a little all the time.
+    # Ignore the reading after the semicolon, which always changes a little.
     new = {name: said for name, said in news.items() if told.get(name) != said.partition(';')[0]}
     for name, said in new.items():
         told[name] = said.partition(';')[0]
@@ -211,7 +208,7 @@ def _rows(positions: Sequence['Position']) -> list[tuple[Cell, ...]]:
 
 def _now(account: 'Account') -> str:
     if isnan(account.now[0]):
-        return 'nothing has come yet'
+        return 'no samples yet'
     return f'now {"at rest" if account.is_still else "moving"}: {_reading(account.now)}'
 
 
@@ -234,7 +231,7 @@ def _worth(account: 'Account') -> str:
 
 
 def _lines(account: 'Account') -> list[str]:
-    """Say what there is beside the positions, and what is missing."""
+    """Return the lines below the positions: state, and what is missing."""
     from ..fitting.coverage import spoken_direction
 
     lines = [_worth(account)]

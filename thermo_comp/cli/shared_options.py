@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the options that several commands share, and what the library takes made of them.
+Owns the options that several commands share, and their conversion to library arguments.
 
-The default of a command's parameter is one option, or a function that makes the parameter of
-several: a command says what it wants, and `expanded` offers typer the options.
+The default of a command's parameter is an option, or a function that builds the parameter from
+several options; `expanded` passes all of these options to typer.
 """
 
 import inspect
@@ -34,21 +34,21 @@ _VALUES: dict[Any, str] = {
     **dict.fromkeys((Path, Path | None, list[Path], list[Path] | None), 'PATH'),
 }
 
-usage = typer.BadParameter  # a mistake in the command line, to be raised: exit code 2
+usage = typer.BadParameter  # error in the command line: exit code 2
 
 
 def option(text: str, default: Any = None, *flags: str, **rules: Any) -> Any:
-    """Describe an option: what it is for, its flags where they are not its name's, its bounds."""
+    """Describe an option: help text, flags (default: its name), bounds."""
     return typer.Option(default, *flags, help=text, **rules)
 
 
 def argument(text: str, default: Any = ..., **rules: Any) -> Any:
-    """Describe what stands on the command line without a flag."""
+    """Describe an argument without a flag."""
     return typer.Argument(default, help=text, **rules)
 
 
 def expanded(command: Callable[..., Any]) -> Any:
-    """Make a function of options alone, as typer takes it, of one of what is made of them."""
+    """Turn a command of built parameters into a function of options, as typer needs it."""
     makers: dict[str, Callable[..., Any]] = {}
     options: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
@@ -75,7 +75,7 @@ def expanded(command: Callable[..., Any]) -> Any:
 
 @contextmanager
 def usage_of(what: str = '') -> Iterator[None]:
-    """Take a ValueError of the block for a mistake in the command line."""
+    """Turn a ValueError of the block into a usage error."""
     try:
         yield
     except ValueError as mistake:
@@ -83,7 +83,7 @@ def usage_of(what: str = '') -> Iterator[None]:
 
 
 def check_serial(serial: str | None) -> str | None:
-    """Refuse what can be no serial; an empty one is for the command to judge."""
+    """Refuse an invalid serial; an empty serial is passed on."""
     if serial:
         with usage_of():
             valid_serial(serial)
@@ -97,7 +97,7 @@ def check_rate(rate_hz: float | None) -> float | None:
     return rate_hz
 
 
-FORCE = option('Overwrite one of the same kind.', False, '--force', '-f')
+FORCE = option('Overwrite an output of the same kind.', False, '--force', '-f')
 QUIET = option('Print nothing but errors.', False, '--quiet', '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
 JUDGED_BAGS = argument('Bags to judge it on.', None, metavar='[BAG]...')
@@ -107,10 +107,10 @@ SERIAL = option(
     "Serial of the unit, instead of the bag's; '' accepts any calibration.", callback=check_serial
 )
 OFFSET = option(
-    'What raw words read without a force, as 32768; found out by itself if it can.', metavar='WORD'
+    'Reading of raw samples without a force, as 32768; default: detected.', metavar='WORD'
 )
 INPUT = option(
-    'What is read from the bag: counts, imu, or auto (the input that it has).',
+    'Input to read from the bag: counts, imu, or auto (the input that it has).',
     'auto',
     '--input',
     metavar='KIND',
@@ -123,18 +123,18 @@ def out(
     as_json: bool = option('Print the result as one JSON object.', False, '--json'),
     quiet: bool = QUIET,
 ) -> Output:
-    """Make where a command prints."""
+    """Build the output of a command."""
     return Output(as_json, quiet)
 
 
 @expanded
 def names(
     topic: list[str] | None = option(
-        'Where an input stands: counts, imu, board, case, temperature/NAME.', metavar='INPUT=TOPIC'
+        'Topic of an input: counts, imu, board, case, temperature/NAME.', metavar='INPUT=TOPIC'
     ),
     topics: Path | None = option('The same from a file, INPUT: TOPIC a line.', metavar='YAML'),
 ) -> dict[str, str]:
-    """Collect what `--topic` says, and what of the file it does not."""
+    """Collect the topics of `--topic`, and those of the file that it does not name."""
     from ..recording.topics import parse_name, read_names
 
     found = {} if topics is None else read_names(topics)
@@ -147,12 +147,12 @@ def _reading(
     input_: Input = INPUT,
     names: dict[str, str] = names,
     begin: float | None = option(
-        'Read each bag from there on: seconds from its first sample, or a stamp.',
+        'Begin of the part to read: seconds from the first sample, or a stamp.',
         None,
         '--from',
         metavar='S',
     ),
-    end: float | None = option('Read to there.', None, '--to', metavar='S'),
+    end: float | None = option('End of the part to read.', None, '--to', metavar='S'),
 ) -> Any:
     from ..recording.topics import Part, Topics
 
@@ -167,7 +167,7 @@ reading_part = expanded(_reading)
 
 @expanded
 def reading(input_: Input = INPUT, names: dict[str, str] = names) -> Any:
-    """Make what says where the inputs stand in a bag."""
+    """Build the topics of the inputs in a bag."""
     return _reading(input_, names, None, None)
 
 
@@ -182,7 +182,7 @@ def place(
     latitude: float | None = option('Latitude in degrees, with --height.'),
     height: float | None = option('Height above the ellipsoid in m.'),
 ) -> float | None:
-    """Give local gravity, None where nothing was said; latitude and height go together."""
+    """Return local gravity, None if not stated; latitude and height go together."""
     if gravity is not None or (latitude is None and height is None):
         return gravity
     if latitude is None or height is None:
@@ -199,10 +199,10 @@ def site(
     latitude: float | None = option('Latitude in degrees, with --height.'),
     height: float | None = option('Height above the ellipsoid in m.'),
     gravity_sd: str | None = option(
-        'Standard uncertainty of gravity: 5ug; else 0 of --gravity, 50ug of --latitude.'
+        'Standard uncertainty of gravity, as 5ug; default: 0 for --gravity, 50ug for --latitude.'
     ),
 ) -> dict[str, float]:
-    """Give local gravity and its standard deviation; a usage error where nothing was said."""
+    """Return local gravity and its standard deviation; a usage error if not stated."""
     found = gravity
     if gravity is None:
         if latitude is None or height is None:
@@ -226,7 +226,7 @@ def judging(
     tolerance: str | None = option('Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
 ) -> dict[str, Any]:
-    """Give keywords of what judges."""
+    """Return the keywords of a judgement."""
     return locals() | {'tolerance': acceleration(tolerance, '--tolerance')}
 
 
@@ -245,7 +245,7 @@ def fitting(
         'Temperature at which the constants are stated, in degC.', 20.0, metavar='DEGC'
     ),
     min_rest_s: float | None = option(
-        'Shortest rest used, in s; else 3, or less where short ones tell more.',
+        'Shortest rest used, in s; default: 3, or less if short rests give more information.',
         None,
         '--min-rest',
         metavar='S',
@@ -255,11 +255,12 @@ def fitting(
         "Largest scatter of samples at rest: a few times the sensor's noise.", '50mg'
     ),
     mounting_sd: str | None = option(
-        'How well mounting and turn-on repeat, sd of the bias: 30ug; else what the bags show.'
+        'Repeatability of mounting and turn-on (sd of the bias), as 30ug; default: estimated from '
+        'the bags.'
     ),
     allow: list[str] | None = option('Refusal to override, as its message names it.'),
 ) -> dict[str, Any]:
-    """Give keywords of FitOptions."""
+    """Return the keywords of FitOptions."""
     given = locals()
     if fault := QUANTITIES['temperature'].fault(reference_temperature):
         raise usage(f'--reference-temperature: {fault}, got {reference_temperature:g}')
@@ -275,13 +276,13 @@ def fitting(
 
 
 def acceleration(text: str | None, name: str) -> float | None:
-    """Read an acceleration with its unit [m/s^2]; None where none is given."""
+    """Parse an acceleration with its unit [m/s^2]; None if not given."""
     with usage_of(f'{name}: '):
         return None if text is None else parse_acceleration(text)
 
 
 def require_ros() -> None:
-    """Raise ThermoCompError, which says what to do, where there is no ROS."""
+    """Raise ThermoCompError, with advice, if ROS is not installed."""
     if find_spec('rclpy') is None:
         raise ThermoCompError(
             f'this command needs ROS 2 for {sys.executable}: source its setup file, or '

@@ -25,41 +25,41 @@ def simulate(
         'Bag to write; with several positions a directory of them.', ..., '--output', '-o'
     ),
     unit: str = option(
-        'Kind of unit: thermostatted, bare-quartz, mems; or with one kind of physics: '
+        'Kind of unit: thermostatted, bare-quartz, mems; or a kind of physics: '
         'own-lags, between, products, hysteresis, even, convection, switched-load, paper, '
         'slow-noise, plain, demo.',
         'thermostatted',
     ),
-    unit_seed: int = option('Which specimen of that kind.', 1, min=0),
+    unit_seed: int = option('Seed of the specimen of that kind.', 1, min=0),
     sibling: int | None = option('Another unit of its type, +-15 % in everything.', min=0),
     plan: str | None = option(
         'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
         'tumble, tumble-3, tumble-1 or held-out.'
     ),
     profile: str | None = option(
-        "Chamber program: a name (else chamber), or like '20 30min, 35@0.5 1h, 5@1 1h'."
+        "Chamber program: a name (default: chamber), or steps as '20 30min, 35@0.5 1h, 5@1 1h'."
     ),
-    positions: int | None = option('Number of positions, one bag each; else 1.', min=1, max=999),
-    position_seed: int = option('Which set of positions.', 0, min=0),
+    positions: int | None = option('Number of positions, a bag each; default: 1.', min=1, max=999),
+    position_seed: int = option('Seed of the set of positions.', 0, min=0),
     rate_hz: float = option('Conversion cycles per second.', 100.0, min=0.1, max=1e5),
     temperature_rate_hz: float | None = option(
-        "Temperature readings per second, else the sensors' own.", min=1e-4, max=100.0
+        "Temperature readings per second; default: the sensors' rate.", min=1e-4, max=100.0
     ),
     seed: int = option('Seed of the noise.', 0, min=0),
     gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY),
     imu: bool = option(
-        'Write sensor_msgs/Imu, with the angular rate of a unit that has one.', False, '--imu'
+        'Write sensor_msgs/Imu, with the angular rate if the unit has a gyroscope.', False, '--imu'
     ),
     level: int = option('zstd level, 1 fast to 19 small.', 3, min=1, max=19),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
     """
-    Make bags of a thermal test whose truth is known.
+    Simulate bags of a thermal test with known truth.
 
     The unit is simulated from its physics (heat flow, parts with
-    temperature coefficients, noise, converter); the truth stands in each
-    bag's metadata.
+    temperature coefficients, noise, converter); the truth is in each bag's
+    metadata.
 
     Example:
       thermo_comp simulate --rate-hz 2 --positions 12 -o bags/sim
@@ -129,7 +129,7 @@ def simulate(
 def _write(
     writer: 'BagWriter', runs: Iterator['SimulatedRun'], unit: 'UnitModel', is_imu: bool
 ) -> Iterator[dict[str, int]]:
-    """Write a run by blocks, from its first temperatures on, as a recorder would; count them."""
+    """Write a run by blocks, from its first temperatures on; yield the numbers of messages."""
     import numpy as np
 
     from ..recording.blocks import ImuColumns
@@ -142,12 +142,12 @@ def _write(
             first = [one[0] for one in (run.board_stamp_ns, run.case_stamp_ns) if len(one)]
             start_ns = max(first) if len(first) == 2 else 0
         keep = run.accel_stamp_ns >= start_ns
-        # Temperatures first: of equal stamps the reading comes before the sample.
+        # Temperatures first: at equal stamps a reading precedes the sample.
         writer.write_temperature(topics.board, run.board_stamp_ns, run.board)
         writer.write_temperature(topics.case, run.case_stamp_ns, run.case)
         stamp_ns, counts = run.accel_stamp_ns[keep], run.counts[keep]
         if is_imu:
-            # As a driver reports it: scaled by what the data sheet says.
+            # Like a driver: scaled by the nominal scale factor.
             force, rate = counts / np.mean(unit.scale_factor), run.angular_rate
             rest = None if rate is None else ImuColumns.of_rate(rate[keep])
             writer.write_imu(topics.imu, stamp_ns, force, np.zeros(9), 'imu_link', rest)

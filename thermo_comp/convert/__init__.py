@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the way between other people's logs and parameter files and ours."""
+"""Owns the conversion of other tools' logs and parameter files, in both directions."""

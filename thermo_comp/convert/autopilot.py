@@ -3,17 +3,17 @@
 """
 Owns the logs of autopilots, behind the extras ``px4`` and ``ardupilot``: one IMU, one barometer.
 
-The thermometer inside the IMU lags: it becomes the board temperature. The barometer beside it
-follows the surroundings: it becomes the case temperature, and the board's where the IMU has none.
-A simulator's log is refused: it has no noise, so nothing can be weighed by it.
+The thermometer inside the IMU lags: it becomes the board temperature. The barometer follows the
+surroundings: it becomes the case temperature, and the board's if the IMU has no thermometer. A
+simulator's log is refused: without noise the fit cannot weight its samples.
 
-PX4's ULog (``.ulg``): ``sensor_accel`` holds what the driver read, before PX4's own corrections,
-with the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` asks for more. Where it is
-missing, ``sensor_combined`` stands in: after PX4's calibration, and without a temperature.
+PX4's ULog (``.ulg``): ``sensor_accel`` holds the driver's samples before PX4's corrections, with
+the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher rate. If it is
+missing, ``sensor_combined`` is used: after PX4's calibration, and without a temperature.
 
-ArduPilot's DataFlash (``.BIN``): one message type per IMU in old logs (``IMU``, ``IMU2``), one
-with an instance number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. What was
-logged while ``INS_TCALn_ENABLE`` was 1 is left out: its thermal drift is already taken out. The
+ArduPilot's DataFlash (``.BIN``): a message type per IMU in old logs (``IMU``, ``IMU2``), a type
+with an instance number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. Samples
+logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected. The
 parameter is followed over time; learning (2) corrects nothing, and sets it to 1 at its end.
 
 https://docs.px4.io/main/en/dev_log/ulog_file_format
@@ -43,7 +43,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while drift is taken out: its values from stamps on; what to do."""
+    """A parameter that is 1 while the autopilot corrects drift: values from stamps on; advice."""
 
     parameter: str
     since_ns: Sequence[int]
@@ -51,12 +51,12 @@ class _Correction(NamedTuple):
     advice: str
 
 
-#: What a log holds by instance: IMUs, barometers, and what took out an IMU's thermal drift.
+#: Content of a log by instance: IMUs, barometers, thermal corrections of the IMUs.
 _Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, _Correction]]
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
-_NO_NOISE = 1e-6  # no noise at all, but for the rounding of sums [parts of g]
+_NO_NOISE = 1e-6  # noise below this is rounding of sums, as in a simulator [g]
 _AXES = ('x', 'y', 'z')
 _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
 _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperature'}
@@ -70,16 +70,16 @@ def read_autopilot(
     path: Path, imu: int | None = None, baro: int | None = None, allow_compensated: bool = False
 ) -> ForeignLog:
     """
-    Read one IMU and one barometer of a PX4 (``.ulg``) or ArduPilot log, those of the lowest
-    instance by default; ArduPilot's are counted from 0: the old type ``IMU2`` is 1.
+    Read an IMU and a barometer of a PX4 (``.ulg``) or ArduPilot log, by default the lowest
+    instances. ArduPilot's IMUs are counted from 0: the old type ``IMU2`` is 1.
     """
     read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
     try:
-        # What no integer can hold is found later, among the stamps.
+        # Overflows of the integer conversion are found later, among the stamps.
         with np.errstate(invalid='ignore', over='ignore'):
             imus, baros, compensated = read(path)
     except (ArithmeticError, LookupError, TypeError, ValueError) as failure:
-        # Formats that contradict their messages, in whichever way.
+        # Formats that contradict their messages.
         raise RecordingError(f'damaged: {failure}', path=path) from failure
     rows = _instance(imus, imu, 'IMU', path)
     correction = compensated.get(min(imus, default=0) if imu is None else imu)
@@ -90,7 +90,7 @@ def read_autopilot(
     if rest.noise <= _NO_NOISE * rest.magnitude:
         raise RecordingError(
             'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
-            'from which no calibration of a real sensor can come',
+            'which cannot calibrate a real sensor',
             path=path,
         )
     heard = {number: _reported(readings) for number, readings in baros.items()}
@@ -105,11 +105,11 @@ def read_autopilot(
 
 
 def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
-    """Leave out what was logged while the parameter was 1; RecordingError if that is all."""
+    """Drop the samples logged while the parameter was 1; RecordingError if none is left."""
     name, since_ns, values, advice = correction
     at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
-    told = 'the autopilot has already taken the thermal drift out of these readings'
+    told = 'the autopilot has already corrected the thermal drift of these samples'
     if is_corrected.all():
         raise RecordingError(f'{name} was 1: {told}; {advice}', path=rows.path)
     if not is_corrected.any():
@@ -173,11 +173,11 @@ def _ulog(path: Path) -> _Held:
 
 
 def _combined(columns: _Columns) -> list[_Columns]:
-    """Take ``sensor_combined`` apart into an accelerometer and a gyroscope."""
+    """Split ``sensor_combined`` into an accelerometer and a gyroscope."""
     relative = _column(columns, 'accelerometer_timestamp_relative')
     rows = np.flatnonzero(np.isfinite(relative) & (relative != _NOT_THERE))
     stamp_us = columns['timestamp'][rows].astype(np.int64) + relative[rows].astype(np.int64)
-    # A message with news of the gyroscope alone repeats what the accelerometer said last.
+    # A message that is new only for the gyroscope repeats the last accelerometer sample.
     is_new = np.diff(stamp_us, prepend=stamp_us[:1] - 1) != 0
     names = [f'{name}[{i}]' for name in ('accelerometer_m_s2', 'gyro_rad') for i in range(3)]
     parts = _vectors(columns, names)[rows[is_new]].T.reshape(2, 3, -1)
@@ -186,8 +186,8 @@ def _combined(columns: _Columns) -> list[_Columns]:
 
 
 def _stamps(columns: _Columns) -> Ints:
-    """Give the stamps of microseconds since the start; `NO_STAMP` beyond a century: damage."""
-    # When the sample was taken, where the log says it; older logs only say when it was published.
+    """Return stamps from microseconds since the start; `NO_STAMP` (damage) beyond a century."""
+    # The time of the sample if logged; older logs only have the time of publication.
     whole = columns['timestamp_sample' if 'timestamp_sample' in columns else 'timestamp']
     size = whole.astype(np.float64)
     is_time = (size >= 0.0) & (size < _CENTURY_US)
@@ -204,7 +204,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate the rate to the accelerometer's stamps; None where it was logged sparsely."""
+    """Interpolate the rate to the accelerometer's stamps; None if it was logged sparsely."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
@@ -274,7 +274,7 @@ def _dataflash(path: Path) -> _Held:
 
 
 def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
-    """Gather one message type: its columns, and how many of its messages were cut off."""
+    """Read a message type: its columns, and the number of truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
     codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # numpy calls numbers as struct does
@@ -296,10 +296,10 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
 
 
 def _read(module: str, name: str, extra: str, what: str, path: Path, *arguments: Any) -> Any:
-    """Let the library of an extra read a file."""
+    """Read a file with the library of an extra."""
     read = getattr(library(module, extra, what, path), name)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        # They raise whatever a damaged file makes Python raise.
+        # On damaged files the libraries raise any exception.
         try:
             return read(*arguments)
         except Exception as failure:
@@ -317,7 +317,7 @@ def _instance(found: Mapping[int, T], wanted: int | None, what: str, path: Path)
 
 
 def _reported(readings: Readings) -> Readings:
-    """Leave out what no thermometer said: NaN, and the zeros of a sensor that has none."""
+    """Drop NaN, and the zeros of a sensor without thermometer."""
     use = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
     use &= bool(readings.celsius[use].any())
     return readings.take(use)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns other people's bags: ROS 1 and 2 recordings whose topics and units are their own.
+Owns the reading of bags with other topics and units, ROS 1 and 2.
 
-Drivers call their topics as they like and not all of them publish m/s^2. The Imu topic is found
-by its type; a thermometer is told by its neighbours: beside the Imu it is the board's, beside a
-barometer (sensor_msgs/FluidPressure) the case's. What rests must read gravity in the stated unit.
+Drivers choose their topic names, and not all of them publish m/s^2. The Imu topic is found by its
+type; a thermometer by its namespace: that of the Imu makes it the board's, that of a barometer
+(sensor_msgs/FluidPressure) the case's. At rest the samples must read gravity in the stated unit.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def bag_log(
     case: str | None = None,
     unit: Unit = 'm/s^2',
 ) -> ForeignLog:
-    """Read a bag, with the topics that are None found; `unit` is what the driver publishes."""
+    """Read a bag; topics that are None are searched; `unit` is that of the Imu topic."""
     present = inspect_recording(path).topics
     with translated(path):
         found = find_topics(present, imu, board, case)
@@ -43,7 +43,7 @@ def bag_log(
         among = 'only' if role == 'imu' else 'nearest'
         usual = given or getattr(Topics(), role)
         chosen.append(said_choice(name, role, usual, among) if name else '')
-    # A name that no topic has stands for a thermometer that is not there.
+    # '/none', which no topic has, stands for a missing thermometer.
     names = {role: name or '/none' for role, name in found.items()}
     recording = read_recording(path, Topics.named(names, input='imu'), require=('accel',))
     columns = recording.columns
@@ -69,7 +69,7 @@ def bag_log(
 def find_topics(
     present: Present, imu: str | None, board: str | None, case: str | None
 ) -> dict[str, str | None]:
-    """Tell ``imu``, ``board`` and ``case`` apart, None for a thermometer that is not there."""
+    """Find the topics of ``imu``, ``board`` and ``case``; None for a missing thermometer."""
     imu = imu or _most(_of_type(present, IMU), 'Imu')
     if imu is None:
         raise RecordingError('the bag holds no Imu messages')
@@ -93,7 +93,7 @@ def _of_type(present: Present, kind: str) -> list[str]:
 
 
 def _shared(name: str, others: list[str]) -> int:
-    """Count the namespaces that a topic shares with the nearest of others."""
+    """Largest number of leading namespaces that a topic shares with any of the others."""
     own, *theirs = ({*PurePosixPath('/', one.strip('/')).parents} for one in (name, *others))
     return max((len(own & one) for one in theirs), default=0)
 

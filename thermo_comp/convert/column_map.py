@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns tables with a column map: which column is what, in which unit, and how it becomes a message.
+Owns tables with a column map: the content and unit of each column, and the message it becomes.
 
-A map is a small YAML file beside the log; config/columns/ has examples. Without one, headings are
-asked what they name (see `headings`). A table of numbers alone,
-``[t] ax ay az [wx wy wz]`` as for imu_tk, has its map guessed: times rise; what rests reads
-gravity in its unit; and a gyroscope that counts in degrees is faster than any hand in radians.
+A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
+by their headings (see `headings`). The map of a table of numbers alone, ``[t] ax ay az [wx wy
+wz]`` as for imu_tk, is guessed: times rise; readings at rest are gravity, which gives the unit;
+degrees per second taken for radians would be faster than any turn by hand.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ Triple = tuple[Column, Column, Column]
 
 #: Slope and offset from a table's reading to degC.
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
-#: Between two samples lies more than the first [s], and less than the second: so times are told.
+#: Range of plausible sample intervals [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
-#: Or up to this [s], where blocks of so many samples rest with so much of a turn [rad] in the one
-#: between, which lasts milliseconds otherwise.
+#: Longest interval [s] of a table in which the unit turns by at least this angle [rad] between
+#: blocks of this number of still samples (scatter [g]): in ms such a turn would be impossible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
 _A_MAP = 'a column map: --columns MAP'
@@ -48,8 +48,8 @@ class Accel:
     """
     The accelerometer's three columns, which become `output`: ``counts`` or ``imu`` (m/s^2).
 
-    `clip` are the readings, in the table's unit, at and beyond which the sensor saturates;
-    `offset` is what it reads without a force, as 32768 in offset binary, which is taken away.
+    `clip` are the readings, in the table's unit, from which on the sensor is saturated; `offset`
+    is the reading without a force, as 32768 in offset binary, which is subtracted.
     """
 
     columns: Triple
@@ -70,7 +70,7 @@ class Accel:
 
 @dataclass(frozen=True)
 class Gyro:
-    """The gyroscope's three columns; they travel in the Imu message."""
+    """The gyroscope's three columns, which are part of the Imu message."""
 
     columns: Triple
     unit: Literal['rad/s', 'deg/s']
@@ -93,7 +93,7 @@ class Thermometer:
 
 @dataclass(frozen=True)
 class Further(Thermometer):
-    """A thermometer beside board and case; its topic is ``temperature/<name>``."""
+    """A further thermometer; its topic is ``temperature/<name>``."""
 
     name: Annotated[str, Bounds(shortest=1)] = field(kw_only=True)
 
@@ -131,7 +131,7 @@ class ColumnMap:
 
 
 def load_column_map(path: Path) -> ColumnMap:
-    """Read a column map; RecordingError, with the key, if it is none."""
+    """Read a column map; RecordingError, with the key, if it is not valid."""
     data = read_plain_yaml(path)
     try:
         if not isinstance(data, dict):
@@ -142,7 +142,7 @@ def load_column_map(path: Path) -> ColumnMap:
 
 
 def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
-    """Read all rows of a table as its column map says, with the temperatures thinned."""
+    """Read all rows of a table by its column map; repeated temperatures are thinned."""
     accel, gyro = columns.accel, columns.gyro
     thermometers = {'board': columns.board, 'case': columns.case}
     thermometers |= {one.name: one for one in columns.further}
@@ -193,13 +193,13 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
         return _by_headings(path, table, rate_hz)
     if width not in (3, 4, 6, 7):
         raise RecordingError(
-            f'{width} columns without headings do not say what they are: {_GIVE_MAP}', path=path
+            f'{width} columns without headings cannot be identified: {_GIVE_MAP}', path=path
         )
     first = int(width in (4, 7))
     x, y, z = first, first + 1, first + 2
     accel = np.column_stack([table.values[column] for column in (x, y, z)])
     stamp = _stamp(path, table.values[0] if first else None, rate_hz, accel)
-    # Stillness asks for the order of the samples, and hardly for their times; rests may be short.
+    # Any time axis will do: finding rests depends on the order of the samples.
     still = find_stillness(np.arange(len(accel)) * 10**9, accel)
     believed, reason = believed_unit(still.magnitude)
     if believed == 'unknown':
@@ -214,7 +214,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
 
 
 def _by_headings(path: Path, table: Table, rate_hz: float | None) -> ColumnMap:
-    """Tell the columns by their headings, and the units that these do not state by the numbers."""
+    """Guess the columns by their headings, and missing units by the numbers."""
     named = read_headings(table.headings)
     if named is None or not (named.time or rate_hz):
         listed = ', '.join(map(repr, table.headings[:20]))
@@ -267,7 +267,7 @@ def _by_headings(path: Path, table: Table, rate_hz: float | None) -> ColumnMap:
 
 
 def spoken_columns(columns: ColumnMap) -> str:
-    """Say what the columns of a table were taken for."""
+    """Describe a column map in a line."""
     stamp = columns.stamp
     said = [f'{stamp.rate_hz:g} Hz' if stamp.column is None else f'time [{stamp.unit}]']
     said.append(f'x y z [{columns.accel.unit}]')
@@ -277,7 +277,7 @@ def spoken_columns(columns: ColumnMap) -> str:
 
 
 def _stamp(path: Path, times: Floats | None, rate_hz: float | None, accel: Floats) -> Stamp:
-    """Tell the unit of times by how often samples come."""
+    """Guess the unit of times by the sample interval."""
     if times is None:
         if rate_hz is None:
             raise RecordingError('it has no times: give --rate-hz', path=path)
@@ -287,16 +287,16 @@ def _stamp(path: Path, times: Floats | None, rate_hz: float | None, accel: Float
     steps = np.diff(times[np.isfinite(times)])
     step = float(np.median(steps)) if len(steps) else 0.0
     is_time = len(steps) > 0 and (steps > 0.0).mean() > 0.9
-    # From the largest unit on: a step of 5 is no time in seconds, but one in ms.
+    # From the largest unit down: an interval of 5 is not plausible in s, but in ms.
     longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
     for unit, exponent in STAMP_EXPONENTS.items():
         if is_time and _STEPS_S[0] < step * 10.0 ** (exponent - 9) < longest:
             return Stamp(0, unit)
-    raise RecordingError(f'its first column is no time that rises: {_GIVE_MAP}', path=path)
+    raise RecordingError(f'its first column is not a rising time: {_GIVE_MAP}', path=path)
 
 
 def _turns_at_once(accel: Floats) -> bool:
-    """Whether the unit rests in another attitude faster than a hand turns it in milliseconds."""
+    """Whether the unit turns between still blocks faster than possible if times were in ms."""
     blocks = accel[: len(accel) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, 3)
     mean = blocks.mean(axis=1)
     size = np.linalg.norm(mean, axis=1, keepdims=True)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns exchange with other tools: what lies between one's file and a calibration.
+Owns the exchange with other tools: calibrations to the content of their files, and back.
 
-All say ``a = A (N - b)`` of a reading N. Autopilots let b depend on temperature and keep A at 1,
-the tools for tumbles keep both constant. What a calibration holds beyond that is named in the
-notes of an export, with the error that its loss leaves.
+All use ``a = A (N - b)`` of a reading N. In autopilots b depends on temperature and A is 1; in
+tools for tumble tests both are constant. The notes of an export name the parts of a calibration
+that are lost, with the resulting error.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from ..unit.rate_triad import rate_triad
 from .tools import TOOLS, Content, Tool, ql, turned
 
 _GRID = 257
-#: White noise of an imported gyroscope, of which nothing is said [rad/s/sqrt(Hz)].
+#: White noise assumed for an imported gyroscope [rad/s/sqrt(Hz)].
 _RATE_NOISE = 1e-4
-#: Readings in m/s^2 have scale factors near 1; beyond this factor they are something else.
+#: Largest factor between 1 and the scale factor of readings in m/s^2.
 _NEAR_ONE = 2.0
 
 
@@ -43,18 +43,18 @@ def export_calibration(
     up: tuple[float, float, float] | None = None,
 ) -> Content:
     """
-    Write a calibration's static set as the file of one of `TOOLS`: its `text`, and in the `notes`
-    what it cannot hold.
+    Write a calibration's static set as the file of one of `TOOLS`: its `text`, and `notes` on the
+    lost parts.
 
-    `number`: which set or IMU, where the file numbers them; `device_id`: by which PX4 matches it.
-    At the attitude `up`, a unit vector, the drift of the scale is folded into the offset.
+    `number` of the set or IMU, if the file numbers them; `device_id` by which PX4 matches the
+    sensor. With `up`, a unit vector, the scale's drift in this attitude is added to the offset.
     """
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')
     content = _content(calibration, TOOLS[to], up)
     text = TOOLS[to].write(content, number, device_id)
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
-    # Whatever a note holds, it ends with its line; imu_tk's reader knows no comments.
+    # A note is a single line; imu_tk's reader knows no comments.
     head = [] if to == 'imu_tk' else [f'# {one_line(said)}\n' for said in (title, *content.notes)]
     return replace(content, text=''.join(head) + text)
 
@@ -62,7 +62,7 @@ def export_calibration(
 def _content(
     calibration: Calibration, tool: Tool, up: tuple[float, float, float] | None
 ) -> Content:
-    """Take from a calibration what a tool's file can hold, and note the rest."""
+    """Convert a calibration to the content of a tool's file, with notes on lost parts."""
     sets = calibration.static.axes()
     K = np.array([axis.scale_factor for axis in calibration.axes])
     levels = zip(calibration.axes, sets, strict=True)
@@ -71,7 +71,7 @@ def _content(
     temperature = np.linspace(*range_c, _GRID)
     own_reference_c = calibration.reference_temperature_c
     t = temperature - own_reference_c
-    # Counts have been divided by K before a correction, readings in m/s^2 have not.
+    # Counts are divided by K before the tool's correction, readings in m/s^2 are not.
     gain = K if calibration.unit.input == 'm/s^2' else np.ones(3)
     bias = np.array([one.bias_function.value(t) for one in sets]) / K[:, None]
     scale = np.array([one.scale_function.value(t) for one in sets]) - 1.0
@@ -80,7 +80,7 @@ def _content(
     matrix, cubics = np.array(calibration.misalignment), np.zeros((3, 4))
     notes: list[str] = []
     if calibration.provenance.model == unit.POPULATION:
-        notes.append('it is the mean of a type of unit: what one differs by is not in it')
+        notes.append('it is the mean of a type of unit, without the deviations of this unit')
     rate_notes, rate_bias = [], None
     if tool.is_thermal:
         d = temperature - reference_c
@@ -121,16 +121,16 @@ def _content(
             f'{spoken(float(np.max(np.abs(bias))))}, the scale by {1e6 * scale_drift:.2g} ppm'
         )
         if not calibration.needs_temperature:
-            drift = 'what temperature does is not known'
+            drift = 'it has no correction for temperature'
         notes.append(f'it holds at {reference_c:g} degC: {drift}')
         rate_notes = ['is lost'] * (calibration.gyroscope is not None)
     notes += _losses(calibration)
-    notes += [f'angular rate: {one}' for one in rate_notes]
+    notes += [f'angular rate: {note}' for note in rate_notes]
     if calibration.unit.input == 'counts':
         notes.append(
             'offsets are counts divided by K: the driver must scale by these K'
             if tool.is_thermal
-            else 'it is for counts, as the calibration is'
+            else 'it is for counts, like the calibration'
         )
     noise = (
         max(calibration.noise_density_m_s2_sqrt_hz),
@@ -141,13 +141,13 @@ def _content(
 
 
 def _cubics(d: Floats, offset: Floats) -> tuple[Floats, float]:
-    """Fit a cubic to the offset of each axis, and say by how much it is off at most."""
+    """Fit a cubic to the offset of each axis; return it and its largest error."""
     cubics = polynomial.polyfit(d, offset.T, 3)
     return cubics.T, float(np.max(np.abs(polynomial.polyval(d, cubics) - offset)))
 
 
 def _losses(calibration: Calibration) -> list[str]:
-    """Say what no other tool's file can hold of a calibration."""
+    """List the parts of a calibration that no other tool's file can hold."""
     notes = []
     lost = sorted({term.group for term in calibration.response if any(term.bias + term.scale)})
     if lost:
@@ -177,8 +177,8 @@ def import_calibration(
     noise_density: float = 200.0 * MICRO_G,
 ) -> Calibration:
     """
-    Read the file of one of `TOOLS`, told by what it holds, with the same set in both regimes.
-    `number` chooses a set or IMU; None takes the only one there is. `full_scale` is in m/s^2.
+    Read the file of one of `TOOLS`, recognised by its content; both regimes get the same set.
+    `number` chooses a set or IMU, None the only one. `full_scale` is in m/s^2.
     """
     found = (tool.read(text, number) for tool in TOOLS.values())
     content = next((one for one in found if one is not None), None)
@@ -200,7 +200,7 @@ def import_calibration(
         )
     (_, _, _), (yx, _, _), (zx, zy, _) = (matrix * K).tolist()
     if not is_si:
-        # Of words with an offset, such as 32768, on either side of it.
+        # Samples in an offset code, as 32768, extend to both sides of the offset.
         full_scale = full_scale * float(K.max()) + float(np.abs(content.bias[:, 0]).max())
     one = Polynomial((1.0,))
     x_set, y_set, z_set = (unit.AxisSet(curve, one) for curve in _curves(content.bias))
@@ -229,5 +229,5 @@ def import_calibration(
 
 
 def _curves(bias: Floats) -> list[Polynomial]:
-    """Give each axis' cubic without its level."""
+    """Return each axis' cubic without its constant."""
     return [Polynomial((0.0, *row[1:])) for row in bias.tolist()]

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the headings of a table say: its time, its triads, its thermometers, and their units.
+Owns the recognition of headings: time, triads, thermometers, and their units.
 
-A guess is printed as the column map that it is, for the user to keep or to edit.
+A guess is printed as a column map, for the user to keep or to edit.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _UNIT = re.compile(r'[\[(]([^\])]*)[\])]')
 _TIME = re.compile(r'(^|_)(time|timestamp|stamp|now|date|datetime|epoch|elapsed|utc|t|ts)(_|$)')
 _TIMES = {'s': 's', 'sec': 's', 'seconds': 's', 'ms': 'ms', 'us': 'us', 'µs': 'us', 'ns': 'ns'}
 _ACCEL, _GYRO = re.compile('acc|force|^a$'), re.compile('gyr|omega|rot|rate|angular|^g$|^w$')
-# What has three axes and is neither.
+# Words in headings of triads that are neither accelerometer nor gyroscope.
 _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|vel(?!ocity)')
 _TEMPERATURE = re.compile('temp|tmp|celsius|(^|_)t_?c($|_)')
 _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
@@ -30,7 +30,7 @@ Columns = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class Headings:
-    """What they name, with the units that they state; '' where they do not."""
+    """The recognised columns with their stated units; '' if not stated."""
 
     time: str
     time_unit: str
@@ -38,7 +38,7 @@ class Headings:
     accel_unit: str
     gyro: Columns | None
     gyro_unit: str
-    thermometers: dict[str, tuple[str, str]]  # by its name the column and the unit
+    thermometers: dict[str, tuple[str, str]]  # column and unit by thermometer
 
 
 def read_headings(headings: Sequence[str]) -> Headings | None:
@@ -70,7 +70,7 @@ def read_headings(headings: Sequence[str]) -> Headings | None:
 
 
 def map_lines(columns: Any) -> Iterator[str]:
-    """Write a column map as its file has it."""
+    """Yield the lines of a column map's file."""
     stamp, accel, gyro = columns.stamp, columns.accel, columns.gyro
     is_timed = stamp.column is not None
     times = f'column: {stamp.column!r}, unit: {stamp.unit}' if is_timed else None
@@ -88,7 +88,7 @@ def map_lines(columns: Any) -> Iterator[str]:
 
 
 def _plain(heading: str) -> str:
-    """Bring a heading into small letters, words parted by underscores, without its unit."""
+    """Convert a heading to lower case with underscores, without its unit."""
     return re.sub(r'[^0-9a-z]+', '_', _UNIT.sub('', heading).strip().lower()).strip('_')
 
 
@@ -98,7 +98,7 @@ def _unit(heading: str) -> str:
 
 
 def _triads(names: dict[str, str]) -> Iterator[tuple[str, Columns]]:
-    """Find names that differ in one x, y, z; by what they have in common."""
+    """Find three names that differ only in x, y, z; yield their common part and the columns."""
     for name in reversed(names):
         for at in (match.start() for match in re.finditer('x', name)):
             three = [f'{name[:at]}{axis}{name[at + 1 :]}' for axis in 'xyz']

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way from any foreign log to a bag: checks, thinning, and the account of every row.
+Owns the conversion of a foreign log to a bag: checks, thinning, and a report on every row.
 
-At rest the specific force is gravity, whatever the attitude: a log whose map says otherwise is
-refused, because a factor of 9.8 that nobody sees ends in a calibration.
+At rest the specific force is gravity in any attitude. A log whose map contradicts that is refused,
+because an unnoticed factor of 9.8 would end in a calibration.
 """
 
 from __future__ import annotations
@@ -33,64 +33,64 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-# |a| of a still sensor in each unit. A cheap one is off by a few per cent (bias and scale), a
-# thermal chamber adds some more; 20 % is beyond all of them and far below the ratios to be told.
+# |a| of a still sensor in each unit. Cheap sensors are off by a few per cent (bias and scale), a
+# thermal chamber adds some; 20 % is beyond both and far below the ratios between the units.
 PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # The usual sensitivities, from +-16 g to +-2 g of a 16-bit sensor.
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12
-# Noise this many times the quiet level is handling, not noise: the sd of 12 samples stays within
-# a factor of 2 of its mean.
+# Scatter / quiet level from which a cell is handled: the sd of 12 samples of noise stays within a
+# factor of 2 of its mean.
 _MOVING_RATIO = 4.0
-_MERGE_NS = 10 * 10**9  # two movements with less rest between them than this are one
+_MERGE_NS = 10 * 10**9  # shortest rest between two separate movements
 
-NO_STAMP = np.iinfo(np.int64).min  # the stamp of a row that has none
-# No sensor on a circuit board is read outside this range; kelvins and raw counts are.
+NO_STAMP = np.iinfo(np.int64).min  # the stamp of a row without a stamp
+# Range of temperatures on a circuit board; kelvins and raw counts are outside.
 _PLAUSIBLE_CELSIUS = (-90.0, 200.0)
-_RUN_ROWS = 100_000  # rows are reduced and written in runs of so many: bounded memory
+_RUN_ROWS = 100_000  # number of rows processed at a time, to bound the memory
 _EXAMPLES = 5
-SLOW_HZ = 5.0  # slower logs tell of soaks alone
+SLOW_HZ = 5.0  # slower logs are only good for soaks
 
 
 @dataclass(frozen=True)
 class ForeignLog:
-    """What a log of any format holds, in file order."""
+    """The content of a log of any format, in file order."""
 
     path: str
-    stamp_ns: Ints  # `NO_STAMP` where there is none, shape (n,)
-    accel: Floats  # in the stated unit; NaN where a cell is no number, shape (n, 3)
+    stamp_ns: Ints  # `NO_STAMP` if missing, shape (n,)
+    accel: Floats  # in the stated unit; NaN if a cell is not a number, shape (n, 3)
     gyro: Floats | None = None  # [rad/s], shape (n, 3)
     temperatures: Mapping[str, Readings] = field(default_factory=dict)
-    line: Ints | None = None  # where each row stands in the file, shape (n,); None counts them
-    input: Literal['counts', 'imu'] = 'imu'  # what the accelerometer's messages become
+    line: Ints | None = None  # line of each row in the file, shape (n,); None: its number
+    input: Literal['counts', 'imu'] = 'imu'  # type of the messages to write
     unit: Unit = 'm/s^2'
     counts_per_g: float | None = None
-    clip: tuple[float, float] | None = None  # at and beyond which the sensor saturates
+    clip: tuple[float, float] | None = None  # readings from which on the sensor is saturated
     frame_id: str = 'imu_link'
     serial: str = ''
-    n_short: int = 0  # rows that were left out
+    n_short: int = 0  # number of rows left out
     metadata: Mapping[str, str] = field(default_factory=dict)
-    missing: str | None = None  # what of it could not be read
-    chosen: str | None = None  # topics that were taken without being named
-    guessed: Any = None  # its column map, where nobody gave one
-    hint: str = ''  # how its recorder would have logged more
+    missing: str | None = None  # description of unreadable parts
+    chosen: str | None = None  # note on topics chosen by type
+    guessed: Any = None  # column map, if it was guessed
+    hint: str = ''  # advice how to log more
 
 
 @dataclass(frozen=True)
 class Stillness:
-    """Where a recording rests, and what it reads there, in its unit; NaN where it never does."""
+    """Rests of a recording and the readings there, in its unit; NaN without a rest."""
 
     magnitude: float  # median |a| of the quiet cells
     noise: float  # their median sd per axis
     still_s: float
-    moving_ns: tuple[tuple[int, int], ...]  # where it is moved, from and to
+    moving_ns: tuple[tuple[int, int], ...]  # begin and end of each movement
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that `count` rows have in common, the first few of which stand in `lines`."""
+    """A property of `count` rows; `lines` are the lines of the first few."""
 
     count: int
     lines: tuple[int, ...] = ()
@@ -98,20 +98,20 @@ class Finding:
 
 @dataclass(frozen=True)
 class ConversionReport:
-    """What came in, what went out, and what was seen on the way."""
+    """Summary of a conversion."""
 
-    log: ForeignLog  # what was written of it
+    log: ForeignLog  # the part that was written
     rows: int
     messages: Mapping[str, int]  # by the name of the input
     rate_hz: float
     duration_s: float
     findings: dict[str, Finding]
-    believed: str  # which unit the readings at rest speak for
+    believed: str  # unit inferred from the readings at rest
     stillness: Stillness
 
 
 def library(module: str, extra: str, what: str, path: Path) -> Any:
-    """Import what an extra brings to read a file with."""
+    """Import the module of an extra."""
     try:
         return import_module(module)
     except ImportError as failure:
@@ -127,7 +127,7 @@ def write_log(
     force: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> ConversionReport:
-    """Check a log and write it as a bag: a bare file ``*.mcap``, else a rosbag2 directory."""
+    """Check a log and write it as a bag: a bare file ``*.mcap`` or a rosbag2 directory."""
     if log.serial:
         try:
             valid_serial(log.serial)
@@ -213,7 +213,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _write(
     log: ForeignLog, output: Path, force: bool, newest: Ints, progress: Callable[[float], None]
 ) -> None:
-    """Write the messages; a stamp that goes back keeps its place through its log time."""
+    """Write the messages; log times never go back, so backward stamps keep their order."""
     topics, n = Topics(), len(log.stamp_ns)
     per_g = PER_G.get(log.unit, log.counts_per_g or 1.0)
     factor = STANDARD_GRAVITY / per_g if log.input == 'imu' else 1.0
@@ -252,7 +252,7 @@ def _write(
 
 
 def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
-    """Find where a recording (n, 3) rests, from its noise alone, however shortly."""
+    """Find the rests of a recording (n, 3) of any length by their noise."""
     reduced = CellAccumulator(_CELL_S, None, least=_MIN_SAMPLES)
     for first in range(0, len(accel), _RUN_ROWS):
         run = slice(first, first + _RUN_ROWS)
@@ -263,8 +263,8 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
-    # The quiet level is the lower quartile: a log may be handled for most of its time. A sensor
-    # whose noise is below its own step shows none: then a step is the level.
+    # The quiet level is the lower quartile: a log may be handled for most of its time. It is at
+    # least a quantum: a sensor with less noise shows none.
     is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
     cell_ns = round(cells.cell_s * 1e9)
     moving: list[tuple[int, int]] = []
@@ -280,7 +280,7 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
 
 
 def believed_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
-    """Say which unit a still |a| speaks for (``counts`` and ``unknown`` among them), and why."""
+    """Infer the unit (or ``counts``, ``unknown``) from |a| at rest; return it and the reason."""
     if not np.isfinite(magnitude):
         return 'unknown', 'it never rests, so its unit was not checked'
     said = f'|a| at rest is {magnitude:.4g}'
@@ -291,12 +291,12 @@ def believed_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
         if abs(magnitude / sensitivity - 1.0) <= _TOLERANCE:
             return 'counts', f'{said}, as of a sensor with {sensitivity} counts per g'
     if magnitude > 50.0:
-        return 'counts', f'{said}, which is no gravity in g or m/s^2'
-    return 'unknown', f'{said}, which is gravity in no unit known here'
+        return 'counts', f'{said}, which is not gravity in g or m/s^2'
+    return 'unknown', f'{said}, which is not gravity in any known unit'
 
 
 def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> str | None:
-    """Say why a stated unit cannot be true, or None where nothing speaks against it."""
+    """Return why a stated unit cannot be true; None if it may be."""
     if not np.isfinite(magnitude):
         return None
     believed, reason = believed_unit(magnitude)

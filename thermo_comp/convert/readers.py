@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the choice of a log's reader: the name of a file tells a table, an autopilot's log and a bag.
+Owns the choice of a log's reader by the file name: table, autopilot's log or bag.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, Literal
 from . import autopilot, bag, column_map
 from .log import ForeignLog, write_log
 
-#: What may be said of each kind of file, by the names of `read_log`'s keywords.
+#: Keywords of `read_log` that apply to each kind of file.
 KEYWORDS: dict[str, tuple[str, ...]] = {
     'table': ('columns', 'rate_hz'),
     'log': ('imu', 'baro', 'allow_compensated'),
@@ -25,7 +25,7 @@ KEYWORDS: dict[str, tuple[str, ...]] = {
 
 
 def kind_of(path: Path) -> Literal['table', 'log', 'bag']:
-    """Tell a table, a PX4 or ArduPilot log, and a bag apart."""
+    """Return the kind of a file: table, PX4 or ArduPilot log, or bag."""
     suffix = path.suffix.lower()
     if path.is_dir() or suffix in ('.mcap', '.db3', '.bag'):
         return 'bag'
@@ -34,32 +34,32 @@ def kind_of(path: Path) -> Literal['table', 'log', 'bag']:
 
 def read_log(path: Path, **given: Any) -> ForeignLog:
     """
-    Read a table, a PX4 or ArduPilot log, or somebody's bag.
+    Read a table, a PX4 or ArduPilot log, or a bag with other topics.
 
-    Of a table `columns` is the path of its column map (else it is guessed) and `rate_hz` the rate
-    of one without times; of a log `imu` and `baro` count from 0 and `allow_compensated` takes
-    what the autopilot has corrected; of a bag `topic` names ``imu``, ``board`` and ``case``, and
-    `unit` is what the driver publishes.
+    Table: `columns` is the path of its column map (default: guessed), `rate_hz` the sample rate if
+    it has no times. Log: `imu` and `baro` count from 0, `allow_compensated` accepts samples that
+    the autopilot has corrected. Bag: `topic` names ``imu``, ``board`` and ``case``, `unit` is that
+    of the Imu topic.
 
-    Raises ValueError for a keyword that this kind of file has no use for, RecordingError if the
+    Raises ValueError for a keyword that does not apply to this kind of file, RecordingError if the
     file cannot be read.
     """
     kind = kind_of(path)
     said = {name: value for name, value in given.items() if value is not None}
     for name in said:
         if name not in KEYWORDS[kind]:
-            has = ', '.join(f'`{one}`' for one in KEYWORDS[kind])
+            has = ', '.join(f'`{keyword}`' for keyword in KEYWORDS[kind])
             raise ValueError(f'a {kind} needs no `{name}`; it has {has}')
     if kind == 'bag':
         names = said.pop('topic', {})
         if not names.keys() <= {'imu', 'board', 'case'}:
-            raise ValueError('`topic`: of a bag, imu, board and case are converted')
+            raise ValueError('`topic`: only imu, board and case of a bag are converted')
         return bag.bag_log(path, **names, **said)
     if kind == 'log':
         return autopilot.read_autopilot(path, **said)
     columns, rate_hz = said.get('columns'), said.get('rate_hz')
     if columns is not None and rate_hz is not None:
-        raise ValueError('`rate_hz`: a column map says that')
+        raise ValueError('`rate_hz`: the column map holds the rate')
     if columns is not None:
         return column_map.table_log(path, column_map.load_column_map(columns))
     guessed = column_map.guess_columns(path, rate_hz)
@@ -70,11 +70,11 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
 def as_bags(
     paths: Sequence[Path], told: Callable[[ForeignLog], None] = lambda _: None, **given: Any
 ) -> Iterator[list[Path]]:
-    """Let tables and logs take part as bags, for as long as it lasts; `told` gets each log."""
+    """Convert tables and logs to temporary bags; `told` is called with each log."""
     others = [path for path in paths if path.is_file() and kind_of(path) != 'bag']
     if any(given.values()) and not others:
         flags = ' and '.join(f'`{name}`' for name in given)
-        raise ValueError(f'{flags} are for tables, and there is none')
+        raise ValueError(f'{flags} are for tables, but no table is given')
     with TemporaryDirectory(prefix='thermo_comp-') as folder:
         bags = {}
         for number, path in enumerate(others):

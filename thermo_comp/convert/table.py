@@ -3,8 +3,8 @@
 """
 Owns tables of numbers: CSV, TSV, blank-separated or Parquet -> named columns of float64.
 
-A cell that is no number becomes NaN and its row is counted; a stamp is read exactly, as decimal
-digits, because nanoseconds since 1970 do not fit a float.
+A cell that is not a number becomes NaN, and its row is counted. Stamps are read exactly, by their
+decimal digits, because a float does not resolve nanoseconds since 1970.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ Column = str | int
 TimeUnit = Literal['s', 'ms', 'us', 'ns', 'iso']
 
 _SNIFF_BYTES = 65536
-_PREAMBLE_ROWS = 1000  # a logger's preamble is no longer than this
-_MOST_ROWS_PER_BYTE = 4  # what packs numbers more tightly holds no measurement
+_PREAMBLE_ROWS = 1000  # longest preamble of a logger
+_MOST_ROWS_PER_BYTE = 4  # largest number of rows per byte of a Parquet file with measurements
 #: Powers of ten from a unit of time to nanoseconds.
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
-#: ISO 8601, with the name of a zone behind it as some loggers have; without a zone it is UTC.
+#: ISO 8601, optionally followed by the name of a zone, as of some loggers; the default is UTC.
 _ISO = re.compile(
     r'(\d{4})-(\d\d)-(\d\d)[T ](\d\d):(\d\d)(?::(\d\d)(?:[.,](\d{1,9})\d*)?)?'
     r'\s*(?:(Z|UTC)|([+-])(\d\d):?(\d\d)?)?(?:\s*\[[^\]]*\])?'
@@ -54,7 +54,7 @@ _Rows = Iterator[tuple[int, list[str]]]  # line number and cells of each row
 
 @dataclass(frozen=True)
 class Format:
-    """How the text is laid out; found out where it is not said."""
+    """Layout of the text; None is detected."""
 
     delimiter: Literal[',', ';', '|', 'tab', 'blank'] | None = None
     header: bool | None = None
@@ -73,22 +73,22 @@ class Stamp:
         if (self.column is None) == (self.rate_hz is None):
             raise ValueError('give either `column` and `unit`, or `rate_hz`')
         if self.column is not None and self.unit is None:
-            raise ValueError('`unit` must be s, ms, us, ns or iso where there is a column')
+            raise ValueError('`unit` must be s, ms, us, ns or iso if `column` is given')
 
     def ticks(self, n: int) -> Ints:
-        """Give the stamps of rows at the fixed rate, shape (n,); no rounding adds up."""
+        """Return the stamps of rows at the fixed rate, shape (n,); rounding does not add up."""
         steps: Ints = np.rint(np.arange(n) * (1e9 / (self.rate_hz or 1.0))).astype(np.int64)
         return steps + round(self.start_s * 1e9)
 
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of one table, in file order, shape (n,)."""
+    """Columns of a table, in file order, shape (n,)."""
 
-    line: Ints  # where each row stands in the file, from 1; of Parquet its number
-    values: dict[Column, Floats]  # NaN where a cell is no number
-    stamp_ns: Ints  # `NO_STAMP` where a cell is no number
-    n_short: int = 0  # rows with too few cells, as where a log was cut off: left out
+    line: Ints  # line of each row in the file, from 1; in Parquet its number
+    values: dict[Column, Floats]  # NaN if a cell is not a number
+    stamp_ns: Ints  # `NO_STAMP` if a cell is not a number
+    n_short: int = 0  # number of dropped rows with too few cells, as at a cut
     headings: tuple[str, ...] = ()
 
 
@@ -119,9 +119,9 @@ def read_text(
 
 def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
-    Find the delimiter of a text table, the one that splits most lines alike (a blank is any run of
-    white space), and its width. The lines are taken from the end of the head, where the preamble
-    of a logger is over; the last one may be cut.
+    Find the delimiter of a text table, which splits most lines into the same number of cells (a
+    blank is any run of white space), and this number. Only the lines at the end of the head count,
+    after the preamble of a logger; the last line may be cut.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = (lines[:-1] if len(lines) > 2 else lines)[-50:]
@@ -142,7 +142,7 @@ def _n_cells(row: Sequence[str]) -> int:
 
 
 def _rows(file: Iterable[str], delimiter: str) -> _Rows:
-    """Yield (line number, cells) of every line that holds something but a comment."""
+    """Yield (line number, cells) of every line that is neither empty nor a comment."""
     if delimiter == ' ':
         cells: Iterable[list[str]] = (line.split() for line in file)
     else:
@@ -154,9 +154,9 @@ def _rows(file: Iterable[str], delimiter: str) -> _Rows:
 
 def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str], _Rows]:
     """
-    Skip what stands before a table; return its headings, if it has any, and its rows. These are as
-    wide as most, but for a blank last cell. The first of numbers, or a run of such rows right
-    before it, begins the table: then the first of these has the headings.
+    Skip the preamble; return the headings, if any, and the rows of a table. A row has the usual
+    width, except for a blank last cell. The table begins at the first row of numbers, or at rows
+    of the same width directly before it, the first of which has the headings.
     """
     first = list(islice(rows, _PREAMBLE_ROWS))
     is_row = [_n_cells(row) <= width <= len(row) for _, row in first]
@@ -174,7 +174,7 @@ def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str],
 
 
 def _number(cell: str) -> float | None:
-    """Read a cell as a number, of which NaN and infinity are some."""
+    """Read a cell as a number, including NaN and infinity; None if it is not a number."""
     try:
         return float(cell)
     except ValueError:
@@ -195,7 +195,7 @@ def _collect(
     needed = 1 + max([*places.values(), -1 if at is None else at])
     for name, place in places.items():
         if re.fullmatch(r'\s*[+-]?[0-9]+,[0-9]+\s*', first[1][place]):
-            why = f'column {name!r} has decimal commas, as in {first[1][place]}: give it points'
+            why = f'column {name!r} has decimal commas, as in {first[1][place]}: use points'
             raise RecordingError(why, path=path)
 
     line, stamps, n_short = array('q'), array('q'), 0
@@ -220,7 +220,7 @@ def _collect(
 
 
 def _place(path: Path, name: Column, headings: Sequence[str], width: int) -> int:
-    """Return the number of a column, counted from 0; RecordingError if it is not there once."""
+    """Return the index of a column; RecordingError if it does not exist exactly once."""
     if isinstance(name, int):
         if 0 <= name < width:
             return name
@@ -237,7 +237,7 @@ def _place(path: Path, name: Column, headings: Sequence[str], width: int) -> int
 
 
 def exact_ns(cell: object, unit: TimeUnit | None) -> int:
-    """Return the stamp of a number or a date, exact to the last digit; else `NO_STAMP`."""
+    """Return the exact stamp of a number or a date; `NO_STAMP` for any other cell."""
     if unit == 'iso':
         return _iso_ns(str(cell).strip())
     try:
@@ -255,7 +255,7 @@ def _iso_ns(text: str) -> int:
     year, month, day, hour, minute, second = (int(part or 0) for part in moment)
     try:
         seconds = timegm(datetime(year, month, day, hour, minute, second).timetuple())
-    except ValueError:  # a thirteenth month
+    except ValueError:  # for example a thirteenth month
         return NO_STAMP
     east_s = 3600 * int(hours or 0) + 60 * int(minutes or 0)
     seconds += east_s if sign == '-' else -east_s
@@ -276,7 +276,7 @@ def read_parquet(
         with open_regular(path) as file:
             found = pq.ParquetFile(file)
             if found.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
-                raise RecordingError(f'it claims {found.metadata.num_rows} rows', path=path)
+                raise RecordingError(f'it declares {found.metadata.num_rows} rows', path=path)
             headings = list(found.schema_arrow.names)
             wanted = range(len(headings)) if columns is None else columns
             names = [*wanted] if stamp.column is None else [*wanted, stamp.column]
@@ -284,7 +284,7 @@ def read_parquet(
             table = found.read(columns=[headings[i] for i in sorted(set(places.values()))])
     except RecordingError:
         raise
-    except Exception as failure:  # a damaged file surfaces there as nearly any exception type
+    except Exception as failure:  # a damaged file may raise any exception
         reason = ' '.join(str(failure).split())
         raise RecordingError(f'not a readable Parquet file ({reason})', path=path) from failure
     if not table.num_rows:

@@ -1,24 +1,23 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the files of other tools, `TOOLS`: how each is written and read.
+Owns the files of other tools, `TOOLS`: writing and reading of each.
 
-Autopilots correct each axis' bias by a cubic of the sensor's own temperature, held at the edges of
-a range, in m/s^2 or, of a gyroscope, in rad/s, and nothing else; ``raw`` is already in m/s^2
-there, scaled by the driver::
+Autopilots only correct each axis' bias, by a cubic of the sensor's temperature held at the edges
+of a range, in m/s^2 or, for a gyroscope, in rad/s; ``raw`` is in m/s^2, scaled by the driver::
 
     PX4        a = raw - (X0 + X1 d + X2 d^2 + X3 d^3),        d = T - TREF
     ArduPilot  a = raw - 1e-6 (p(T) - p(CALTEMP)),  p(T) = ACC1 d + ACC2 d^2 + ACC3 d^3, d = T - 35
 
-A gyroscope's are ``TC_Gn`` in the place of ``TC_An``, and ``GYR`` in that of ``ACC``. Other tools
-calibrate a triad at one temperature; with the reading N and the specific force a::
+For a gyroscope ``TC_Gn`` replaces ``TC_An``, and ``GYR`` replaces ``ACC``. Other tools calibrate a
+triad at one temperature; with the reading N and the specific force a::
 
     imu_tk      a = T K (N - B)      T upper triangular, unit diagonal; K diagonal    (.calib)
     imu_calib   a = SM N - bias      SM any matrix                                    (YAML)
     Kalibr      N = M a + b          M lower triangular                               (YAML)
     here        a = M K^-1 (N - b)   M lower triangular, unit diagonal; K diagonal
 
-A triangle of the other kind, or a full matrix, belongs to a frame that is turned against ours.
+An upper triangle, or a full matrix, belongs to a frame that is rotated relative to ours.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from ..typing import Floats
 
 _ARDUPILOT_REFERENCE_C = 35.0
 _ARDUPILOT_SCALE = 1e6
-# ArduPilot's value for a temperature of calibration that was never recorded.
+# ArduPilot's value for an unknown temperature of the offset calibration [degC].
 _NO_TEMPERATURE = -273.0
 _AXES = ('X', 'Y', 'Z')
 _THERMAL_NOTE = (
@@ -45,26 +44,26 @@ _THERMAL_NOTE = (
 )
 _NAME = re.compile(r'\b(TC_[AG]\d_\w+|TC_[AG]_ENABLE|INS_TCAL\d_\w+|INS_(?:ACC|GYR)\d_CALTEMP)\b')
 _NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
-#: What the tools for triads do not say: where their constants were found.
+#: Reference and range assumed for files of triads, which do not state a temperature [degC].
 _REFERENCE_C, _RANGE_C = 20.0, (-60.0, 120.0)
-_TRIAD_NOTE = 'imported: constants of one temperature, taken for all; no uncertainty'
+_TRIAD_NOTE = 'imported: constants of one temperature, used for all; no uncertainty'
 _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')
 
 
 @dataclass(frozen=True)
 class Content:
-    """What a file says: ``a = matrix (N - bias)``, the bias a cubic of temperature."""
+    """The content of a file: ``a = matrix (N - bias)``, the bias a cubic of temperature."""
 
-    matrix: Floats  # shape (3, 3); of an autopilot's file the identity
+    matrix: Floats  # shape (3, 3); the identity in an autopilot's file
     bias: Floats  # coefficients of each axis, in units of N, shape (3, 4)
-    reference_c: float  # that the cubics count from
+    reference_c: float  # origin of the cubics
     range_c: tuple[float, float]
-    notes: list[str]  # what is lost, or lacks
+    notes: list[str]  # lost or missing parts
     source: str = ''  # the tool and the set that was read
-    # White [m/s^2/sqrt(Hz)], walk [m/s^2/sqrt(h)], samples per second, on the way out.
+    # For export: white noise [m/s^2/sqrt(Hz)], walk [m/s^2/sqrt(h)], samples per second.
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rate_bias: Floats | None = None  # as `bias`, of the angular rate [rad/s]
-    text: str = ''  # the file, once it is written
+    rate_bias: Floats | None = None  # like `bias`, for the angular rate [rad/s]
+    text: str = ''  # the written file
 
 
 def _write_px4(content: Content, number: int | None, device_id: int) -> str:
@@ -82,7 +81,7 @@ def _write_px4(content: Content, number: int | None, device_id: int) -> str:
         lines += [f'1\t1\t{prefix}{name}\t{value:.9g}\t9' for name, value in values.items()]
         if not known_id:
             content.notes.append(
-                f'{prefix}ID is 0: set it to the device id of the sensor, PX4 matches by it'
+                f'{prefix}ID is 0: set it to the device id of the sensor, by which PX4 matches'
             )
     return '\n'.join(lines) + '\n'
 
@@ -112,7 +111,7 @@ def _within(number: int | None, lowest: int) -> int:
 
 
 def _read_px4(text: str, number: int | None) -> Content | None:
-    """Read PX4 parameters as QGroundControl saves them, or as ``NAME=VALUE``; None if not one."""
+    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None if there are none."""
     values = _Parameters(text)
     found = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
     if not found:
@@ -130,7 +129,7 @@ def _read_px4(text: str, number: int | None) -> Content | None:
     rate_bias = None
     if values.get('TC_G_ENABLE', 1.0) == 1.0 and f'TC_G{number}_X1_0' in values:
         rate_bias, its_own, *edges = cubics(f'TC_G{number}_')
-        # One reference for both, and the range where both hold.
+        # Common reference, and common range of both.
         moved = np.polynomial.Polynomial((reference - its_own, 1.0))
         for row in rate_bias:
             coefficients = np.polynomial.Polynomial(row)(moved).coef
@@ -141,7 +140,7 @@ def _read_px4(text: str, number: int | None) -> Content | None:
 
 
 def _read_ardupilot(text: str, number: int | None) -> Content | None:
-    """Read ArduPilot parameters as Mission Planner or MAVProxy save them; None if not one."""
+    """Read ArduPilot parameters (Mission Planner, MAVProxy); None if there are none."""
     values = _Parameters(text)
     found = {int(name[8]) for name in values if name.startswith('INS_TCAL')}
     if not found:
@@ -154,14 +153,14 @@ def _read_ardupilot(text: str, number: int | None) -> Content | None:
     def cubics(sensor: str) -> Floats:
         names = [[f'{prefix}{sensor}{power}_{axis}' for power in (1, 2, 3)] for axis in _AXES]
         slopes = np.array([[values[name] for name in row] for row in names]) / _ARDUPILOT_SCALE
-        # The correction is relative to the temperature of the offset calibration: no offset there.
+        # The correction is 0 at the temperature of the offset calibration.
         calibrated = values.get(f'INS_{sensor}{number}_CALTEMP', _NO_TEMPERATURE)
         held = min(max(calibrated, values[f'{prefix}TMIN']), values[f'{prefix}TMAX'])
         powers = (held - _ARDUPILOT_REFERENCE_C) ** np.arange(1, 4)
         return np.column_stack((-slopes @ powers, slopes))
 
     bias, range_c = cubics('ACC'), (values[f'{prefix}TMIN'], values[f'{prefix}TMAX'])
-    # An autopilot that has learnt nothing of its gyroscope lists zeros.
+    # Without a thermal calibration of the gyroscope its parameters are zeros.
     rate_bias = cubics('GYR') if values.has(f'{prefix}GYR') else None
     source, notes = f'ArduPilot {prefix}*', [_THERMAL_NOTE]
     reference = _ARDUPILOT_REFERENCE_C
@@ -169,7 +168,7 @@ def _read_ardupilot(text: str, number: int | None) -> Content | None:
 
 
 class _Parameters(dict[str, float]):
-    """What a text says of thermal parameters, by name; one that is missing is a mistake."""
+    """Thermal parameters in a text, by name; a missing parameter is an error."""
 
     def __init__(self, text: str) -> None:
         for line in text.splitlines():
@@ -182,7 +181,7 @@ class _Parameters(dict[str, float]):
             self[name[0]] = float(value[0])
 
     def has(self, prefix: str) -> bool:
-        """Tell whether one that begins so is other than 0."""
+        """Whether any parameter with this prefix is not 0."""
         return any(value for name, value in self.items() if name.startswith(prefix))
 
     def __missing__(self, name: str) -> float:
@@ -190,7 +189,7 @@ class _Parameters(dict[str, float]):
 
 
 def _choose(found: set[int], number: int | None, is_in_use: Callable[[int], bool]) -> int:
-    """Choose a set: the one asked for, or the only one in use."""
+    """Choose the set `number`, or the only set in use."""
     if number is None:
         live = [n for n in sorted(found) if is_in_use(n)] or sorted(found)
         if len(live) > 1:
@@ -202,20 +201,20 @@ def _choose(found: set[int], number: int | None, is_in_use: Callable[[int], bool
 
 
 def ql(matrix: Floats) -> tuple[Floats, Floats]:
-    """Take a matrix apart into a rotation and a lower triangle with a positive diagonal."""
+    """Decompose a matrix into a rotation and a lower triangle with a positive diagonal."""
     rotation, lower = _qr(matrix[::-1, ::-1])
     return rotation[::-1, ::-1], lower[::-1, ::-1]
 
 
 def _qr(matrix: Floats) -> tuple[Floats, Floats]:
-    """Take a matrix apart into a rotation and an upper triangle with a positive diagonal."""
+    """Decompose a matrix into a rotation and an upper triangle with a positive diagonal."""
     rotation, upper = np.linalg.qr(matrix)
     signs = np.diag(np.sign(np.diag(upper)))
     return rotation @ signs, signs @ upper
 
 
 def turned(rotation: Floats) -> list[str]:
-    """Say by what our frame is turned in theirs, as tf takes it; nothing where it is not."""
+    """Describe the rotation of our frame in theirs for tf; empty if there is none."""
     if np.abs(rotation - np.eye(3)).max() < 1e-9:
         return []
     roll = np.arctan2(rotation[2, 1], rotation[2, 2])
@@ -237,7 +236,7 @@ def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str
 
 
 def _write_imu_calib(content: Content, _number: int | None, _device_id: int) -> str:
-    """Write imu_calib's YAML: the matrix row by row, the bias behind it."""
+    """Write imu_calib's YAML: the matrix by rows, then the bias."""
     bias = content.matrix @ content.bias[:, 0]
     return f'SM: {content.matrix.ravel().tolist()}\nbias: {bias.tolist()}\n'
 
@@ -246,8 +245,8 @@ def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
     """Write the accelerometer's part of an IMU in Kalibr's YAML."""
     white, walk, rate = content.noise
     rows = ''.join(f'    - {row}\n' for row in np.linalg.inv(content.matrix).tolist())
-    content.notes.append('Kalibr finds the bias anew each time and overlooks the key `bias`')
-    content.notes.append('topic and gyroscope are yours to add')
+    content.notes.append('Kalibr estimates the bias each time and ignores the key `bias`')
+    content.notes.append('topic and gyroscope must be added')
     return (
         f'imu{number or 0}:\n  model: scale-misalignment\n  update_rate: {rate:.9g}\n'
         f'  accelerometer_noise_density: {white!r}\n'
@@ -257,7 +256,7 @@ def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
 
 
 def _read_imu_tk(text: str, _number: int | None) -> Content | None:
-    """Read imu_tk's ``.calib``: 21 numbers, perhaps with its headings; None if not one."""
+    """Read imu_tk's ``.calib``: 21 numbers, with or without headings; None for another file."""
     lines = (line for line in text.splitlines() if not _HEADING.match(line))
     try:
         numbers = np.array([float(cell) for line in lines for cell in line.split()])
@@ -270,7 +269,7 @@ def _read_imu_tk(text: str, _number: int | None) -> Content | None:
 
 
 def _read_imu_calib(text: str, _number: int | None) -> Content | None:
-    """Read imu_calib's YAML; None if not one."""
+    """Read imu_calib's YAML; None for another file."""
     data = _mapping(text)
     if not {'SM', 'bias'} <= data.keys():
         return None
@@ -280,7 +279,7 @@ def _read_imu_calib(text: str, _number: int | None) -> Content | None:
 
 
 def _read_kalibr(text: str, number: int | None) -> Content | None:
-    """Read one IMU of Kalibr's YAML, by its number; None if there is none with a matrix."""
+    """Read an IMU of Kalibr's YAML, by its number; None if no IMU has a matrix."""
     imus = {
         str(name): _dictionary(_dictionary(part).get('accelerometers'))
         for name, part in _mapping(text).items()
@@ -300,7 +299,7 @@ def _read_kalibr(text: str, number: int | None) -> Content | None:
 
 def _regular(matrix: Floats) -> Floats:
     if not 0.0 < np.linalg.det(matrix) < np.inf:
-        raise CalibrationError('its matrix mirrors or flattens: it is no correction of a triad')
+        raise CalibrationError('its matrix is singular or mirrors: it cannot correct a triad')
     return matrix
 
 
@@ -332,12 +331,12 @@ def _array(value: object, key: str, size: int) -> Floats:
 
 @dataclass(frozen=True)
 class Tool:
-    """One tool's file: a bias over temperature, or scale and misalignment."""
+    """The file of a tool: a bias over temperature, or scale and misalignment."""
 
     write: Callable[[Content, int | None, int], str]
-    read: Callable[[str, int | None], Content | None]  # None of a text that is no such file
+    read: Callable[[str, int | None], Content | None]  # None for a text of another kind
     is_thermal: bool = False
-    reference_c: float | None = None  # where it is fixed
+    reference_c: float | None = None  # the fixed reference of an autopilot
 
 
 TOOLS = {

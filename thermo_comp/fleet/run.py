@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a run over a fleet: what is missing is done; a result.json, written last, says it is."""
+"""Owns a run over a fleet: fits what is missing; a test is done when its result.json exists."""
 
 from __future__ import annotations
 
@@ -30,32 +30,32 @@ from .work import FleetOptions, UnitOutcome, connected, run, sha256
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
 _FORMAT = 2
 _LONGEST_NAME = 100
-# A list longer than this is for the table's readers.
+# Largest number of rows listed on the page; the table has all.
 _MOST_ROWS = 60
 CALIBRATION, CERTIFICATE, RESULT = 'calibration.yaml', 'certificate.html', 'result.json'
 
 
 @dataclass(frozen=True)
 class FleetResult:
-    """A fleet, done: its rows by name, what they tell, the files."""
+    """The result of a fleet: rows by name, summary, files."""
 
     rows: tuple[Row, ...]
     summary: Summary
-    n_done: int  # tests that this run fitted, or tried to
+    n_done: int  # number of tests that this run fitted or tried to fit
     parquet: Path
     csv: Path
     page: Path
     prior: Path | None
-    no_prior: str  # why there is none
+    no_prior: str  # reason if there is no prior
 
     @property
     def n_fitted(self) -> int:
-        """Units with a calibration."""
+        """Number of units with a calibration."""
         return sum(is_fitted(row) for row in self.rows)
 
     @property
     def is_whole(self) -> bool:
-        """Whether every unit has a calibration that is valid on its bags, on all of them."""
+        """Whether every unit has a calibration from all of its bags that is valid on them."""
         return all(is_valid(row) and not (row['n_left_out'] or row['n_torn']) for row in self.rows)
 
 
@@ -72,10 +72,10 @@ def fit_fleet(
     tell: Callable[[int, int, Row | None], None] = lambda *_: None,
 ) -> FleetResult:
     """
-    Fit all units whose results are not there yet; ThermoCompError, OutputError if it cannot.
+    Fit all units without results; raises ThermoCompError or OutputError if impossible.
 
-    `tell` is called with the number of tests whose result is there and the number of all tests:
-    before the first fit, with None, and after each, with its row.
+    `tell` is called with the number of finished tests and of all tests: before the first fit with
+    None, and after each fit with its row.
     """
     for name in ('distributed', 'fsspec', 'pyarrow'):
         if find_spec(name) is None:
@@ -126,17 +126,17 @@ def fit_fleet(
 
 
 def _speaks(row: Row) -> bool:
-    """Whether a unit may speak for its type: all of it was seen, and holds."""
+    """Whether a unit may contribute to the prior: data complete, calibration valid."""
     return is_valid(row) and row['is_whole'] == 1
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
-    """Write what the units that hold have in common; else say why there is nothing."""
-    # A unit that was tested twice is one unit: the later test speaks.
+    """Build the prior from the valid units; otherwise return the reason why there is none."""
+    # Of a unit that was tested twice only the later test counts.
     tests = sorted((row for row in rows if _speaks(row)), key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}
     if len(latest) < UNITS_NEEDED:
-        return None, f'{len(latest)} units whose own bags tell all of them, need {UNITS_NEEDED}'
+        return None, f'{len(latest)} units with complete data, {UNITS_NEEDED} are needed'
     units = [load_calibration(results.folder_of(name) / CALIBRATION) for name in latest.values()]
     try:
         prior = population(sorted(units, key=lambda one: one.unit.serial))
@@ -149,7 +149,7 @@ def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, 
 def render_fleet(
     rows: Sequence[Row], summary: Summary, certificate_of: Callable[[Row], str]
 ) -> str:
-    """Write the page; `certificate_of` gives a certificate's path beside it, or nothing."""
+    """Render the page; `certificate_of` gives the relative path of a certificate, or ''."""
     from ..report.figures_unit import draw_distances, draw_shares
     from ..report.html import render
     from ..report.page import ReportFigure, drawn_figures
@@ -161,10 +161,10 @@ def render_fleet(
     }
     shares = ReportFigure(
         'residuals',
-        'What is left of |f|, unit by unit?',
+        'How large are the residuals of |f| in the fleet?',
         'Share of the units whose residual at rest is below the value: raw (constants at the '
-        'reference temperature), and with each unit’s calibration. Steep is alike; a tail to '
-        'the right is a unit to look at.',
+        'reference temperature), and with each unit’s calibration. Steep: the units are alike; '
+        'a tail to the right: units to inspect.',
         partial(draw_shares, curves),
     )
     distances = ReportFigure(
@@ -179,7 +179,7 @@ def render_fleet(
             summary.limit,
         ),
     )
-    # Of few units nobody knows what is usual.
+    # With few units the spread is not known.
     can_tell = np.isfinite(summary.limit)
     return render(
         'fleet.html',
@@ -197,27 +197,27 @@ def render_fleet(
 
 
 class Results:
-    """The folder of results, made if it is not there; raises ThermoCompError if it cannot be."""
+    """The folder of results, created if missing; ThermoCompError if that fails."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         try:
             (folder / 'units').mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ThermoCompError(f'{folder}: cannot be made: {error.strerror}') from error
+            raise ThermoCompError(f'{folder}: cannot be created: {error.strerror}') from error
 
     def folder_of(self, name: str, with_prior: object = False) -> Path:
-        """Return the folder of a unit's files; no name leads out of the fleet's."""
+        """Return the folder of a unit's files, which is always inside the fleet's."""
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 
     def certificate_of(self, row: Row) -> str:
-        """Give the path of a unit's certificate below the folder; nothing where there is none."""
+        """Return the path of a unit's certificate relative to the folder; '' without one."""
         path = self.folder_of(str(row['name']), row['prior']) / CERTIFICATE
         return path.relative_to(self.folder).as_posix() if path.is_file() else ''
 
     def look_up(self, unit: FoundUnit, options: FleetOptions) -> Row | None:
-        """Find the row of an earlier run; None where something changed, or was never finished."""
+        """Find the row of an earlier run; None if something changed or was not finished."""
         folder = self.folder_of(unit.name, options.fit.prior)
         try:
             said = json.loads((folder / RESULT).read_bytes())
@@ -234,14 +234,14 @@ class Results:
         return row
 
     def store(self, unit: FoundUnit, options: FleetOptions, outcome: UnitOutcome) -> Row:
-        """Write what came out, and return its row; a failure takes no calibration away."""
+        """Write an outcome and return its row; a failure keeps an earlier calibration."""
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):
             said = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
             return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, said)))})
         if outcome.calibration:
-            # Until the record is written its hash is not the file's: the unit is not done.
+            # Until the record is written, its hash differs from the file's: the unit is not done.
             content = outcome.calibration.encode()
             files.write_atomically(folder / CALIBRATION, content, files.CALIBRATION)
             (folder / CERTIFICATE).unlink(missing_ok=True)
@@ -255,13 +255,13 @@ class Results:
 
 
 def _key(unit: FoundUnit, options: FleetOptions) -> dict[str, Any]:
-    """Give what a result depends on, as JSON has it."""
+    """Return everything that a result depends on, for JSON."""
     found = [list(file) for bag in unit.bags.values() for file in bag]
     return {'format': _FORMAT, 'options': options.digest(), 'files': found}
 
 
 def _safe(part: str) -> str:
-    """Make a name that somebody else chose a name of one file."""
+    """Turn any name into the name of a single file."""
     name = quote(part, safe=" +,=@()'")
     if name.strip('.') and len(name) <= _LONGEST_NAME:
         return name

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what a fleet table tells: spreads that outliers do not widen, who stands out, drift."""
+"""Owns the statistics of a fleet table: robust spreads, outliers, drift."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from ..typing import Floats
 from .table import COLUMNS, Column, Row, is_fitted
 
 _FALSE_ALARMS = 0.05
-# Fewer units have no spread to stand out of.
+# Smallest number of units for which outliers are sought.
 _UNITS_NEEDED = 8
-# A median absolute deviation knows the spread as well as 0.37 n values do with their squares.
+# Efficiency of the median absolute deviation for a normal spread, relative to the sample sd.
 _MAD_EFFICIENCY = 0.37
-#: In what units are compared.
+#: The columns in which units are compared.
 QUANTITIES = tuple(one for one in COLUMNS if one.label)
 
 
 class Spread(NamedTuple):
-    """How a quantity is spread about its median, and each unit's distance in robust sd."""
+    """Spread of a quantity about its median, and each unit's distance in robust sd."""
 
     quantity: Column
     names: tuple[str, ...]
     values: Floats
     middle: float
-    sd: float  # 1.4826 times the median absolute deviation; of a size, of its logarithm
+    sd: float  # 1.4826 times the median absolute deviation (of the logarithm for sizes)
     z: Floats
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """A unit that stands out by `z` standard deviations from the fleet's `middle`."""
+    """A unit that is `z` standard deviations away from the fleet's median `middle`."""
 
     name: str
     serial: str
@@ -54,7 +54,7 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Retest:
-    """What changed between two tests of a unit, and whether by more than chance."""
+    """Changes between two tests of a unit, and whether they are significant."""
 
     serial: str
     earlier: str
@@ -65,23 +65,23 @@ class Retest:
 
     @property
     def worst(self) -> Drift:
-        """The surest change."""
+        """The most significant change."""
         return max(self.changes, key=_sds)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a fleet table tells: units by verdict; outliers and drifts, the surest first."""
+    """Statistics of a fleet: units by verdict; outliers and drifts, most significant first."""
 
     verdicts: dict[str, int]
     spreads: tuple[Spread, ...]
-    limit: float  # in standard deviations; infinite where too few units tell
+    limit: float  # of an outlier in standard deviations; infinite with too few units
     outliers: tuple[Outlier, ...]
     drifts: tuple[Retest, ...]
 
 
 def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
-    """Look at a fleet as a whole; rows of earlier tables tell what drifted."""
+    """Compute the statistics of a fleet; rows of earlier tables give the drifts."""
     fitted = [row for row in rows if is_fitted(row)]
     spreads = tuple(spread for one in QUANTITIES if (spread := spread_of(one, fitted)))
     limit = outlier_limit(len(fitted), len(spreads))
@@ -93,7 +93,7 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
         if abs(z) > limit
     ]
     wide = Verdict.WIDE.value
-    # Without its amount, so that like ones count together.
+    # Drop the amount from the verdict, so that equal verdicts count together.
     said = (str(row['verdict']) for row in rows)
     verdicts = (f'{wide} little' if one.startswith(wide) else one for one in said)
     return Summary(
@@ -106,7 +106,7 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
 
 
 def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
-    """Measure the spread of a quantity over calibrated units; None where no unit has it."""
+    """Measure the spread of a quantity over calibrated units; None if no unit has it."""
     known = [row for row in rows if row[quantity.name] is not None]
     if not known:
         return None
@@ -123,7 +123,7 @@ def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
 
 
 def outlier_limit(n_units: int, n_quantities: int) -> float:
-    """Give the distance of Student's t beyond which a unit stands out; infinite below eight."""
+    """Return the limit of an outlier by Student's t; infinite below eight units."""
     from scipy.stats import t
 
     if n_units < _UNITS_NEEDED or not n_quantities:
@@ -165,7 +165,7 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
 
 
 def _sds(drift: Drift) -> float:
-    """Give the size of a change in its standard deviations; 0 where nobody claims one."""
+    """Return the size of a change in its standard deviations; 0 if its sd is not known."""
     return abs(drift.change) / drift.sd if drift.sd > 0.0 else 0.0
 
 

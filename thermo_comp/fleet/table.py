@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the one table of units: its columns, what a fit puts into them, and its files."""
+"""Owns the table of units: its columns, the cells of a fit, and its files."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from ..unit.prediction import in_a_soak
 Cell = str | int | float | None
 Row = Mapping[str, Cell]
 
-#: What stands in the column `verdict` where there is no verdict of the judge.
+#: Values of the column `verdict` without a verdict of `judging`.
 REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
-# How a formula of a spreadsheet begins.
+# First characters of a spreadsheet formula.
 _FORMULA = ('=', '+', '-', '@')
-# What the fit has to say of bags that leave something of the unit to its prior.
+# Findings of the fit on incomplete data: the prior decides part of the calibration.
 _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
 
 class Column(NamedTuple):
-    """One column: its heading with the unit of measurement, what stands in it, its meaning."""
+    """A column: heading with the unit of measurement, kind of value, meaning."""
 
     name: str
     kind: str  # text, whole, number
     meaning: str
-    label: str = ''  # of what units are compared in, see `_COMPARED`
+    label: str = ''  # text for a compared quantity, see `_COMPARED`
     unit: str = ''
     by: str = 'value'
     sd: str = ''  # the column with its standard deviation
@@ -52,23 +52,23 @@ class Column(NamedTuple):
 _BELOW = ((1, 0), (2, 0), (2, 1))
 _TABLE = (
     ('name', 'text', 'folder of the bags, or serial; the folder of the results'),
-    ('serial', 'text', "serial in the bags' metadata, else the folder's own name"),
+    ('serial', 'text', "serial in the bags' metadata, or the folder's name"),
     ('lot', 'text', '`lot` in the metadata, else the folder above the unit'),
-    ('verdict', 'text', 'that of evaluate on its own bags; refused by the fit; failed'),
+    ('verdict', 'text', 'verdict of evaluate on the bags of the fit; or refused, failed'),
     ('reason', 'text', 'the numbers of the verdict'),
     ('problem', 'text', 'why there is no calibration'),
-    ('reservations', 'text', 'what the certificate holds against the calibration'),
+    ('reservations', 'text', 'reservations on the certificate'),
     ('left_out', 'text', 'bags that were left out, each with its reason'),
-    ('chosen', 'text', 'topics that were taken by their type, for want of the usual name'),
+    ('chosen', 'text', 'topics chosen by their type, as the usual name is missing'),
     ('n_bags', 'whole', 'bags found'),
-    ('n_left_out', 'whole', 'of them left out'),
-    ('n_torn', 'whole', 'bags that were cut off, and are read up to there'),
+    ('n_left_out', 'whole', 'bags left out'),
+    ('n_torn', 'whole', 'bags that were cut off, and are read up to the cut'),
     ('n_positions', 'whole', 'still positions'),
     ('n_samples', 'whole', 'accelerometer samples'),
     ('n_bytes', 'whole', 'size of the bags'),
     ('model', 'text', 'the model of the fit'),
-    ('is_whole', 'whole', '1 where its own bags tell all of it: siblings can begin with it'),
-    ('prior', 'text', 'SHA-256 of the prior.yaml that its fit began with'),
+    ('is_whole', 'whole', '1 if its bags determine everything: it can contribute to the prior'),
+    ('prior', 'text', 'SHA-256 of the prior.yaml of its fit'),
     ('start', 'text', 'UTC of the first sample'),
     ('hours', 'number', 'length of the bags together'),
     ('gravity_m_s2', 'number', 'local gravity used'),
@@ -80,7 +80,7 @@ _TABLE = (
     ('scale_{0}', 'number', '{1}: scale factor at T_ref, input units per m/s^2'),
     ('scale_sd_{0}_ppm', 'number', '{1}: its standard deviation'),
     ('scale_slope_{0}_ppm_k', 'number', '{1}: slope of the static scale at T_ref'),
-    ('bias_{0}_ug', 'number', '{1}: bias at T_ref in still air'),
+    ('bias_{0}_ug', 'number', '{1}: bias in a soak at T_ref'),
     ('bias_sd_{0}_ug', 'number', '{1}: its standard deviation'),
     ('bias_slope_{0}_ug_k', 'number', '{1}: slope of the static bias at T_ref'),
     ('m_{0}_urad', 'number', '`{1}`'),
@@ -93,13 +93,13 @@ _TABLE = (
     ('dynamic_ug', 'number', '|f| - g at rest, RMS, dynamic regime'),
     ('all_ug', 'number', '|f| - g at rest, RMS'),
     ('peak_ug', 'number', '|f| - g at rest, largest window'),
-    ('unseen_ug', 'number', '|f| - g of each position by what the others say, RMS'),
-    ('claimed_ug', 'number', 'RMS of what the calibration claims for these windows'),
+    ('unseen_ug', 'number', '|f| - g of each position by a fit to the others, RMS'),
+    ('claimed_ug', 'number', 'RMS of the claimed standard deviation of these windows'),
     ('cpu_s', 'number', 'processor time of reading and fit'),
     ('tool_version', 'text', 'version that fitted it'),
-    ('calibration_sha256', 'text', 'of calibration.yaml'),
+    ('calibration_sha256', 'text', 'SHA-256 of calibration.yaml'),
 )
-# In what units are compared: as it is, in ppm of the median, or by its logarithm.
+# Compared quantities: by value, in ppm of the median, or by logarithm.
 _COMPARED = {
     'scale_{0}': ('scale factor {1}', 'ppm', 'ppm', 'scale_sd_{0}_ppm'),
     'scale_slope_{0}_ppm_k': ('slope of scale {1}', 'ppm/K'),
@@ -113,7 +113,7 @@ _COMPARED = {
 
 
 def _places(name: str) -> dict[str, str]:
-    """Give what stands for {0} in a name, and for {1} beside it: axes, or elements of M."""
+    """Return the replacements of {0} and {1} in a name: axes, or elements of M."""
     if '{0}' not in name:
         return {'': ''}
     if name.startswith('m_'):
@@ -129,7 +129,7 @@ COLUMNS = tuple(
 
 
 def row_of(**known: Any) -> dict[str, Cell]:
-    """Make a row in which so much is known; other texts are empty, other numbers None."""
+    """Build a row from the known cells; other texts are empty, other numbers None."""
     row: dict[str, Cell] = {one.name: '' if one.kind == 'text' else None for one in COLUMNS}
     strange = known.keys() - row.keys()
     if strange:
@@ -148,12 +148,12 @@ def is_fitted(row: Row) -> bool:
 
 
 def is_valid(row: Row) -> bool:
-    """Whether a unit's calibration was shown to be valid on its own bags."""
+    """Whether a unit's calibration is valid on the bags of its fit."""
     return str(row['verdict']).startswith((Verdict.VALID.value, Verdict.WIDE.value))
 
 
 def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, Any]:
-    """Take what a unit's fit, and the verdict on its own bags, tell; in micro-g unless named."""
+    """Return the cells of a unit's fit and of the verdict on its bags."""
     calibration, bags = result.calibration, result.bags
     start = datetime.fromtimestamp(min(bag.start_ns for bag in bags) // 10**9, timezone.utc)
     sets = calibration.regime_sets()
@@ -228,7 +228,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
     writer = csv.DictWriter(text, [one.name for one in COLUMNS], lineterminator='\n')
     writer.writeheader()
     for row in rows:
-        # A spreadsheet would run such a text as a formula.
+        # Quote texts that a spreadsheet would run as a formula.
         armed = [k for k, v in row.items() if isinstance(v, str) and v.startswith(_FORMULA)]
         writer.writerow({**row, **{name: f"'{row[name]}" for name in armed}})
     paths = folder / 'fleet.parquet', folder / 'fleet.csv'
@@ -238,14 +238,18 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read a table of an earlier run; what it lacks is empty. ThermoCompError if it is none."""
+    """Read a table of an earlier run; missing columns are empty. ThermoCompError if not one."""
     from pyarrow import ArrowException, parquet
 
     try:
         found = parquet.read_table(path).to_pylist()
     except (ArrowException, OSError) as error:
-        raise ThermoCompError(f'{path}: no fleet table: {" ".join(str(error).split())}') from error
+        raise ThermoCompError(
+            f'{path}: not a fleet table: {" ".join(str(error).split())}'
+        ) from error
     names = {one.name for one in COLUMNS}
     if not all('serial' in row and 'verdict' in row for row in found):
-        raise ThermoCompError(f'{path}: no fleet table: it lacks the columns serial and verdict')
+        raise ThermoCompError(
+            f'{path}: not a fleet table: it lacks the columns serial and verdict'
+        )
     return [row_of(**{k: v for k, v in row.items() if k in names}) for row in found]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns where a fleet's bags lie, on any file system of fsspec, and which are one unit's."""
+"""Owns the search for a fleet's bags on any file system of fsspec, and their units."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..errors import RecordingError, ThermoCompError
 from ..recording.reader import open_recording
 from ..text import one_line
 
-# What a file system may say of a file that changes with its content, the surest first.
+# Attributes of a listing that change with a file's content, the most reliable first.
 _STAMPS = (
     *('ETag', 'etag', 'md5Hash', 'content_md5', 'generation', 'version_id'),
     *('mtime', 'LastModified', 'last_modified', 'updated', 'created'),
@@ -26,14 +26,14 @@ _STAMPS = (
 
 
 class StoredFile(NamedTuple):
-    """One file as its listing has it; `stamp` (ETag or time) changes with its content."""
+    """A file in a listing; `stamp` (ETag or time) changes with its content."""
 
     name: str
     size: int
     stamp: str
 
 
-#: The files of each bag, by its name below the fleet's folder; several for a directory.
+#: Files of each bag by the bag's path relative to the fleet's folder; several for a directory.
 Bags = dict[str, list[StoredFile]]
 
 
@@ -47,7 +47,7 @@ class FoundUnit:
 
 
 class Storage:
-    """A folder here or at a URL like ``s3://bucket/bags``, of a known protocol."""
+    """A local folder or a URL of a known protocol, like ``s3://bucket/bags``."""
 
     def __init__(self, url: str) -> None:
         import fsspec
@@ -59,12 +59,12 @@ class Storage:
             raise ThermoCompError(f'{url}: {words(error)}') from error
         self._root = str(root).rstrip('/')
         self._is_local = 'file' in self._fs.protocol
-        # What another process must be told to find it, wherever that was started.
+        # Address that is valid in any process, whatever its working directory.
         self.address = self._root if self._is_local else url
         self.name = self._root.rpartition('/')[2]
 
     def files(self) -> list[StoredFile]:
-        """List all files below the folder but hidden ones, sorted by name."""
+        """List all files below the folder except hidden ones, sorted by name."""
         try:
             if self._is_local:
                 found = {path: self._fs.info(path) for path in _walk(self._root)}
@@ -72,7 +72,7 @@ class Storage:
                 found = self._fs.find(self._root, detail=True)
             if not found and not self._fs.isdir(self._root):
                 raise NotADirectoryError(errno.ENOTDIR, 'no such directory')
-        except Exception as error:  # each file system has exceptions of its own
+        except Exception as error:  # each file system has different exceptions
             raise ThermoCompError(f'{self.url}: cannot be listed: {words(error)}') from error
         files = []
         for path, facts in found.items():
@@ -84,7 +84,7 @@ class Storage:
 
     @contextmanager
     def here(self, name: str, files: Sequence[StoredFile]) -> Iterator[Path]:
-        """Give the path of a bag on this machine, a copy if it lies elsewhere; raises OSError."""
+        """Yield a local path of a bag, a copy if it is remote; raises OSError."""
         if self._is_local:
             yield Path(self._root, name)
             return
@@ -100,22 +100,22 @@ class Storage:
 
 
 def _walk(root: str) -> Iterator[str]:
-    """Give the files of a local tree, which may be of links: fsspec does not follow them."""
+    """Yield the files of a local tree, following links, which fsspec does not."""
     for folder, folders, names in os.walk(root, followlinks=True):
         here = Path(folder).resolve()
-        # A link to a folder that contains it would never end.
+        # Skip links to a containing folder: they would never end.
         folders[:] = [n for n in folders if Path(folder, n).resolve() not in (here, *here.parents)]
         yield from (str(path) for name in names if (path := Path(folder, name)).is_file())
 
 
 def words(error: Exception) -> str:
-    """Say in one line what went wrong."""
+    """Return the text of an error on one line."""
     said = getattr(error, 'strerror', None) or ' '.join(str(error).split())
     return said or type(error).__name__
 
 
 def find_units(storage: Storage) -> list[FoundUnit]:
-    """Find the units by name; ThermoCompError where nothing can be listed or there is no bag."""
+    """Find the units by name; ThermoCompError if nothing can be listed or there is no bag."""
     bags = group_files(storage.files())
     if not bags:
         raise ThermoCompError(
@@ -135,7 +135,7 @@ def find_units(storage: Storage) -> list[FoundUnit]:
 
 
 def group_files(files: Sequence[StoredFile]) -> Bags:
-    """Put the files of a fleet together to bags, in the order of their names."""
+    """Group the files of a fleet into bags, in the order of their names."""
     by_folder: dict[str, list[StoredFile]] = defaultdict(list)
     for file in files:
         by_folder[_folder(file.name)].append(file)
@@ -150,7 +150,7 @@ def group_files(files: Sequence[StoredFile]) -> Bags:
 
 
 def _is_bag(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
-    """Whether a folder is a rosbag2 directory; one whose recorder was killed has no metadata."""
+    """Whether a folder is a rosbag2 directory, even without metadata (recorder killed)."""
     stems = [one.name.rpartition('.')[0].rpartition('_') for one in stored]
     own = f'{folder}/{folder.rpartition("/")[2]}'
     return any(one.name == f'{folder}/metadata.yaml' for one in inside) or all(
@@ -163,10 +163,10 @@ def _folder(name: str) -> str:
 
 
 def _serial(storage: Storage, name: str, files: Sequence[StoredFile]) -> str:
-    """Ask a bag that lies in the fleet's folder itself whose it is."""
+    """Read the serial from a bag directly in the fleet's folder."""
     try:
         with storage.here(name, files) as path, open_recording(path, require=()) as reader:
             return reader.info.metadata.get('serial') or storage.name
     except (RecordingError, OSError):
-        # Nobody knows whose it is: it becomes a unit of its own, which says what is wrong.
+        # Without a serial the bag becomes a unit, whose row shows the problem.
         return name

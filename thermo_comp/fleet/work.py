@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the work on a unit, its bags read and fitted, and the way of units onto Dask."""
+"""Owns the work on a unit (reading and fitting its bags), and its distribution by Dask."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def sha256(content: str | bytes) -> str:
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """What the user says of all units alike; serial and input unit are those of the bags."""
+    """Options for all units; serial and input unit come from the bags."""
 
     fit: FitOptions
     topics: Topics | None = None
@@ -44,7 +44,7 @@ class FleetOptions:
 
     @property
     def prior_sha256(self) -> str:
-        """Hash of the calibration that fits begin with; empty where there is none."""
+        """Hash of the prior of the fits; empty without a prior."""
         return '' if self.fit.prior is None else sha256(dump_calibration(self.fit.prior))
 
     def digest(self) -> str:
@@ -56,17 +56,17 @@ class FleetOptions:
 
 @dataclass(frozen=True)
 class UnitOutcome:
-    """What came out of one unit, small enough to travel."""
+    """The result of a unit, small enough to send."""
 
     row: dict[str, Cell]
     hashes: dict[str, str]  # of its bags
-    is_final: bool  # the same bags would give the same again; a failed file system may not
+    is_final: bool  # the same bags give the same result, unlike after a file system failure
     calibration: str = ''
     certificate: str = ''
 
 
 def _started_row(unit: FoundUnit, **known: Any) -> dict[str, Cell]:
-    """Make the row of a unit of which nothing is known but its files, and what is given."""
+    """Build the row of a unit from its files and the cells given."""
     started = {
         'name': unit.name,
         'serial': unit.name.rpartition('/')[2],
@@ -79,11 +79,11 @@ def _started_row(unit: FoundUnit, **known: Any) -> dict[str, Cell]:
 
 
 def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcome:
-    """Read and fit a unit; no bag stops it, no unit stops the fleet."""
+    """Read and fit a unit; a bad bag does not stop the unit, a bad unit not the fleet."""
     began = time.process_time()
     storage = Storage(url)
     hashes = dict.fromkeys(unit.bags, '')
-    # Of a bag its sufficient statistics are kept, some kilobytes per hour.
+    # Only the sufficient statistics of a bag are kept, some kilobytes per hour.
     bags: dict[str, ReducedBag] = {}
     problems = []
     is_final = True
@@ -94,8 +94,8 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
                 source, info = recording_source(path, options.topics, require=('accel', 'board'))
                 how = replace(options.fit, input=_UNIT_OF[info.input])
                 bags[name] = reduce_bag(replace(source, sha256=hashes[name]), how)
-        except RecordingError as error:  # noqa: PERF203 - no bag stops the others
-            # Named as the fleet does, wherever it lies.
+        except RecordingError as error:  # noqa: PERF203 - a bad bag does not stop the others
+            # Name the bag by its path in the fleet, not by that of a local copy.
             problems.append(': '.join(one for one in (name, error.key, error.message) if one))
             is_final = is_final and not isinstance(error.__cause__, OSError)
         except OSError as error:
@@ -139,7 +139,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
 def _fitted(
     row: dict[str, Cell], bags: Sequence[ReducedBag], how: FitOptions, has_page: bool
 ) -> tuple[dict[str, Cell], str, str]:
-    """Fit bags; give the whole row, the calibration and the certificate."""
+    """Fit bags; return the whole row, the calibration and the certificate."""
     from ..report.evidence import evidence_of_fit
     from ..report.page import render_report
 
@@ -160,15 +160,15 @@ def _fitted(
 
 
 def dask_setup(_worker: object) -> None:
-    """Keep a worker quiet: a preload of Dask."""
+    """Silence the log of a worker (preload of Dask)."""
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
 
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Leave Ctrl-C, which a terminal sends to all, to this process; answer it once all run."""
+    """Keep Ctrl-C, which a terminal sends to all processes, for this one; raise it afterwards."""
     heard: list[int] = []
-    # What the server of processes ignores they ignore, too.
+    # Processes inherit the ignored signal from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     forkserver.ensure_running()
     signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
@@ -182,12 +182,12 @@ def _uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def connected(scheduler: str | None = None, n_workers: int | None = None) -> Iterator[Any]:
-    """Give a client of a cluster: of one that runs, with workers of this version, or its own."""
+    """Yield a client of a running cluster with workers of this version, or of a local one."""
     import dask
     from distributed import Client
     from distributed.utils import get_mp_context
 
-    # What a worker does on its way down is in the fleet table, in words that its reader knows.
+    # The fleet table reports failures of workers; Dask's log is not needed.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     quiet = {
         'logging.distributed': 'critical',
@@ -211,7 +211,7 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
             client.wait_for_workers(1, timeout=_WAIT_S)
             said = f'a worker lacks thermo_comp {__version__}'
             versions = client.run(version)
-        except Exception as error:  # whatever an import fails with over there
+        except Exception as error:  # an import on a worker may raise any exception
             raise ThermoCompError(f'{scheduler}: {said}') from error
         for worker, found in versions.items():
             if found != __version__:
@@ -221,14 +221,14 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
 
 
 def version() -> str:
-    """Return the version of whoever is asked."""
+    """Return the version of the process that runs this."""
     return __version__
 
 
 def run(
     client: Any, url: str, units: Sequence[FoundUnit], options: FleetOptions
 ) -> Iterator[tuple[FoundUnit, UnitOutcome]]:
-    """Do units, and yield each as it is done; one whose task failed comes with the reason."""
+    """Process units and yield each when done; a failed task yields the reason."""
     from distributed import as_completed
 
     futures = client.map(process_unit, units, url=url, options=options, pure=False, batch_size=256)
@@ -242,7 +242,7 @@ def run(
 
 
 def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
-    """Take a task's result, or the words for what became of it: a failure to be done again."""
+    """Return a task's result, or the reason of its failure, which a later run repeats."""
     from distributed import KilledWorker
 
     if future.status == 'finished':
@@ -253,7 +253,7 @@ def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
         problem = 'the scheduler was lost'
     elif isinstance(error, KilledWorker):
         n_died = error.allowed_failures + 1
-        problem = f'its worker died {n_died} times at it: too little memory?'
+        problem = f'its worker died {n_died} times: too little memory?'
     else:
         problem = f'{type(error).__name__}: {words(error)}'
     return UnitOutcome(_started_row(unit, verdict=FAILED, problem=problem), {}, is_final=False)

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the judgement of a calibration against recordings: one judge, for every command."""
+"""Owns the judgement of a calibration on recordings, which every command uses."""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the way from recordings, each read once, to a judgement; the history of a unit."""
+"""Owns the evaluation of recordings, each read once, and the history of a unit."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from ..unit.prediction import in_a_soak
 from .judgement import Judgement, judge
 from .windows import WINDOW_S, corrected_windows, sum_length
 
-# A unit at rest scatters by no more than this many times what its calibration says of its noise.
+# Largest scatter of a unit at rest / noise that its calibration states.
 _NOISES = 4.0
-# A change must be this sure to be called one.
+# Smallest significant change, in standard deviations.
 _SURE_SDS = 3.0
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What recordings tell of calibrations, by name; the notes say what was not judged."""
+    """Judgements of calibrations, by name; the notes list the recordings that were not judged."""
 
     bags: tuple[ReducedBag, ...]
     judgements: dict[str, Judgement]
@@ -51,8 +51,9 @@ def open_bags(
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
     """
-    Read bags for windows of `window_s`, as the first calibration says, else as usual;
-    RecordingError if one cannot be read, or has no board temperature where it needs one.
+    Read bags for windows of `window_s`, with topics and limits of the first calibration if any.
+
+    Raises RecordingError if a bag cannot be read, or lacks a board temperature that is needed.
     """
     require: tuple[Role, ...] = ('board',)
     known: dict[str, Any] = {}
@@ -62,23 +63,23 @@ def open_bags(
         density = max(calibrations[0].noise_density_m_s2_sqrt_hz) / STANDARD_GRAVITY
         noise = _NOISES / np.sqrt(unit.cycle_time_s) * density
         known = {'full_scale': unit.full_scale, 'still_sd': max(STILL_SD, noise)}
-    found: list[ReducedBag] = []
+    bags: list[ReducedBag] = []
     for path in paths:
 
-        def told(part: float) -> None:
-            progress((len(found) + part) / len(paths))
+        def report(part: float) -> None:
+            progress((len(bags) + part) / len(paths))
 
-        source, info = recording_source(path, topics, require=require, progress=told)
+        source, info = recording_source(path, topics, require=require, progress=report)
         usual = {'full_scale': None if info.input == 'imu' else COUNTS_FULL_SCALE}
         source = replace(source, sha256=digest(Path(path)))
-        for other, twin in zip(found, paths, strict=False):
+        for other, twin in zip(bags, paths, strict=False):
             if other.source.sha256 == source.sha256:
                 raise RecordingError(f'is {twin} once more, and nothing may count twice', path)
         bag = reduce_source(source, window_s=sum_length(window_s), **(usual | known))
         if 'board' in require and not len(bag.board.value):
             raise RecordingError('no board temperature in it', path=str(path))
-        found.append(bag)
-    return found
+        bags.append(bag)
+    return bags
 
 
 def judge_bags(
@@ -89,7 +90,7 @@ def judge_bags(
     window_s: float = WINDOW_S,
     tolerance: float | None = None,
 ) -> Judgement | None:
-    """Judge a calibration on reduced bags; None where no window was corrected."""
+    """Judge a calibration on reduced bags; None if no window was corrected."""
     windows = corrected_windows(bags, calibration, gravity=gravity, window_s=window_s)
     known = {source.sha256 for source in calibration.provenance.sources if source.sha256}
     is_seen = all(bag.source.sha256 in known for bag in bags)
@@ -108,20 +109,20 @@ def evaluate(
     progress: Callable[[float], None] = lambda _: None,
 ) -> Evaluation:
     """
-    Judge one or more calibrations of a unit, given with their names, on its recordings.
+    Judge calibrations of a unit, given with their names, on its recordings.
 
-    Local gravity and what is read are those of the first calibration by default; `tolerance` is
-    the largest RMS that is accepted [m/s^2]; of `serial` see `replay.check_unit`.
+    Local gravity and topics default to those of the first calibration; `tolerance` is the largest
+    accepted RMS [m/s^2]; for `serial` see `replay.check_unit`.
 
-    Raises RecordingError if one cannot be read, or none rests for a window; CalibrationError if a
-    calibration is for another unit.
+    Raises RecordingError if a recording cannot be read, or none has a window at rest;
+    CalibrationError if a calibration is for another unit.
     """
-    models = [one for _, one in calibrations]
+    models = [model for _, model in calibrations]
     gravity = models[0].gravity_m_s2 if gravity is None else gravity
     bags = open_bags(paths, models, topics=topics, window_s=window_s, progress=progress)
     for bag in bags:
-        for one in models:
-            check_unit(one, bag.info, serial)
+        for model in models:
+            check_unit(model, bag.info, serial)
     judgements = {}
     for name, calibration in calibrations:
         judgement = judge_bags(
@@ -145,8 +146,8 @@ def evaluate(
 @dataclass(frozen=True)
 class Epoch:
     """
-    One calibration of a history, in a soak at the reference temperature of the first: bias of x y
-    z [ug], scale [ppm of the first one], shape (6,); an sd that nobody claims is NaN.
+    A calibration of a history, in a soak at the reference temperature of the first: bias of x, y,
+    z [ug], change of scale since the first [ppm], shape (6,); an unknown sd is NaN.
     """
 
     created: str
@@ -156,7 +157,7 @@ class Epoch:
 
 @dataclass(frozen=True)
 class Drift:
-    """What one constant changed by between two calibrations; sure beyond three sd."""
+    """The change of a constant between two calibrations; significant beyond three sd."""
 
     earlier: str
     later: str
@@ -167,14 +168,14 @@ class Drift:
 
     @property
     def is_sure(self) -> bool:
-        """Whether it is more than what both calibrations leave open."""
+        """Whether the change is significant given the uncertainty of both calibrations."""
         return abs(self.change) > _SURE_SDS * self.sd
 
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
-    Put calibrations of the first one's unit in the order of their dates; of those that were fitted
-    on the same bags the first counts: two models are no history.
+    Sort the calibrations of the first one's unit by date; of calibrations fitted on the same bags
+    only the first counts, as two models are no history.
     """
     known: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []
@@ -197,7 +198,7 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
 
 
 def drifts_of(history: Sequence[Epoch]) -> list[Drift]:
-    """List what changed from each calibration to the next, as if both knew nothing in common."""
+    """List the changes from each calibration to the next, with independent errors assumed."""
     return [
         Drift(
             earlier=before.created,

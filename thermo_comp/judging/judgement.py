@@ -21,19 +21,19 @@ from . import verdicts
 from .verdicts import Section, Sections, Verdict
 from .windows import Windows, means_by
 
-# Nor does it promise much above 1 mg.
+# Claimed sd above which a valid calibration is called wide [m/s^2].
 _WIDE_CLAIM = 1e3 * MICRO_G
-# A shift must be this sure to be called one.
+# Smallest significant shift, in standard deviations.
 _SURE_SDS = 3.0
-# Nobody knows a misalignment better than this [rad], nor the mean of a position [1].
-_SMALLEST_SKEW, _SMALLEST_MISS = 1e-5, 1e-8
-# What temperature leaves is alike in windows that follow each other, some so many.
+# Smallest sd assumed for a misalignment [rad], and for the mean of a position [1].
+_SMALLEST_MISALIGNMENT_SD, _SMALLEST_MISS = 1e-5, 1e-8
+# Number of consecutive windows over which thermal residuals are correlated.
 _ALIKE = 6.0
 
 
 @dataclass(frozen=True)
 class AxisShift:
-    """What an axis has moved by: bias [m/s^2], relative scale; the sds hold what was claimed."""
+    """Shift of an axis: bias [m/s^2], relative scale; the sds include the claimed error."""
 
     bias: float
     bias_sd: float
@@ -44,12 +44,12 @@ class AxisShift:
 @dataclass(frozen=True)
 class Judgement:
     """
-    What recordings tell of a calibration: the verdict, and one sentence of its numbers.
+    The judgement of a calibration on recordings: the verdict, and a sentence with its numbers.
 
-    `left_out_rms` is, of windows that the fit has seen, what it left on positions left out, else
-    NaN; `tolerance` the user's limit [m/s^2]. Shifts are per axis, none with fewer than six
-    distinct positions; `moved` says those that are sure. For `axis_rms` see `rms_by_axis`. The
-    gyroscope is judged apart, where there is one.
+    `left_out_rms` is the fit's RMS on positions left out, NaN if the bags are not those of the
+    fit; `tolerance` is the user's limit [m/s^2]. `shifts` are per axis, empty with fewer than six
+    distinct positions; `moved` lists the significant ones. For `axis_rms` see `rms_by_axis`. A
+    gyroscope is judged separately.
     """
 
     kind: Verdict
@@ -77,7 +77,7 @@ class Judgement:
 
     @property
     def headline_rms(self) -> float:
-        """RMS of what a new attitude will see: left out of the fit, or of bags it has not seen."""
+        """RMS expected in a new attitude: on positions left out, or on bags that the fit lacks."""
         in_sample = self.sections['all'].rms
         return self.left_out_rms if np.isfinite(self.left_out_rms) else in_sample
 
@@ -89,11 +89,11 @@ class Judgement:
         return str(self.kind.value)
 
     def __str__(self) -> str:
-        """Give the verdict with its numbers, as every command prints it."""
+        """Return the verdict with its numbers, as every command prints it."""
         return f'{self.verdict}: {self.reason}'
 
     def facts(self) -> dict[str, Any]:
-        """Give everything but the windows, as every command's JSON holds it."""
+        """Return everything except the windows, as in every command's JSON."""
         return {
             'verdict': self.verdict,
             'reason': self.reason,
@@ -119,8 +119,8 @@ def judge(
     is_seen: bool = False,
 ) -> Judgement:
     """
-    Judge a calibration by its windows, those that its fit has seen by what it left on positions
-    left out; a `tolerance` on the RMS [m/s^2] decides where given.
+    Judge a calibration by its windows; windows of the fit's bags (`is_seen`) by the RMS on
+    positions left out. A `tolerance` on the RMS [m/s^2] decides if given.
     """
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)
@@ -152,7 +152,7 @@ def _verdict(found: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict,
         return Verdict.OUTSIDE, said
     worst = max([s.rms for s in sections.regimes or [one]] + [found.headline_rms])
     ratio = sections.worst_ratio
-    # A NaN of no claim compares false.
+    # Without a claim the value is NaN, and the comparison false.
     is_wide = one.claimed_rms > (tolerance or min(verdicts.WIDE_PART * one.raw_rms, _WIDE_CLAIM))
     if windows.is_swapped.any():
         kind = Verdict.SWAPPED
@@ -175,7 +175,7 @@ def _verdict(found: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict,
     elif claims:
         says.append(f'largest ratio of a regime {ratio:.2g}, limit {verdicts.LARGEST_RATIO:g}')
     else:
-        says.append('the calibration says nothing of its uncertainty: give a tolerance')
+        says.append('the calibration states no uncertainty: give a tolerance')
     if kind is Verdict.SWAPPED:
         says.insert(0, SWAPPED)
     if found.moved:
@@ -200,7 +200,7 @@ def _windows(n: int, windows: Windows) -> str:
 
 
 def distinct_positions(windows: Windows) -> int:
-    """Count the directions that differ by more than five degrees."""
+    """Count the directions that are more than five degrees apart."""
     means = means_by(windows.position, windows.force)
     return len(distinct_directions(means / np.linalg.norm(means, axis=1, keepdims=True)))
 
@@ -210,7 +210,7 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     if distinct_positions(windows) < POSITIONS_NEEDED:
         return ()
     gravity = windows.gravity
-    # Where a calibration claims little, as while its lags are unknown, it is asked little.
+    # Windows with a large claimed sd, as while the lags are unknown, have a small weight.
     weight = 1.0 / np.maximum(windows.claimed_sd, _SMALLEST_MISS) ** 2
     known = means_by(windows.position, weight)
     force = means_by(windows.position, windows.force * weight[:, None]) / known[:, None] / gravity
@@ -219,13 +219,15 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     count = np.unique(windows.position, return_counts=True)[1]
     variance = 1.0 / known + scatter / np.maximum(count / _ALIKE, 1.0)
     sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)) / gravity, _SMALLEST_MISS)
-    # Linear in shifts, as small as they are: of the norms, and of a misalignment that is known.
+    # Linear in the small shifts: equations of the norms, and of the misalignment's prior.
     sizes = np.linalg.norm(force, axis=1)
     seen = norm_columns(force / sizes[:, None]) / sd[:, None]
-    seen = np.vstack((seen, np.eye(9)[6:] / np.maximum(misalignment_sd, _SMALLEST_SKEW)[:, None]))
+    seen = np.vstack(
+        (seen, np.eye(9)[6:] / np.maximum(misalignment_sd, _SMALLEST_MISALIGNMENT_SD)[:, None])
+    )
     misses = np.concatenate(((sizes - 1.0) / sd, np.zeros(3)))
     found = np.linalg.lstsq(seen, misses, rcond=None)[0]
-    # What the constants leave unexplained makes them less sure.
+    # Residuals in excess of the claimed errors increase the sd of the shifts.
     freedom, left = len(sd) - 6, float(np.sum((misses - seen @ found) ** 2))
     excess = max(1.0, left / freedom) if freedom > 0 else 1.0
     spread = np.sqrt(np.diag(np.linalg.pinv(seen.T @ seen)) * excess)
@@ -234,7 +236,7 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
 
 
 def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
-    """Name the shifts that are sure, as in ``z bias +12 +- 3 ug``."""
+    """Name the significant shifts, as in ``z bias +12 +- 3 ug``."""
     said = []
     for axis, shift in zip('xyz', shifts, strict=False):
         for name, value, sd, unit in (
@@ -247,7 +249,7 @@ def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
 
 
 def rms_by_axis(windows: Windows) -> Floats:
-    """Give the RMS of each axis about its mean in a position, static and dynamic, shape (2, 3)."""
+    """Return the RMS of each axis about its position's mean, static and dynamic, shape (2, 3)."""
     about = within_positions(windows.force, windows.position)
     return np.array(
         [

@@ -19,11 +19,11 @@ from ..unit.rate_bias import MILLIDEGREE
 from ..unit.rate_triad import rate_triad
 from .windows import Windows, means_by
 
-#: A calibration holds while its error is within this many times what it claims.
+#: Largest ratio of RMS error to claimed RMS at which a calibration holds.
 LARGEST_RATIO = 2.0
-#: A claim promises little if it is not below this part of the raw error.
+#: Ratio of claimed RMS to raw RMS above which a valid calibration is called wide.
 WIDE_PART = 0.5
-# Fewer windows of a regime are judged with the others only.
+# Smallest number of windows of a regime that is judged separately.
 _FEWEST = 6
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
@@ -49,10 +49,10 @@ class Verdict(Enum):
 @dataclass(frozen=True)
 class Section:
     """
-    What `n` windows of one section leave: ``|f| - g`` [m/s^2], or changes of the rate [rad/s].
+    Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or changes of the rate [rad/s].
 
-    Raw is by the constants at the reference temperature, the others by the calibration;
-    `claimed_rms` is the RMS of what is claimed for the same windows, NaN where nothing is.
+    `raw` values use the constants at the reference temperature, the others the calibration;
+    `claimed_rms` is the RMS of the claimed sd of the same windows, NaN without a claim.
     """
 
     n: int
@@ -74,7 +74,7 @@ class Sections(dict[str, Section]):
 
     @property
     def regimes(self) -> list[Section]:
-        """The regimes with enough windows to be judged by themselves."""
+        """The regimes with enough windows to be judged separately."""
         return [one for one in (self['static'], self['dynamic']) if one.n >= _FEWEST]
 
     @property
@@ -83,7 +83,7 @@ class Sections(dict[str, Section]):
         return max(one.ratio for one in (*self.regimes, self['all']))
 
     def facts(self) -> dict[str, Any]:
-        """Give everything, as JSON holds it."""
+        """Return everything, as in JSON."""
         return {name: {**asdict(one), 'ratio': one.ratio} for name, one in self.items()}
 
 
@@ -105,18 +105,18 @@ def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats
 
 @dataclass(frozen=True)
 class RateJudgement:
-    """What recordings tell of a gyroscope: sections of the changes of all axes, in rad/s."""
+    """The judgement of a gyroscope: sections of the changes of all axes [rad/s]."""
 
     kind: Verdict
     reason: str
     sections: Sections
 
     def __str__(self) -> str:
-        """Give the verdict with its numbers, as every command prints it."""
+        """Return the verdict with its numbers, as every command prints it."""
         return f'angular rate: {self.kind.value}: {self.reason}'
 
     def facts(self) -> dict[str, Any]:
-        """Give everything, as every command's JSON holds it."""
+        """Return everything, as in every command's JSON."""
         return {
             'verdict': self.kind.value,
             'reason': self.reason,
@@ -127,16 +127,16 @@ class RateJudgement:
 
 def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | None:
     """
-    Judge a gyroscope by the windows of bags; None without one, or without its rate.
+    Judge a gyroscope by the windows of bags; None without a gyroscope or an angular rate.
 
-    At rest it reads the Earth's rate and what its turn-on has left, which nobody knows: judged are
-    the changes from the mean of each rest, by what is claimed for the very same changes.
+    At rest a gyroscope reads the Earth's rate and its turn-on bias, both unknown. Therefore the
+    changes from the mean of each rest are judged, against the sd claimed for these changes.
     """
     windows = windows.select(np.asarray(np.isfinite(windows.gyro[:, :6]).all(axis=1)))
     if not windows.gyro.size:
         return None
     raw, corrected, variance = (windows.gyro[:, k : k + 3] for k in (0, 3, 6))
-    # What lies outside the ranges is held against the rest's mean inside them, if there is one.
+    # Windows outside the ranges are compared with the mean of the windows inside, if any.
     _, place = np.unique(windows.position, return_inverse=True)
     has_inside = np.bincount(place, windows.is_inside) > 0.0
     weight = np.where(has_inside[place], windows.is_inside, 1.0)
@@ -148,16 +148,16 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
     triad = rate_triad(calibration)
     claims, claimed = triad.has_uncertainty, np.full_like(corrected, np.nan)
     if claims:
-        # What is claimed for the changes, from what is for the rate of one message.
+        # The claimed variance of the changes, from that of the rate of one message.
         correction = Correction(triad, Correction(calibration).memory)
         whole, away = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
         slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
-        # Of the thermometers' noise, and of lags that started unseen, a rest's mean has little.
+        # The errors by thermometer noise and unseen starts of lags nearly vanish in a rest's mean.
         rest = np.maximum(variance - np.array(correction.noise) - slow - whole, 0.0)
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
         hours = counts[:, None] * windows.window_s / 3600.0
-        # A walk strays from its mean over a time by a sixth of what it gains in that time.
+        # Variance of a random walk about its mean over a time: 1/6 of the variance gained in it.
         walk = np.square(triad.slow_noise_m_s2_sqrt_h) * hours / 6.0
         claimed = np.sqrt(rest + away + noise + walk)
     changes = np.stack((raw - mean_of(raw), corrected - mean_of(corrected), claimed))
@@ -175,13 +175,13 @@ def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict
     over = f'over {one.n} windows of {window_s:g} s'
     if not claims:
         kind = Verdict.NO_BETTER if one.rms > one.raw_rms else Verdict.NO_CLAIM
-        return kind, f'{said} {over}; the calibration says nothing of its uncertainty'
+        return kind, f'{said} {over}; the calibration states no uncertainty'
     ratio = sections.worst_ratio
     said = (
         f'{said}, {_mdeg(one.claimed_rms)} claimed {over}; '
         f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
     )
-    # Where no temperature changes, nothing is corrected: that is no fault.
+    # At constant temperature the correction is constant, so equal to raw is no fault.
     if ratio > LARGEST_RATIO:
         return Verdict.NO_BETTER if one.rms >= one.raw_rms else Verdict.RECALIBRATE, said
     return Verdict.WIDE if one.claimed_rms > WIDE_PART * one.raw_rms else Verdict.VALID, said

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the windows that a judgement rests on: means at rest, corrected as the node would."""
+"""Owns the windows of a judgement: means at rest, corrected as in the node."""
 
 from __future__ import annotations
 
@@ -27,28 +27,27 @@ from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
 from ..unit.metrics import norm_residual
 
-#: Length of a window unless the user says otherwise [s].
+#: Default length of a window [s].
 WINDOW_S = 60.0
-# Less than this beyond a calibrated range, in half ranges, is its edge: thermometers have noise.
+# Distance outside a calibrated range that still counts as inside, in half ranges: noise.
 _EDGE = 0.02
-# A sum of fewer than this part of the usual samples does not last as long.
+# Smallest number of samples of a partial sum / median number.
 _LEAST_FILLED = 0.9
 
 
 @dataclass(frozen=True)
 class Windows:
     """
-    Windows at rest, of all bags, in order; arrays of n rows, which are all that is kept of a bag.
+    Windows at rest of all bags, in order; arrays of n rows.
 
-    Each is exactly `window_s` long, from `start_ns` on; `time` is its middle since the bag's first
-    sample [s], `count` and `mean` are of its raw samples. A position is a still interval, counted
-    through all bags. The rate is the board's [K/s]. Dynamic are those in which the dynamic set
-    prevails, inside those that lie inside the calibrated ranges as a whole, swapped those in which
-    the board leads the case. `raw` is the specific force by the constants at the reference
-    temperature, `force` that by the calibration, shapes (n, 3); `claimed_sd` is claimed for the
-    norm of `force`: the calibration's error and the white noise of the mean, which is `noise_sd`
-    alone. `gyro` has rows of the angular rate, raw and corrected, its claimed variances, and the
-    thermal state; empty without a gyroscope.
+    A window lasts exactly `window_s` from `start_ns`; `time` is its middle since the bag's first
+    sample [s], `count` and `mean` are of its raw samples. A position is a still interval, numbered
+    through all bags. `rate` is the board's [K/s]. `is_dynamic`: the dynamic set has more than half
+    the weight; `is_inside`: entirely inside the calibrated ranges; `is_swapped`: the board leads
+    the case. `raw` is the specific force by the constants at the reference temperature, `force`
+    by the calibration, shapes (n, 3). `claimed_sd` of the norm of `force`: the calibration's error
+    and the white noise of the mean; `noise_sd`: the white noise alone. Rows of `gyro`: angular
+    rate raw and corrected, its claimed variances, the thermal state; empty without a gyroscope.
     """
 
     window_s: float
@@ -71,13 +70,12 @@ class Windows:
     gyro: Floats
 
     def __len__(self) -> int:
-        """Count the windows."""
+        """Return the number of windows."""
         return len(self.time)
 
     def select(self, rows: Bools) -> Windows:
-        """Keep some of the windows."""
-        # All but the first two, length and gravity.
-        kept = {one.name: getattr(self, one.name)[rows] for one in fields(self)[2:]}
+        """Return the windows of some rows; all fields but length and gravity are arrays."""
+        kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[2:]}
         return replace(self, **kept)
 
     @cached_property
@@ -97,7 +95,7 @@ def sum_length(window_s: float) -> float:
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Choose the length [s] of the windows of a fit's bags: 60 s, or what next their sums fill."""
+    """Choose the window length [s] for a fit's bags: the next multiple of their sums from 60 s."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 
@@ -110,8 +108,8 @@ def corrected_windows(
     window_s: float = WINDOW_S,
 ) -> Windows:
     """
-    Correct the windows of bags, without a calibration not at all; RecordingError if the samples
-    are too slow for such windows.
+    Build the windows of bags, corrected if there is a calibration; RecordingError if the samples
+    are too slow for windows of this length.
     """
     table = _table(bags, calibration, window_s)
     raw, claimed_sd, noise_sd = table['mean'], *np.full((2, len(table)), np.nan)
@@ -121,7 +119,7 @@ def corrected_windows(
         raw = constants.force(raw)
         along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
         noise = along**2 @ np.array(Correction(calibration).noise)
-        # Of a message's noise the rounding is carried on to the next: a mean has none of it.
+        # The converter carries the rounding error to the next sample, so a mean has none.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
         mean_white = white / (calibration.unit.cycle_time_s * table['count'])
         claimed_sd = np.sqrt(np.maximum(table['variance'] - noise, 0.0) + mean_white)
@@ -140,7 +138,7 @@ def corrected_windows(
 
 
 def columns_of(windows: Windows, bags: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
-    """Give the columns of a table of windows."""
+    """Return the columns of a table of windows."""
     force = windows.force.T
     return {
         'bag': np.array(bags, dtype=object)[windows.bag],
@@ -161,7 +159,7 @@ def columns_of(windows: Windows, bags: Sequence[str]) -> dict[str, npt.NDArray[A
 
 
 def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floats:
-    """Average rows that have the same label, in the order of the labels."""
+    """Average the rows of each label, in the order of the labels."""
     weight = np.ones(len(labels)) if weight is None else weight
     _, place = np.unique(labels, return_inverse=True)
     count = np.bincount(place, weight)
@@ -170,16 +168,16 @@ def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floa
     return np.asarray((total.T / count).T)
 
 
-# Sums, and then windows, in rows with names.
+# A structured array of partial sums or windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# What is there once for a window, all else but `excess` is averaged over its sums.
+# Fields that a window has once; the others except `excess` are averaged over its sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped')
 _TRIPLES = ('mean', 'force')
 
 
 def _table(bags: Sequence[ReducedBag], calibration: Calibration | None, window_s: float) -> _Table:
-    """Put the sums of bags together to windows, a row each."""
+    """Combine the partial sums of bags into windows, one per row."""
     n_gyro = 0
     if calibration is not None and calibration.gyroscope is not None:
         n_gyro = 9 + Layout(Correction(calibration).memory).width
@@ -219,7 +217,7 @@ def _table(bags: Sequence[ReducedBag], calibration: Calibration | None, window_s
             whole['force'] = whole['mean']
         else:
             _correct(calibration, bag, whole)
-        # Messages were lost, or the bag ends within it.
+        # Drop sums with lost messages, or cut by the end of the bag.
         few = _LEAST_FILLED * np.median(whole['count']) if len(whole) else 0.0
         whole['excess'][whole['count'] < few] = np.nan
         parts.append(_joined(whole.reshape(-1, per)))
@@ -227,7 +225,7 @@ def _table(bags: Sequence[ReducedBag], calibration: Calibration | None, window_s
 
 
 def _joined(sums: _Table) -> _Table:
-    """Join the sums of each row to a window; out are those that were not corrected as a whole."""
+    """Join the sums of each row to a window; drop windows that were not entirely corrected."""
     result = sums[:, 0].copy()
     result['count'] = sums['count'].sum(axis=1)
     result['excess'] = sums['excess'].max(axis=1)
@@ -238,8 +236,8 @@ def _joined(sums: _Table) -> _Table:
 
 
 def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
-    """Run sums through the compensator, with the readings that came before each."""
-    # A window's mean is no sample: what looks for stuck or too large ones would misread it.
+    """Run the sums through the compensator, with the readings before each."""
+    # The checks for stuck samples and gravity do not apply to a mean.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
     thermal = compensator.thermal

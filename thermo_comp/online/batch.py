@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the batch form of the compensator: whole columns at once, with the stream's bits.
+Owns the batch form of the compensator: whole arrays at once, with the bits of the stream.
 
-The readings run through the compensator's own gate one by one; only what it says of each segment
-is gathered, evaluated for all segments together and applied to all samples by the same arithmetic.
+The compensator takes the readings one by one. Its segments are collected, evaluated together and
+applied to all samples with the arithmetic of the stream.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
 
-#: Readings yet to come, the next one last: samples before it, the latest stamp of its thermometer
-#: so far, its name, its stamp, degC.
+#: Future readings, the next one last: number of samples before it, latest stamp of its thermometer
+#: so far, thermometer, stamp, degC.
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
-#: Each with the number of its samples.
+#: Segments, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
-#: Why a sample does not go out, 0 where it does.
+#: Code of the reason for which a sample is dropped; 0 is a published sample.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
 _TOO_FAST, _REFUTED = _REASONS['n_too_fast'], _REASONS['n_refuted']
-PIECE: Final = 4096  # samples corrected at a time: their columns stay in the cache
-#: Values of `corrected` in the order of a block's columns: the covariance as a whole matrix.
+PIECE: Final = 4096  # samples corrected at a time, so that their arrays stay in the cache
+#: Indices in the result of `corrected`: force x, y, z, then the whole covariance matrix.
 _COLUMNS: Final = (0, 1, 2, 3, 4, 5, 4, 6, 7, 5, 7, 8)
-#: Rows of these that are specific force x, y, z and covariance xx, xy, xz, yy, yz, zz.
+#: The rows of `_COLUMNS` that are force x, y, z and covariance xx, xy, xz, yy, yz, zz.
 _SAMPLE = [0, 1, 2, 3, 4, 5, 7, 8, 11]
 
 
@@ -42,11 +42,11 @@ _SAMPLE = [0, 1, 2, 3, 4, 5, 7, 8, 11]
 class CompensatedBlock:
     """The published samples of a block."""
 
-    index: Ints  # which samples of the block these are, shape (n,)
+    index: Ints  # indices of these samples in the block, shape (n,)
     stamp_ns: Stamps
     specific_force: Floats  # [m/s^2], shape (n, 3)
     covariance: Floats  # row-major 3x3 [m^2/s^4], shape (n, 9)
-    #: [rad/s], and variances [rad^2/s^2], shape (n, 3), where a rate is given and corrected.
+    #: [rad/s], and variances [rad^2/s^2], shape (n, 3); None unless a rate is given and corrected.
     angular_rate: Floats | None = None
     angular_rate_variance: Floats | None = None
 
@@ -89,7 +89,7 @@ def process_block(
 
 
 def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list[Ints]:
-    """Find the samples that are in order, in runs between which time jumps back."""
+    """Find the samples that are in order, split into runs where time jumps back."""
     before_ns, leap_ns = compensator.last_ns, compensator.leap_ns
     steps = np.diff(stamps, prepend=stamps[:1] if before_ns == EVER_NS else before_ns)
     is_plain = compensator.leapt_ns is None and (steps[before_ns == EVER_NS :] > 0).all()
@@ -117,12 +117,12 @@ def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list
 def _push(
     compensator: Compensator, arrivals: _Arrivals, place: int, due_ns: int = EVER_NS
 ) -> None:
-    """Queue readings up to a place, the next sample of which is stamped so, if it is known."""
+    """Queue the readings before sample number `place`, whose stamp is `due_ns` if known."""
     thermal = compensator.thermal
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # They take effect meanwhile in a node that waits for a sample; for the first, all do.
+            # Like a node that waits for a sample, let them take effect; all of them for the first.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -131,7 +131,7 @@ def _push(
 def _gather(
     compensator: Compensator, arrivals: _Arrivals, index: Ints, stamps: Stamps
 ) -> tuple[Segments, Ints]:
-    """Cut into segments between readings, with their numbers of samples; and which those are."""
+    """Cut samples into segments between readings; return segments and sample indices."""
     thermal, counters = compensator.thermal, compensator.counters
     n_seen = counters.n_in - counters.n_out_of_order
     segments: Segments = []
@@ -171,7 +171,7 @@ def _apply(
     samples: Floats,
     angular_rate: Floats | None,
 ) -> CompensatedBlock:
-    """Correct the samples of segments, and keep those that are published."""
+    """Correct the samples of segments; return the published samples."""
     correction, of_rate = compensator.thermal.correction, compensator.thermal.rate_correction
     line = rate_line = np.empty((21, 0))
     if segments:
@@ -203,7 +203,7 @@ def _apply(
 
 
 def _line(correction: Correction, segments: Segments, part: slice) -> Floats:
-    """Evaluate the lines of segments, with their part of what changes slowly, (21, n)."""
+    """Evaluate the lines of segments, with `part` of their slow variance, shape (21, n)."""
     each = [segment for segment, _ in segments]
     start, end, slow = (np.array([one[at] for one in each]).T for at in (4, 5, 6))
     excess = np.array([one.noise_excess for one in each])
@@ -217,14 +217,14 @@ def _corrected(
     samples: Floats,
     misalignment: tuple[float, ...] | None = None,
 ) -> Floats:
-    """Give force and row-major covariance (12, n) of segments; or rates and variances (6, n)."""
+    """Return force and row-major covariance (12, n) of segments; or rates and variances (6, n)."""
     each = [segment for segment, _ in segments]
     start_ns = np.array([one.start_ns for one in each], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
     order = range(6) if misalignment is None else _COLUMNS
     n = len(stamps)
     result = np.empty((len(order), n))
-    # What is not finite is corrected like the rest; whoever asked leaves it out.
+    # Samples that are not finite are corrected like the rest; the caller drops them.
     with np.errstate(invalid='ignore', over='ignore'):
         for begin in range(0, n, PIECE):
             stop = min(begin + PIECE, n)
@@ -247,7 +247,7 @@ def _corrected(
 def _judge(
     compensator: Compensator, segments: Segments, stamps: Stamps, samples: Floats, force: Floats
 ) -> Bools:
-    """Leave out what the stream would not publish, and count why."""
+    """Mark the samples that the stream would publish; count the reasons of the others."""
     reasons = np.zeros(len(stamps), dtype=np.int8)
     reasons[compensator.stuck.find(stamps, samples)] = _REASONS['n_stuck']
     is_large = ~(np.abs(samples) < compensator.calibration.unit.full_scale).all(axis=1)
@@ -261,7 +261,7 @@ def _judge(
     looks = zip(segments, first.tolist(), stamps[first].tolist(), rows, strict=True)
     held = _REFUTED if compensator.is_refusing else 0
     for (segment, count), begin, stamp_ns, row in looks:
-        # The first sample of a new segment is looked at even where it does not go out.
+        # The first sample of a new segment is checked even if it is not published.
         is_bad = bool(reasons[begin])
         if segment.is_too_fast:
             held = _TOO_FAST

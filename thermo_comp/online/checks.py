@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what physics says about samples: a converter that stands still, samples that come faster than
-conversions can, and |f| while the platform stands, which must be gravity.
+Owns the plausibility checks of samples: a stuck converter, samples faster than conversions can be,
+and |f| at rest, which must be gravity.
 
-A converter with noise does not give three numbers to the bit for seconds; three exact zeros are a
-dead wire. A count is charge per cycle, so at another rate it is of another scale. A calibration
-that has aged, or of another unit, misses gravity by more than its own uncertainty in windows of a
-second, or longer, which are still: scatter as the sensor's, mean as in the window before. What
-steps away at rest, and rests there, is no motion: it is judged within a second.
+A converter with noise does not repeat three numbers for seconds; three exact zeros are a dead
+wire. A count is charge per cycle, so its scale changes with the rate. An aged calibration, or that
+of another unit, misses gravity by more than its uncertainty in still windows (the scatter of the
+sensor, the mean of the previous window) of a second or longer. A step of |f| from one rest to
+another is no motion: it is judged within a second.
 """
 
 from __future__ import annotations
@@ -23,52 +23,52 @@ from ..thermal.reading_queue import NEVER_NS
 from ..typing import Bools, Floats, Ints
 from .status import GravityResidual
 
-#: Fewer equal samples in a row than this are chance, however far they lie apart.
+#: Smallest number of equal samples in a row that counts as stuck.
 STUCK_SAMPLES: Final = 50
-#: Samples may come this many times as fast as the calibrated cycle in the long run ...
+#: Largest long-term rate of samples / calibrated rate ...
 LARGEST_RATE: Final = 1.5
-#: ... with so many of them, or so many seconds' worth, at once (a driver that empties a buffer).
+#: ... plus a burst of this number of samples, or of this time's samples [s]: a driver's buffer.
 BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
-#: Samples this much faster than calibrated, relative, still have the calibrated noise.
+#: Relative excess of the rate up to which the calibrated noise holds.
 RATE_TOLERANCE: Final = 0.1
-_WINDOW_S: Final = 1.0  # a rate is measured over so many seconds
-#: Shortest window; it is longer where samples are few, up to the second figure.
+_WINDOW_S: Final = 1.0  # time over which the rate is measured [s]
+#: Shortest window [ns], and its longest extension if samples are few.
 WINDOW_NS: Final = 1_000_000_000
 LONGEST_WINDOW_NS: Final = 30_000_000_000
-PROBE_NS: Final = 90_000_000  # samples closer than this to the last one need not be added
-SMALLEST_WINDOW: Final = 5  # fewer samples than this make no window
-#: A still window scatters by at most this many times the noise of its samples...
+PROBE_NS: Final = 90_000_000  # shortest time between samples added to a window
+SMALLEST_WINDOW: Final = 5  # smallest number of samples in a window
+#: Largest scatter of a still window / noise of its samples.
 SCATTER_FACTOR: Final = 3.0
-#: ... and its mean differs from the last one's by noise and this [m/s^2]: half a milli-g.
+#: Largest change of the mean between two still windows, noise apart [m/s^2]: half a milli-g.
 LARGEST_CHANGE: Final = 5e-3
-#: Still windows averaged into one residual, the older with falling weight.
+#: Number of still windows averaged into one residual, with exponentially falling weight.
 MEMORY_WINDOWS: Final = 30.0
-#: So many still windows running refute a calibration; so many restore the trust in it.
+#: Number of consecutive still windows that refute a calibration, and that clear it again.
 REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
-#: Samples that lie off, as long as this, after one at rest from which they stepped [ns].
+#: Time at rest after a step of |f| from rest, after which the step is judged [ns].
 STEP_NS: Final = 300_000_000
-#: Beyond the tolerance, and beyond so many of its own standard deviations.
+#: A residual refutes beyond the tolerance and this number of its standard deviations.
 REFUTING_SIGMAS: Final = 5.0
 
 
 class StuckCheck:
-    """Counts equal samples in a row; beyond the time-out [s], if any, they are not believed."""
+    """Counts equal samples in a row; after the time-out [s] (0 = never) they count as stuck."""
 
     def __init__(self, timeout_s: float) -> None:
-        self.is_on = timeout_s > 0.0  # whether anything is watched
+        self.is_on = timeout_s > 0.0
         self.limit_ns = round(timeout_s * 1e9) if self.is_on else NEVER_NS
-        self.run = (math.nan, math.nan, math.nan, 0)  # what the run began with, its stamp
-        self.n_same = 0  # how often it has come again
+        self.run = (math.nan, math.nan, math.nan, 0)  # first sample of the run, and its stamp
+        self.n_same = 0  # number of repetitions of that sample
 
     def again(self, stamp_ns: int) -> bool:
-        """Count one more equal sample; say whether it is too many."""
+        """Count another equal sample; whether the samples are stuck."""
         self.n_same += 1
         return self.n_same >= STUCK_SAMPLES and stamp_ns - self.run[3] > self.limit_ns
 
     def find(self, stamps: Ints, samples: Floats) -> Bools:
-        """Find the samples (n > 0, 3) that the stream would call stuck, or three exact zeros."""
+        """Find the samples (n > 0, 3) that the stream drops as stuck or as three exact zeros."""
         n = len(stamps)
         x, y, z = samples.T
         same = np.empty(n, dtype=np.bool_)
@@ -100,20 +100,20 @@ class RateCheck:
     def __init__(self, cycle_s: float, counts_cycles: bool = True) -> None:
         self._cycle_s, self._counts_cycles = cycle_s, counts_cycles
         self._allowance = max(BURST_SAMPLES, BURST_S / cycle_s)
-        self.is_too_fast = False  # more samples have come than conversions can make
-        self.ratio = 1.0  # samples per calibrated cycle over the last second or so
+        self.is_too_fast = False  # more samples than conversions can make
+        self.ratio = 1.0  # samples per calibrated cycle over the last `_WINDOW_S`
         self._level = 0.0
         self._last: tuple[int, int] | None = None
         self._window = (0, 0)
 
     @property
     def noise_excess(self) -> float:
-        """What the rate adds to a sample's noise, relative to the calibrated cycle's."""
+        """Excess noise variance of a sample at this rate, relative to the calibrated variance."""
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def update(self, n_seen: int, stamp_ns: int) -> None:
-        """Take the count of samples, of different stamps, before a stamp."""
+        """Take the number of samples with different stamps before a stamp."""
         last = self._last
         self._last = (n_seen, stamp_ns)
         if last is None:
@@ -125,7 +125,7 @@ class RateCheck:
             self._level = 0.0
             self.is_too_fast = False
         else:
-            # Twice the allowance at most, so that a long excess is soon forgiven.
+            # Limited to twice the allowance, so that the alarm ends soon after a long excess.
             self._level = min(level, 2.0 * self._allowance)
             self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
@@ -143,32 +143,32 @@ def variance_along(force: Sequence[float], covariance: Sequence[float]) -> float
 
 
 class GravityCheck:
-    """Compares |f| with gravity, positive, over still windows; a tolerance of 0 is anything."""
+    """Compares |f| with gravity over still windows; with a tolerance of 0 nothing is refuted."""
 
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
-        self.is_refuted = False  # the last windows all missed it by more than the tolerance
+        self.is_refuted = False  # the last windows all missed gravity by more than the tolerance
         self._n_alike = 0
         self._is_against = False
         self._forces: list[Sequence[float]] = []
-        #: What came since |f| stepped away at rest: samples, and the stamp of the first.
+        #: Samples since |f| stepped away from rest, and the stamp of the first.
         self._off: list[Sequence[float]] = []
         self._off_ns = 0
-        self._is_resting = False  # the last sample was as the still window before it
+        self._is_resting = False  # the last sample agreed with the still window before it
         self._begin_ns = self._last_ns = 0
         self._last_mean: list[float] | None = None
         self._weight = 0.0
-        self.result: GravityResidual | None = None  # so far; None before the first still window
+        self.result: GravityResidual | None = None  # None before the first still window
 
     def wants(self, stamp_ns: int) -> bool:
-        """Say whether a sample is far enough from the last one to tell something new."""
+        """Whether enough time has passed since the last sample added."""
         return not 0 <= stamp_ns - self._last_ns < PROBE_NS
 
     def add(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Take a sample, its covariance xx .. zz, and the noise of one in the trace [m^2/s^4]."""
+        """Take a sample, its covariance xx .. zz, and the noise variance in its trace."""
         self._watch_step(stamp_ns, force, covariance, noise)
         if (
             not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS
@@ -187,12 +187,12 @@ class GravityCheck:
     def _watch_step(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Refute, before windows can, what has stepped away at rest and rests there."""
+        """Refute a step from rest to rest sooner than windows could."""
         rests = self.result and self.result.is_still and self._last_mean
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
             return
-        # Of two samples, as of means.
+        # Noise of the difference of two samples, as for means in `_close`.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
         was_resting, reference = (
             self._is_resting,
@@ -224,7 +224,7 @@ class GravityCheck:
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
         scatter = math.fsum(squares) / (n - 1)
         last, self._last_mean = self._last_mean, mean
-        # Two means of n samples differ by noise, too: at most four standard deviations of it.
+        # The means of two windows differ by noise, too: allow four standard deviations of it.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
         is_still = (
             scatter <= SCATTER_FACTOR**2 * noise_variance
@@ -239,7 +239,7 @@ class GravityCheck:
         noise = noise_variance / 3.0
         variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n
         if self._judge(abs(size - self.gravity), math.sqrt(variance)):
-            # What was before says nothing of what is.
+            # Earlier windows no longer describe the present state.
             self._weight = 0.0
         decay = 1.0 - 1.0 / MEMORY_WINDOWS
         self._weight = self._weight * decay + 1.0
@@ -250,7 +250,7 @@ class GravityCheck:
         self.result = GravityResidual(residual, sd, n + 1, is_still)
 
     def _judge(self, miss: float, sd: float) -> bool:
-        """Count windows that agree on a miss; tell whether this one does not with the last."""
+        """Count consecutive windows of equal verdict; True if the verdict has just changed."""
         was_against = self._is_against
         is_against = miss > self._tolerance + REFUTING_SIGMAS * sd
         self._n_alike = self._n_alike + 1 if is_against == self._is_against else 1

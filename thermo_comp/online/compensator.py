@@ -3,10 +3,10 @@
 """
 Owns (counts, temperatures) -> (specific force, covariance, regime, status), streaming and batch.
 
-A reading takes effect at the first sample whose stamp is not before its own and that comes after
-it: stamps and order of arrival tell the result, and a node that got everything in order publishes
-the bits of the offline replay. Each segment begins with a look at the rate of the samples and, by
-its first one, at |f| against gravity: the checks cost nothing per sample, and a batch agrees.
+A reading applies from the first later-arriving sample with an equal or later stamp, so stamps and
+order of arrival determine the output, and a node that received everything in order publishes the
+bits of the offline replay. The rate of the samples, and |f| against gravity, are checked at the
+first sample of each segment: the checks cost nothing per sample, and a batch gives the same.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from .checks import GravityCheck, StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
 
-#: A stamp that goes back by more than this is a jump of time (a bag that loops), not disorder.
+#: Backward step of the stamps from which it is a jump of time (a bag that loops) [ns].
 TIME_JUMP_NS: Final = 1_000_000_000
-#: A stamp further ahead of the last one than this, or than so many cycles, is believed when a
-#: reading, or a second sample, is stamped there, too: one damaged stamp would cost the memory.
+#: A forward step of the stamps above both limits ([ns], [cycles]) is accepted only if a reading or
+#: a second sample confirms it: a single damaged stamp would erase the memory.
 LEAP_NS: Final = 15_000_000_000
 LEAP_CYCLES: Final = 10.0
-#: The board temperature is called stale beyond this many of its usual intervals.
+#: Age of the board temperature at which it is stale, in its usual intervals, and at least [s].
 STALE_INTERVALS: Final = 5.0
-SHORTEST_STALE_S: Final = 0.5  # ... but never sooner than this [s]
-#: What is said of a status, live and offline.
+SHORTEST_STALE_S: Final = 0.5
+#: Texts about a status, for diagnostics and offline reports.
 SWAPPED: Final = (
     'the board leads the case in ramps: are temperature/board and temperature/case swapped, or is '
     'it heated from inside?'
@@ -49,36 +49,36 @@ CONTINUED: Final = (
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]
-Real = TypeVar('Real', float, Floats)  # one sample's, or those of many
+Real = TypeVar('Real', float, Floats)  # the value of one sample, or an array of many
 
 
 @dataclass(frozen=True, slots=True)
 class CompensatorStatus:
-    """How a compensator stands at the stamp of its last sample."""
+    """State of a compensator at the stamp of its last sample."""
 
     stamp_ns: int | None
-    #: By thermometer what is wrong with its readings, and the size of a step not believed [K].
+    #: Fault of each thermometer, and the size of a rejected step [K].
     faults: Mapping[str, tuple[Fault, float]]
-    #: How far the stamps of the readings that wait are ahead of the samples' [s].
+    #: Time from the last sample to the latest waiting reading [s].
     pending_ahead_s: float
-    #: As `ThermalTracker.sample` gives it; empty until there is a board temperature.
+    #: Result of `ThermalTracker.sample`; empty until there is a board temperature.
     state: tuple[float, ...] = ()
     regime: Regime = Regime.UNKNOWN
     direction: int = 0  # -1 cooling, +1 heating, 0 neither
-    is_settled: bool = False  # the memory has forgotten that its start was not seen
-    #: Ages of the last used readings at the last sample [s]; infinite when there was none.
+    is_settled: bool = False  # the unseen start no longer matters to the memory
+    #: Ages of the last used readings at the last sample [s]; infinite without a reading.
     board_age_s: float = math.inf
     case_age_s: float = math.inf
     is_board_stale: bool = True
     is_board_lost: bool = True
     is_case_lost: bool = True
     excess: Excess = Excess(0.0, 0.0, 0.0, 0.0)  # noqa: RUF009 - it is immutable
-    #: Whether the board has led the case in a ramp: the two topics are swapped, most likely.
+    #: Whether the board has led the case in a ramp: most likely the two topics are swapped.
     is_lead_reversed: bool = False
-    gravity: GravityResidual | None = None  # None before the platform has stood
+    gravity: GravityResidual | None = None  # None before the platform has been at rest
     #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.
     is_refuted: bool = False
-    #: What is uncertain of the bias of each axis' angular rate [rad/s]; empty where none is known.
+    #: Bias sd of each axis' angular rate [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
 
 
@@ -95,10 +95,10 @@ class Compensator:
         self.thermal = ThermalSide(model, self.config, self.counters)
         self._use(model.calibration)
         self.last_ns = self.event_ns = EVER_NS
-        #: The stamp of a sample that leapt ahead, until the next one tells.
+        #: Stamp of a sample that leapt ahead and is not confirmed yet.
         self.leapt_ns: int | None = None
         self.reading_ns = EVER_NS  # the latest stamp of a reading
-        #: Of the present segment, as `Correction.line` gives it; empty where no rate is corrected.
+        #: Rate correction of the present segment (`Correction.line`); empty without a gyroscope.
         self.rate_line: list[float] = []
 
     def _use(self, calibration: Calibration) -> None:
@@ -124,7 +124,7 @@ class Compensator:
         Correct one sample in the calibration's input unit.
 
         Returns specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4];
-        None where nothing must be published, with the reason counted in `counters`.
+        None if the sample must not be published; `counters` counts the reason.
         """
         if not self.last_ns < stamp_ns < self.event_ns:
             return self._process_first(stamp_ns, x, y, z)
@@ -156,7 +156,7 @@ class Compensator:
     def correct_rate(
         self, stamp_ns: int, x: float, y: float, z: float
     ) -> tuple[float, float, float, float, float, float]:
-        """Correct the angular rate [rad/s] of the sample just processed; variances behind it."""
+        """Return the corrected angular rate [rad/s] of the last sample, then its variances."""
         return corrected_rate(self.rate_line, (stamp_ns - self._segment[0]) * 1e-9, x, y, z)
 
     def _count_bad(self, x: float, y: float, z: float) -> None:
@@ -172,7 +172,7 @@ class Compensator:
             self.counters.n_saturated += 1
 
     def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
-        """Correct the first sample after an event, which serves the checks, too."""
+        """Correct the first sample after an event, and run the checks on it."""
         if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
             self.reading_ns = EVER_NS
@@ -184,7 +184,7 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Every sample comes back here until there is a temperature, and is counted here.
+            # Until there is a temperature every sample takes this branch and is counted here.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -200,7 +200,7 @@ class Compensator:
             is_good &= is_sound(rate_line)
             self.rate_line = rate_line.tolist()
         if not is_good:
-            # Nothing that is not finite goes out, whatever led to it. Each sample comes back here.
+            # A correction that is not finite: every sample takes this branch and is dropped.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None
@@ -210,7 +210,7 @@ class Compensator:
         self.is_refusing = is_too_fast
         row = self.process(stamp_ns, x, y, z)
         if self.gravity.is_refuted and not is_too_fast:
-            # It still tells when the trust is restored.
+            # The dropped samples still feed the gravity check, which may clear the calibration.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1
@@ -220,19 +220,19 @@ class Compensator:
         return None if self.is_refusing else row
 
     def is_leap(self, stamp_ns: int) -> bool:
-        """Tell whether a rising stamp is too far ahead to be believed of one sample."""
+        """Whether a rising stamp is too far ahead to be accepted from a single sample."""
         leapt_ns, self.leapt_ns = self.leapt_ns, None
         near_ns = stamp_ns - self.leap_ns
         is_far = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
         if is_far and (leapt_ns is None or stamp_ns <= leapt_ns):
             self.leapt_ns = stamp_ns
-            self.event_ns = EVER_NS  # the next sample comes by here, too
+            self.event_ns = EVER_NS  # the next sample takes this branch, too
             return True
         return False
 
     def jump_back(self, stamp_ns: int) -> None:
-        """Begin anew at a sample before which time has jumped back: a bag that loops."""
-        # Readings of the old time that no sample reached belong to the time that is gone.
+        """Restart at a sample before which time has jumped back: a bag that loops."""
+        # Waiting readings with later stamps belong to the time before the jump.
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self.thermal.reset()
         self.stuck = StuckCheck(self.config.stuck_timeout_s)
@@ -241,13 +241,13 @@ class Compensator:
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Take the regime flags that became due: (stamp of the reading that decides, S)."""
+        """Take the regime flags that are due: (stamp of the deciding reading, S)."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 
     @property
     def is_refusing(self) -> bool:
-        """Whether the samples of the present segment are held back."""
+        """Whether the samples of the present segment are dropped."""
         return self._limit < 0.0
 
     @is_refusing.setter
@@ -255,32 +255,31 @@ class Compensator:
         self._limit = -1.0 if value else self._full_scale
 
     def flush(self, stamp_ns: int) -> None:
-        """Let queued readings up to a stamp take effect; no samples are coming."""
+        """Apply the queued readings up to a stamp; for use while no samples come."""
         self.thermal.flush(stamp_ns)
         self.event_ns = EVER_NS
 
     def swap(self, calibration: Calibration) -> None:
-        """Take over another calibration between two samples."""
+        """Use another calibration from the next sample on."""
         vars(self).update(vars(self.successor(Model(calibration), self.config)))
 
     def reconfigure(self, config: CompensatorConfig) -> None:
-        """Take over other settings between two samples."""
+        """Use other settings from the next sample on."""
         vars(self).update(vars(self.successor(self.thermal.model, config)))
 
     def successor(self, model: Model, config: CompensatorConfig) -> Compensator:
         """
-        Make one that goes on from the last sample with another model or other settings.
+        Build a compensator that continues from the last sample with another model or settings.
 
-        Thermometers, regime and memory go on where the new one reads and remembers the same.
-        Nothing here changes, so that whatever fails meanwhile has not happened; of the two only
-        one may go on.
+        Thermometers, regime and memory are kept as far as the new model has the same. This
+        compensator does not change, so a failure has no effect; only one of the two may continue.
         """
         new = copy(self)
         new.take_over(model, config)
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Go on as a successor does; whose copy this is stays as it was."""
+        """Continue as a successor does; the compensator that this is a copy of does not change."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckCheck(config.stuck_timeout_s)
         self.config, self.thermal = config, copy(self.thermal)
@@ -294,7 +293,7 @@ class Compensator:
         return self.last_ns if self.last_ns != EVER_NS else None
 
     def status(self) -> CompensatorStatus:
-        """Say how it stands, for diagnostics."""
+        """Return the state, for diagnostics."""
         thermal = self.thermal
         tracker, rate = thermal.tracker, thermal.rate_correction
         detector, gravity = tracker.detector, self.gravity
@@ -307,7 +306,7 @@ class Compensator:
         board_age_s, case_age_s = (
             math.inf if one is None else (stamp_ns - one) * 1e-9 for one in (board_ns, case_ns)
         )
-        # Half the time-out at the latest, so that a warning always comes before the error.
+        # Stale at half the time-out at the latest, so that a warning precedes the error.
         timeout_s = self.config.temperature_timeout_s
         usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
         state = thermal.sample(stamp_ns)
@@ -335,7 +334,7 @@ class Compensator:
 def corrected(
     line: Iterable[Real], misalignment: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
-    """Give specific force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s into a segment."""
+    """Return force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s into a segment."""
     (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
      ax, lx, qx, ay, ly, qy, az, lz, qz) = line  # fmt: skip
     yx, zx, zy, var_yx, var_zx, var_zy = misalignment
@@ -365,6 +364,6 @@ def corrected(
 def corrected_rate(
     line: Iterable[Real], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real]:
-    """Give the angular rate x, y, z and the variance of each axis, `dt` s into a segment."""
+    """Return the angular rate x, y, z and the variance of each axis, `dt` s into a segment."""
     bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = line
     return x - (bx + bx1 * dt), y - (by + by1 * dt), z - (bz + bz1 * dt), xx, yy, zz

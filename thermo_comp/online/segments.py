@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the segments: from temperature readings to runs of time over which the correction is linear.
+Owns the segments: time intervals between temperature readings, with a correction linear in time.
 
-An event is a temperature reading or, while none comes, the end of a one-second segment. At both
-ends of a segment the correction is evaluated in full, so a sample costs a few operations, follows
-the temperature without a staircase, and a batch needs one evaluation per segment. What changes
-slowly is evaluated at the first segment in each ten seconds of the stamps.
+A segment ends at a temperature reading, or after one second. The correction is evaluated in full
+at both ends, so a sample costs a few operations, the output has no staircase, and a batch needs
+one evaluation per segment. The slow part of the variance is evaluated at the first segment in each
+ten seconds of the stamps.
 """
 
 from __future__ import annotations
@@ -30,36 +30,36 @@ from ..unit.rate_triad import rate_triad
 from .checks import RateCheck
 from .status import CompensatorConfig, Counters
 
-#: Longest time over which bias and scale are taken as linear in time.
+#: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
-SLOW_NS: Final = 10_000_000_000  # how long what changes slowly is held
-EVER_NS: Final = -NEVER_NS  # earlier than any stamp
-#: A unit that no thermometer watches is taken to be at the reference, within this sd [K].
+SLOW_NS: Final = 10_000_000_000  # time for which the slow part of the variance is held
+EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
+#: Sd of the temperature of a unit without thermometer about the reference temperature [K].
 UNMEASURED_SD_K: Final = 10.0
 
 
 class Segment(NamedTuple):
-    """A run of time over which the correction is linear, and what the gate says of its samples."""
+    """A time interval with a linear correction, and the checks that apply to its samples."""
 
     start_ns: int
-    is_new: bool  # not the rest of one that the end of a block, or a call from outside, has cut
-    is_too_fast: bool  # samples come too fast to be conversions
-    noise_excess: float  # what their rate adds to their noise
+    is_new: bool  # False for the rest of a segment cut by the end of a block or by a call
+    is_too_fast: bool  # samples come faster than conversions can
+    noise_excess: float  # excess noise variance by the rate of the samples, relative
     start: tuple[float, ...]  # thermal states at both ends
     end: tuple[float, ...]
-    #: What parameters and starts leave uncertain of each axis; of the angular rate's behind them.
+    #: Slow part of a, b, c of each axis; then that of the angular rate.
     slow: list[float]
 
 
 class Model:
-    """What a calibration says, ready to be evaluated; nothing of it changes any more."""
+    """A calibration prepared for evaluation; immutable."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
         self.needs_temperature = calibration.needs_temperature
         self.correction = Correction(calibration)
         self.uncertainty = [SlowUncertainty(calibration, self.correction)]
-        #: That of the angular rate, over the same thermal state; None where it passes as it is.
+        #: Correction of the angular rate, over the same thermal state; None without a gyroscope.
         self.rate_correction: Correction | None = None
         if calibration.gyroscope is not None:
             triad = rate_triad(calibration)
@@ -69,7 +69,7 @@ class Model:
 
 
 class ThermalSide:
-    """What stream and batch share: readings, thermal state, the gate they open for samples."""
+    """The part common to stream and batch: readings, thermal state, segments."""
 
     def __init__(self, model: Model, config: CompensatorConfig, counters: Counters) -> None:
         self.counters = counters
@@ -106,7 +106,7 @@ class ThermalSide:
         return replace(self.config, transition_time_s=gentle_s), self.calibration.board_lag_s
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Go on with another model or configuration; whose copy this is stays as it was."""
+        """Continue with another model or configuration; the original of this copy stays."""
         before, old, self.config = self.model, self.tracker, config
         if model is before:
             self._forget_segment()
@@ -120,13 +120,13 @@ class ThermalSide:
             self.tracker.reconfigure(*self._tracker_config(), now_ns)
             return
         self.tracker = self._new_tracker()
-        # It starts from the temperatures just seen, so that no sample is lost.
+        # Start from the last temperatures, so that no sample is lost.
         for name, sensor in old.thermometers.items():
             if name in self.inputs and sensor.stamp_ns is not None:
                 self.tracker.read(name, sensor.stamp_ns, sensor.temperature)
 
     def reset(self) -> None:
-        """Forget temperatures, regime and rate; what waits, and counters, stay."""
+        """Forget temperatures, regime and rate; keep waiting readings and counters."""
         self.tracker = self._new_tracker()
         self._forget_rate()
 
@@ -158,17 +158,17 @@ class ThermalSide:
             self.counters.n_case_rejected += n_readings
 
     def flush(self, stamp_ns: int) -> None:
-        """Let what waits take effect up to a stamp."""
+        """Apply the waiting readings up to a stamp."""
         for reading_ns, _, name, _, celsius in self.queue.due(stamp_ns):
             self._apply(name, reading_ns, celsius)
 
     @property
     def is_unmeasured(self) -> bool:
-        """Whether constants are applied to a unit whose temperature nobody has measured."""
+        """Whether a constant correction is applied to a unit without a temperature reading."""
         return not self.model.needs_temperature and self.tracker.board.stamp_ns is None
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
-        """Thermal state at a stamp, as `ThermalTracker.sample` gives it."""
+        """Return the thermal state at a stamp; see `ThermalTracker.sample`."""
         if self.is_unmeasured:
             gradients = (0.0, 0.0) * len(self.calibration.sensors)
             reference = self.calibration.reference_temperature_c
@@ -177,7 +177,7 @@ class ThermalSide:
 
     @property
     def fresh_until_ns(self) -> int:
-        """The last stamp at which the board temperature is not too old; before any without one."""
+        """The last stamp at which the board temperature is fresh; `EVER_NS` without a reading."""
         if not self.model.needs_temperature:
             return NEVER_NS
         board_ns = self.tracker.board.stamp_ns
@@ -192,7 +192,7 @@ class ThermalSide:
             self.counters.n_stale += n_samples
 
     def segment(self, stamp_ns: int, n_seen: int) -> Segment:
-        """Open the segment of a sample, `n_seen` after the first; a new one looks at the rate."""
+        """Open the segment of sample number `n_seen`; a new segment checks the rate."""
         start_ns = stamp_ns - (stamp_ns - (self.tracker.updated_ns or 0)) % SEGMENT_NS
         key = (self._n_applied, start_ns)
         is_new = key != self._segment_key
@@ -204,19 +204,19 @@ class ThermalSide:
         return Segment(start_ns, is_new, rate.is_too_fast, rate.noise_excess, start, end, slow)
 
     def bias_sd(self, correction: Correction, variances: Sequence[float]) -> tuple[float, ...]:
-        """Give what is uncertain of each axis' bias: the whole variance less a sample's noise."""
+        """Return the bias sd of each axis: of the whole variance less a sample's noise."""
         excess = 1.0 + self.rate.noise_excess
         pairs = zip(variances, correction.noise, strict=False)
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[float]:
-        """Give the slow part of the variance of a segment, evaluated at its end or held."""
+        """Return the slow part of the variance of a segment, evaluated at its end or held."""
         key = start_ns // SLOW_NS
         if key != self._slow_key:
             self._slow_key = key
             shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)
             if self.is_unmeasured:
-                # What the weights leave open counts as at the usual distance.
+                # The uncertainty of the weights is taken one sd away from the reference.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
-            self._slow = [v for one in self.model.uncertainty for v in one.at(end_state, shares)]
+            self._slow = [v for part in self.model.uncertainty for v in part.at(end_state, shares)]
         return self._slow

@@ -12,15 +12,15 @@ from ..thermal.settings import ThermalConfig, refuse_outside
 
 @dataclass(frozen=True)
 class CompensatorConfig(ThermalConfig):
-    """What the user sets beside the calibration; ValueError if a value is out of its range."""
+    """Settings of the user; ValueError if a value is out of its range."""
 
-    #: Time after which samples that are equal to the bit are not believed [s], and three exact
-    #: zeros never are; 0 = any sample is believed.
+    #: Time after which repeated equal samples are dropped [s]; three exact zeros always are; 0
+    #: switches both checks off.
     stuck_timeout_s: float = 2.0
-    #: Gravity where the platform stands [m/s^2]; 0 = that of the calibration.
+    #: Gravity at the place of use [m/s^2]; 0 = that of the calibration.
     local_gravity_m_s2: float = 0.0
-    #: What |f| at rest may miss gravity by [m/s^2]; beyond it the calibration is another unit's,
-    #: or an axis is reversed, and nothing is published; 0 = anything.
+    #: Largest error of |f| at rest [m/s^2]. Beyond it the calibration is that of another unit, or
+    #: an axis is reversed, and nothing is published; 0 = no limit.
     gravity_tolerance_m_s2: float = 0.5
 
     def __post_init__(self) -> None:
@@ -34,7 +34,7 @@ class CompensatorConfig(ThermalConfig):
 
 @dataclass(slots=True)
 class Dropped:
-    """Why samples that came in did not go out."""
+    """Numbers of dropped samples by reason."""
 
     n_not_finite: int = 0
     n_saturated: int = 0
@@ -44,7 +44,7 @@ class Dropped:
     n_stuck: int = 0
     n_too_fast: int = 0
     n_refuted: int = 0
-    n_unsound: int = 0  # nothing finite can be made of them
+    n_unsound: int = 0  # the corrected sample is not finite
 
 
 DROPPED = tuple(one.name for one in fields(Dropped))
@@ -52,7 +52,7 @@ DROPPED = tuple(one.name for one in fields(Dropped))
 
 @dataclass(slots=True)
 class Counters(Dropped):
-    """What came in and why some of it did not go out."""
+    """Numbers of samples and readings, published and dropped."""
 
     n_out: int = 0
     n_board: int = 0
@@ -63,7 +63,7 @@ class Counters(Dropped):
 
     @property
     def n_in(self) -> int:
-        """Samples that came in."""
+        """Number of samples received."""
         n_dropped: int = sum(getattr(self, name) for name in DROPPED)
         return self.n_out + n_dropped
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the trial of a calibration: a few samples go through all of it before it is taken into use.
+Owns the trial of a calibration: a few samples are corrected with it before it is used.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from .compensator import Compensator, Corrected
 from .segments import Model
 from .status import CompensatorConfig
 
-#: The coldest and the hottest that a thermometer may read, beyond any range [degC].
+#: Lowest and highest test temperature, beyond any calibrated range [degC].
 _BEYOND: Final = (-273.0, 999.0)
 _STEP_NS: Final = 1_000_000_000
 
 
 def tried(calibration: Calibration, path: str | Path | None = None) -> None:
     """
-    Apply a calibration to a few samples; CalibrationError where anything of it fails.
+    Apply a calibration to a few samples; CalibrationError if any of them fails.
 
-    The samples are zero and full scale, the temperatures the edges of the ranges and what is far
-    beyond; each must come out finite, with a covariance that is positive definite.
+    The samples are zero and full scale, at the edges of the temperature ranges and far beyond;
+    each result must be finite, with a positive definite covariance.
     """
     try:
         is_sound = all(map(is_sound_sample, _samples(Model(calibration))))
@@ -37,12 +37,12 @@ def tried(calibration: Calibration, path: str | Path | None = None) -> None:
         rule = f'cannot be applied: {type(error).__name__}: {error}'
         raise CalibrationError(rule, path) from error
     if not is_sound:
-        rule = 'cannot be applied: what it gives is not finite, or no covariance'
+        rule = 'cannot be applied: a result is not finite, or its covariance is not valid'
         raise CalibrationError(rule, path)
 
 
 def is_sound_sample(row: Corrected) -> bool:
-    """Say whether force and covariance of a sample are numbers that may be published."""
+    """Whether the force of a sample is finite and its covariance positive definite."""
     if not np.isfinite(row).all():
         return False
     xx, xy, xz, yy, yz, zz = row[3:]
@@ -58,7 +58,7 @@ def _samples(model: Model) -> Iterator[Corrected]:
         compensator = Compensator(model, CompensatorConfig(gravity_tolerance_m_s2=0.0))
         for k, size in enumerate((1e-3 * largest, largest, -largest)):
             for name in model.inputs:
-                # Beside the board it is warmer, and more so each time.
+                # The other thermometers are warmer than the board by a growing gradient.
                 celsius_there = celsius + k * (name != BOARD_INPUT)
                 compensator.push(name, k * _STEP_NS, celsius_there)
             row = compensator.process(k * _STEP_NS, size, 0.5 * size, size)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns bags: recordings to columns and columns to recordings, streaming, in bounded memory.
+Owns bags: reading into columns and writing from columns, streaming, in bounded memory.
 
-The only package that knows `rosbags` and `mcap`.
+The only package that imports `rosbags` and `mcap`.
 """

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what a stretch of a bag becomes: messages by the thousand, then a block of columns, on one
-clock; and the words that describe a bag.
+Owns batches of messages, blocks of columns on one clock, and the description of a bag.
 
-A column is a numpy array with one row per message. All times are integer nanoseconds: the
-``stamp`` is the message's own header stamp, the ``log`` is when the recorder got it.
+A column is a numpy array with one row per message. All times are integer nanoseconds: ``stamp`` is
+the stamp in the message's header, ``log`` the time when the recorder received it.
 """
 
 from __future__ import annotations
@@ -27,24 +26,26 @@ Role = str  # ``accel``, or the name of a thermometer
 
 ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 
-#: A block is given out once it has so many messages: what is done per block costs little then.
+#: Messages per block; large enough that the per-block overhead is negligible.
 BLOCK_MESSAGES = 1 << 15
 
-#: The stamp of what has none: before any that a clock gives, and what a header can hold.
+#: Stamp of a message without stamp: before any real stamp, and within the range of a header.
 NO_STAMP_NS = -(2**31) * 10**9
-_JUMP_NS = 10**9  # stamps that go back further are a jump of time, as for the compensator
-LONGEST_PAUSE_NS = 3600 * 10**9  # what a longer jump of the stamps becomes [ns]
-#: More jumps are no clock; and so many days need a message every so many seconds.
+_JUMP_NS = 10**9  # a larger backward step is a jump of time, as for the compensator
+LONGEST_PAUSE_NS = 3600 * 10**9  # a longer jump of the stamps is shortened to this [ns]
+#: Largest number of jumps in a recording with a valid clock.
 _MOST_JUMPS = 100
-# Of one clock are not so many readings that are stamped so far apart in the median [s].
+# Thermometer and accelerometer are on different clocks if at least this many readings have a
+# median stamp offset above this [s].
 _FEWEST_READINGS, _APART_S = 10, 10.0
-#: A thermometer that stands still is heard again after this, so that nobody takes it for lost.
+#: An unchanged reading is kept after this time [ns], so that the sensor does not seem lost.
 _REPEAT_NS = 10_000_000_000
+#: A recording longer than the first needs a mean message interval below the second [ns].
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
 def gather(buffer: Bytes, at: Ints, n_bytes: int) -> Any:
-    """Copy `n_bytes` from each position, so far before the buffer's end, as rows of void."""
+    """Copy `n_bytes` from each position, all before the buffer's end, as rows of void."""
     return _everywhere(buffer, n_bytes)[at] if len(at) else np.empty(0, (np.void, n_bytes))
 
 
@@ -60,14 +61,14 @@ def _everywhere(buffer: Bytes, n_bytes: int) -> Any:
 
 
 def number_at(rows: NDArray[Any], offset: int, kind: str) -> Any:
-    """Look at one number of each gathered row, by its offset [bytes] and numpy type: a view."""
+    """View a number in each gathered row, by its offset [bytes] and numpy type."""
     if len(rows) == 0:
         return np.empty(0, kind)
     return np.ndarray((len(rows),), kind, rows.data, offset=offset, strides=(rows.itemsize,))
 
 
 class Topic(NamedTuple):
-    """What a channel carries: its topic, message type, encoding and number of messages."""
+    """The topic of a channel: name, message type, encoding and number of messages."""
 
     name: str
     type: str
@@ -77,7 +78,7 @@ class Topic(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Messages:
-    """Serialized messages, shape (n,): where they stand in some bytes, and how long they are."""
+    """Serialized messages, shape (n,): their positions and lengths in `data`."""
 
     data: Bytes
     start: Ints
@@ -87,48 +88,48 @@ class Messages:
 
     @classmethod
     def of(cls, pieces: Sequence[bytes], channel: Any, log_ns: Any) -> Messages:
-        """Put messages behind each other."""
+        """Concatenate messages."""
         size = np.fromiter(map(len, pieces), np.int64, len(pieces))
         data = np.frombuffer(b''.join(pieces), np.uint8)
         numbers, times = np.asarray(channel, np.uint16), np.asarray(log_ns, np.int64)
         return cls(data, np.cumsum(size) - size, size, numbers, times)
 
     def __len__(self) -> int:
-        """Count them."""
+        """Return the number of messages."""
         return len(self.start)
 
     def __iter__(self) -> Iterator[bytes]:
-        """Give the bytes of each."""
+        """Yield the bytes of each message."""
         data = self.data.tobytes()
         for at, size in zip(self.start.tolist(), self.size.tolist(), strict=True):
             yield data[at : at + size]
 
     def take(self, which: Ints | Bools | slice) -> Messages:
-        """Choose some of them; the bytes stay."""
+        """Select messages; the bytes are shared."""
         return Messages(
             self.data, self.start[which], self.size[which], self.channel[which], self.log_ns[which]
         )
 
     def places_of(self, numbers: Collection[int]) -> Ints:
-        """Find those of some channels."""
+        """Return the indices of the messages of some channels."""
         is_own = np.zeros(len(self), np.bool_)
-        for number in numbers:  # a few; as fast as one
+        for number in numbers:
             is_own |= self.channel == number
         return np.flatnonzero(is_own)
 
     def of_channels(self, numbers: Collection[int]) -> Messages:
-        """Choose those of some channels."""
+        """Select the messages of some channels."""
         places = self.places_of(numbers)
         return self if len(places) == len(self) else self.take(places)
 
     def in_order(self) -> Messages:
-        """Sort them by log time and, for equal ones, by their places."""
+        """Sort by log time and, for equal times, by position."""
         if (self.log_ns[1:] >= self.log_ns[:-1]).all():
             return self
         return self.take(np.argsort(self.log_ns, kind='stable'))
 
     def packed(self, room: int = 0) -> Messages:
-        """Put their bytes behind each other, with room before each, so that the others' can go."""
+        """Copy the bytes, with `room` before each message, so that the original can be freed."""
         ends = np.cumsum(self.size + room)
         data = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
         for each in np.unique(self.size[self.size > 0]).tolist():
@@ -138,7 +139,7 @@ class Messages:
 
 
 def join_messages(pieces: Sequence[Messages]) -> Messages:
-    """Put messages, at least one piece, behind each other."""
+    """Concatenate pieces of messages, at least one piece."""
     if len(pieces) == 1:
         return pieces[0]
     begins = np.cumsum([0, *(len(one.data) for one in pieces)])
@@ -151,8 +152,8 @@ def join_messages(pieces: Sequence[Messages]) -> Messages:
 
 class BagFile:
     """
-    What is known of one open file of a bag, which errors call by its `path`: topics by the number
-    of their channel, encoding and text of message types, log times, and what is missing.
+    An open file of a bag: topics by channel number, encoding and text of message types, log times,
+    and the missing part. Errors name the file by its `path`.
     """
 
     storage = 'mcap'
@@ -170,10 +171,10 @@ class BagFile:
 @dataclass(frozen=True, slots=True)
 class RecordingInfo:
     """
-    What a bag holds, known before its messages are read.
-    `topics` have message type, two joined by `` | ``, and number of messages. Start and end are
-    log times, or 0; `truncated` says what is missing, `metadata` what its writer left in it,
-    `input` which accelerometer topic is read, `chosen` what was taken by its type.
+    The content of a bag, known before its messages are read.
+    `topics`: message type (several joined by `` | ``) and number of messages. Start and end are
+    log times, or 0. `truncated` describes the missing part; `metadata` is the writer's; `input` is
+    the accelerometer topic that is read; `chosen` lists topics selected by their type.
     """
 
     path: Path
@@ -188,15 +189,15 @@ class RecordingInfo:
 
     @property
     def n_messages(self) -> int:
-        """Count the messages of all topics."""
+        """Number of messages of all topics."""
         return sum(count for _, count in self.topics.values())
 
 
 class ImuColumns(NamedTuple):
     """
-    What a sensor_msgs/Imu carries beside its stamp and its linear acceleration: a quaternion
-    x, y, z, w, shape (n, 4), rates [rad/s], shape (n, 3), and covariances, shape (n, 9). What is
-    written may be one row, the same for all.
+    The fields of sensor_msgs/Imu other than stamp and linear acceleration: quaternion x, y, z, w,
+    shape (n, 4), rates [rad/s], shape (n, 3), and covariances, shape (n, 9). For writing, a single
+    row applies to all messages.
     """
 
     orientation: Floats
@@ -207,7 +208,7 @@ class ImuColumns(NamedTuple):
 
     @classmethod
     def of_rate(cls, rate: Floats | None) -> ImuColumns:
-        """Give rates, if any, of unknown covariance, and what is no orientation (REP 145)."""
+        """Return rates, if any, with unknown covariance and no orientation (REP 145)."""
         none, unknown = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
         level = np.array([0.0, 0.0, 0.0, 1.0])
         if rate is None:
@@ -215,29 +216,29 @@ class ImuColumns(NamedTuple):
         return cls(level, none, rate, unknown, unknown)
 
     def take(self, rows: Ints | Bools) -> ImuColumns:
-        """Choose some messages."""
+        """Select messages."""
         return ImuColumns(*(one[rows] for one in self))
 
 
 class Readings(NamedTuple):
-    """What one thermometer said, shape (m,), in a block `after` so many of its samples."""
+    """Readings of a thermometer, shape (m,); `after`: the block's samples before each."""
 
     stamp_ns: Ints
     celsius: Floats
     after: Ints = np.empty(0, np.int64)
 
     def take(self, which: Ints | Bools | slice) -> Readings:
-        """Choose some of them, of no block."""
+        """Select readings, detached from their block."""
         return Readings(self.stamp_ns[which], self.celsius[which])
 
     def thinned(self) -> Readings:
-        """Keep the finite ones that say something new: a change, or ten seconds without one."""
-        # What is filled up to the rate of other columns would look like one that stands still.
+        """Keep the finite readings that changed, and one every ten seconds."""
+        # Readings repeated at the rate of other columns would look like a stuck sensor.
         kept: list[int] = []
         last_ns, last = 0, math.nan
         rows = zip(self.stamp_ns.tolist(), self.celsius.tolist(), strict=True)
         for row, (now_ns, value) in enumerate(rows):
-            # A stamp before the last one is a restart of the clock, and worth a reading.
+            # A backward stamp is a restart of the clock: keep the reading.
             is_new = value != last or now_ns - last_ns >= _REPEAT_NS or now_ns < last_ns
             if is_new and math.isfinite(value):
                 kept.append(row)
@@ -248,10 +249,10 @@ class Readings(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class Block:
     """
-    A run of messages in reading order, as columns, n samples; it ends where `frame_id` changes.
-    `accel`, shape (n, 3), is in counts per cycle, or m/s^2 where the input is sensor_msgs/Imu;
-    `imu` is the rest of that message. Temperatures are by thermometer, empty where the bag has
-    none, `log_ns` by role, as are the serialized messages, where asked for.
+    Consecutive messages in reading order, as columns; it ends where `frame_id` changes.
+    `accel`, shape (n, 3), is in counts per cycle, or m/s^2 if the input is sensor_msgs/Imu;
+    `imu` holds the other fields of that message. `temperatures` are by thermometer; `log_ns` and,
+    if requested, the serialized messages `raw` are by role.
     """
 
     accel_stamp_ns: Ints
@@ -263,12 +264,12 @@ class Block:
     raw: Mapping[Role, Messages] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Count the accelerometer messages."""
+        """Return the number of accelerometer messages."""
         return len(self.accel_stamp_ns)
 
     @property
     def n_messages(self) -> int:
-        """Count the messages of all roles."""
+        """Number of messages of all roles."""
         return sum(map(len, self.log_ns.values()))
 
     @property
@@ -278,7 +279,7 @@ class Block:
         return {'accel': self.accel_stamp_ns, **stamps}
 
     def take(self, rows: Mapping[Role, Bools]) -> Block:
-        """Choose some messages of each role."""
+        """Select messages of each role."""
         own = rows['accel']
         n_before = np.concatenate(([0], np.cumsum(own)))
         temperatures = {}
@@ -304,7 +305,7 @@ class Recording(NamedTuple):
 
 
 def gathered(blocks: Iterable[Block]) -> Iterator[Block]:
-    """Put blocks together until each has so many messages, or the `frame_id` changes."""
+    """Join blocks until each has `BLOCK_MESSAGES`, or the `frame_id` changes."""
     waiting: list[Block] = []
     frame_id: str | None = None
     for block in blocks:
@@ -322,7 +323,7 @@ def gathered(blocks: Iterable[Block]) -> Iterator[Block]:
 
 
 def joined(blocks: Sequence[Block]) -> Block:
-    """Put blocks, at least one, behind each other as one, with the first sample's `frame_id`."""
+    """Join blocks, at least one, into one with the first sample's `frame_id`."""
     if len(blocks) == 1:
         return blocks[0]
     begins = np.cumsum([0, *map(len, blocks)])
@@ -346,10 +347,10 @@ def joined(blocks: Sequence[Block]) -> Block:
 
 def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
-    Give readings without a stamp that of the sample before them, in the block or `last_ns` before
-    it, and tell the newest; readings before any sample are left out.
+    Give readings without a stamp the stamp of the sample before them (`last_ns` before the block);
+    return the block and its newest stamp. Readings before any sample are dropped.
 
-    So does the node: arrival is told by the samples' own clock, however fast a bag is played.
+    The node does the same: the samples' clock does not depend on the speed of a playback.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
@@ -376,7 +377,7 @@ def _restamp(messages: Messages, stamp_ns: Ints) -> None:
 
 
 def clocks_apart(block: Block) -> str:
-    """Say which thermometer is stamped far from the samples that it came between."""
+    """Name a thermometer whose stamps are far from those of the samples around it."""
     for name, one in block.temperatures.items():
         inside = (one.after > 0) & (one.after < len(block))
         stamp_ns, after = one.stamp_ns[inside], one.after[inside]
@@ -389,17 +390,16 @@ def clocks_apart(block: Block) -> str:
 
 def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
-    Move stamps behind a jump, all by the same; RecordingError for stamps that are no clock.
-    A clock that is set while it runs leaves a hole of years, and whatever walks a grid of time
-    would walk it. After an hour without a reading nothing is known of a unit's thermal state, so
-    a longer jump, either way, becomes an hour.
+    Shorten jumps of the stamps to an hour, backward jumps too; RecordingError for invalid clocks.
+    A clock that is set while it runs leaves a gap of years, which would make any grid over time
+    huge. After an hour without a reading a unit's thermal state is unknown anyway.
     """
     last_ns: int | None = None
     offset = 0
     n_jumps = n_messages = span_ns = 0
     for block in blocks:
         thermometers = block.temperatures.values()
-        # Reading order; a reading stands before the sample that it counts for.
+        # Reading order: a reading precedes the sample for which it counts.
         places = [*(one.after for one in thermometers), np.arange(len(block))]
         stamps = np.concatenate([*(one.stamp_ns for one in thermometers), block.accel_stamp_ns])
         if not len(stamps):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns why a recording is none of an accelerometer at rest, in the words of whoever made it.
+Owns the likely reasons why a recording is not one of an accelerometer at rest, as messages.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from ..unit.gravity import STANDARD_GRAVITY
 from .blocks import Block
 from .stillness import Cells
 
-# Parts of the samples: what is counted once may be a glitch; what more than half are, all are.
+# Shares of the samples: below the first a fault is a glitch, above the second it concerns all.
 _SOME, _MOST = 0.01, 0.5
-# Readings at rest in parts of their unit's gravity: of gravity, and of none.
+# Reading at rest / gravity: range with gravity, and upper limit without gravity.
 _ABOUT_ONE, _NONE = (0.8, 1.25), 0.3
 
 
 class CauseCounter:
-    """Counts, block by block, what a sensor at rest does not send."""
+    """Counts, block by block, the samples that a sensor at rest does not send."""
 
     def __init__(self) -> None:
         self._n = self._n_zero = self._n_absent = 0
@@ -35,11 +35,11 @@ class CauseCounter:
         self._is_imu |= imu is not None
         if covariance is not None:
             self._n_absent += int(np.count_nonzero(covariance[:, 0] == -1.0))
-        if len(self._stamps_ns) < 2:  # whether there are two is all that is asked
+        if len(self._stamps_ns) < 2:  # only "all equal" matters
             self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
 
     def cause(self, cells: Cells, still_sd: float) -> str:
-        """Say what the samples are instead; nothing where they may be an accelerometer's."""
+        """Describe the fault of the samples; empty if they may be an accelerometer's."""
         if self._n_absent > _MOST * self._n:
             return (
                 'its messages say that they hold no acceleration '
@@ -59,7 +59,7 @@ class CauseCounter:
         return self._unit_of(cells, still_sd) if self._is_imu else ''
 
     def _unit_of(self, cells: Cells, still_sd: float) -> str:
-        """Say in which unit the quiet samples of an Imu must be, if not in m/s^2."""
+        """Infer the unit of an Imu's samples at rest, if not m/s^2."""
         scatter = cells.variance.max(axis=1, initial=0.0)
         quiet = (cells.count > 1) & (scatter <= np.quantile(scatter, 0.5) if len(scatter) else 0)
         if not quiet.any():
@@ -74,7 +74,7 @@ class CauseCounter:
                 )
         if norm < _NONE * STANDARD_GRAVITY and sd < still_sd * STANDARD_GRAVITY:
             return (
-                f'it reads {norm:.2g} m/s^2 at rest: gravity is taken off (a linear or free '
-                'acceleration), and the fit needs it: another topic of the driver has it'
+                f'it reads {norm:.2g} m/s^2 at rest: gravity is subtracted (a linear or free '
+                'acceleration), but the fit needs it: use another topic of the driver'
             )
         return ''

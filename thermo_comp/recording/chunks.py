@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the stretches of a file that hold messages: unpacked within limits, and the messages found.
+Owns the spans of a file that hold messages: unpacking within limits, and finding the messages.
 
-What a chunk or a frame claims about its size is only ever an upper limit of what is taken for it.
-Its message index is never trusted: what it points at must be message records that tile the chunk
-without gap or overlap; where they do not, the records are walked one by one.
+The size that a chunk or frame declares is only used as an upper limit. Its message index is never
+trusted: the records it points at must fill the chunk without gap or overlap; otherwise the records
+are read one by one.
 https://mcap.dev/spec
 """
 
@@ -33,40 +33,40 @@ from ..typing import Bytes, Ints
 from .blocks import Messages, gather, number_at
 
 PREFIX = struct.Struct('<BQ')  # opcode and length in front of each record
-HEAD_BYTES = 160  # enough of a chunk's record to hold its head
+HEAD_BYTES = 160  # bytes of a chunk's record that contain its head
 _CHUNK_HEAD = struct.Struct('<BQQQQII')
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_ROW_BYTES = 16  # log time and offset of one message, 8 bytes each
-#: Bytes of a message record before its serialized message; of these, after the prefix.
+#: Bytes of a message record before its serialized message; the same without the prefix.
 MESSAGE_HEAD_BYTES = 31
 _MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size
 MESSAGE = int(Opcode.MESSAGE)
 
-#: Why a walk stopped, besides damage that is said in other words.
+#: Reasons why reading record by record stopped.
 _ENDS_EARLY = 'a record ends too early'
 _ZERO_OPCODE = 'a record has the opcode 0'
-MAX_CHUNK_BYTES = 1 << 26  # a chunk that claims to hold more is refused [bytes]
-#: A file that grows by more than this, beyond so many bytes, is not believed.
+MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
+#: Largest ratio of decompression of a file, checked above this size [bytes].
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
-_STEP_BYTES = 1 << 16  # up to so much before a damage is lost with it
+_STEP_BYTES = 1 << 16  # decompressed at a time: the most that is lost before a damage [bytes]
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,
 }
 
-#: Is given opcode and content of every record that is no message.
+#: Called with opcode and content of every record that is not a message.
 OnRecord = Callable[[int, bytes], None]
 
 
 class DamagedError(Exception):
-    """Bytes that are not what they should be; the text says what."""
+    """Damaged bytes; the text describes the damage."""
 
 
 @contextmanager
 def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
-    """Say which file it is that is damaged or cannot be read, whatever another library raises."""
+    """Turn errors of other libraries into a RecordingError that names the file."""
     try:
         yield
     except RecordingError as error:
@@ -85,8 +85,8 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 @dataclass(frozen=True, slots=True)
 class Span:
     """
-    A stretch of a file: a chunk, one whose end is missing, or messages outside any chunk.
-    `position` and `length` [bytes] leave out the message indexes behind it, `size` is its content.
+    A part of a file: a chunk, a chunk without end ('torn'), or messages outside chunks ('loose').
+    `position` and `length` [bytes] exclude the message indexes after it; `size` is the content's.
     """
 
     position: int
@@ -99,7 +99,7 @@ class Span:
 
 
 def parse_chunk_head(head: bytes, position: int) -> tuple[Span, str, int, int]:
-    """Read the head of the chunk at this place: its span, compression, begin of data, checksum."""
+    """Read the head of a chunk: its span, compression, offset of the data, checksum."""
     try:
         found = _CHUNK_HEAD.unpack_from(head)
         opcode, content, start_ns, end_ns, size, checksum, n_name = found
@@ -114,12 +114,12 @@ def parse_chunk_head(head: bytes, position: int) -> tuple[Span, str, int, int]:
 
 
 def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) -> Messages:
-    """Read a stretch of the file and find its messages, in the order of their places."""
+    """Read a span of the file and find its messages, in the order of their positions."""
     n_bytes = span.length + span.index_length
     try:
         if span.kind == 'chunk' and max(span.size, n_bytes) > MAX_CHUNK_BYTES:
             raise DamagedError(
-                f'{n_bytes} bytes claim to hold {span.size}, a chunk may have {MAX_CHUNK_BYTES}'
+                f'{n_bytes} bytes declare a content of {span.size}, limit {MAX_CHUNK_BYTES}'
             )
         record = read_at(span.position, min(n_bytes, MAX_CHUNK_BYTES))
         data = np.frombuffer(record, np.uint8)
@@ -133,7 +133,7 @@ def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) 
             data = inflate(compression, data[data_at:], MAX_CHUNK_BYTES, is_torn=True)
             return walk(data, on_record)[0]
         if head.length != span.length or head.size != span.size:
-            raise DamagedError('its size is not what the index of the file says')
+            raise DamagedError('its size differs from the index of the file')
         data = inflate(compression, data[data_at : span.length], span.size, span.size + 1)
         if len(data) != span.size:
             raise DamagedError(f'{len(data)} bytes after decompression, expected {span.size}')
@@ -142,7 +142,7 @@ def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) 
         messages = locate(data, memoryview(record)[span.length :], on_record)
         log_ns = messages.log_ns
         if len(log_ns) and (np.min(log_ns) < span.start_ns or np.max(log_ns) > span.end_ns):
-            raise DamagedError('its messages are outside the time it claims')
+            raise DamagedError('its messages are outside its declared time')
     except DamagedError as error:
         place = 'at' if span.kind == 'loose' else 'chunk at'
         raise DamagedError(f'{place} byte {span.position}: {error}') from error
@@ -150,7 +150,7 @@ def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) 
 
 
 def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
-    """Find all messages of a whole chunk, with the message index records behind it as a hint."""
+    """Find all messages of a complete chunk, with the message index after it as a hint."""
     messages = _indexed(data, index)
     if messages is None:
         messages, reason = walk(data, on_record)
@@ -160,7 +160,7 @@ def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
 
 
 def _indexed(data: Bytes, index: memoryview) -> Messages | None:
-    """Find the messages by the index; None where they are not all that the chunk holds."""
+    """Find the messages by the index; None if they do not fill the chunk exactly."""
     columns: list[Ints] = []
     begin = 0
     while begin + _INDEX_HEAD.size <= len(index):
@@ -169,7 +169,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
         is_sound = opcode == Opcode.MESSAGE_INDEX and content == length + 6
         if not is_sound or length % _INDEX_ROW_BYTES or begin + length > len(index):
             return None
-        # An offset that no chunk can have comes out negative.
+        # An impossible offset becomes negative.
         columns.append(np.frombuffer(index, '<i8', length // 8, begin)[1::2])
         begin += length
     at = np.sort(np.concatenate(columns), kind='stable') if columns else np.empty(0, np.int64)
@@ -177,7 +177,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
     if begin != len(index) or not is_inside:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
-    # Unsigned on purpose: a length that is too small wraps around to one that is too large.
+    # Unsigned on purpose: a length that is too small wraps around to a huge one.
     length = number_at(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
     if int(np.max(length)) > len(data) or (number_at(head, 0, 'u1') != MESSAGE).any():
         return None
@@ -190,8 +190,8 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
 
 def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
     """
-    Go from record to record as far as they are whole, and say what is wrong with the next.
-    Before zeros the last message is left out: its own end may be zeros, too.
+    Read record by record while they are complete; return the messages and the reason of the stop.
+    Before zeros the last message is dropped: its end may be zeros, too.
     """
     view = data.data
     places: list[int] = []
@@ -225,12 +225,12 @@ def _messages(data: Bytes, at: Ints, size: Ints, head: NDArray[np.void]) -> Mess
     log_ns = number_at(head, 15, '<i8').astype(np.int64)
     if len(log_ns) and int(np.min(log_ns)) < 0:
         raise DamagedError('a message has a log time beyond the year 2262')
-    channel = number_at(head, 9, '<u2').astype(np.uint16)  # copied: each role looks at all of them
+    channel = number_at(head, 9, '<u2').astype(np.uint16)  # contiguous: every role searches it
     return Messages(data, at + MESSAGE_HEAD_BYTES, size, channel, log_ns)
 
 
 def expand(packed: Path, target: Path) -> str | None:
-    """Decompress a ``.zstd`` file of rosbag2; say where it is unreadable, None if it is whole."""
+    """Decompress a ``.zstd`` file of rosbag2; return a description of the damage, or None."""
     with open_regular(packed) as source, target.open('wb') as file:
         limit = packed.stat().st_size * _MAX_GROWTH + _FREE_GROWTH_BYTES
         loss = None
@@ -239,16 +239,16 @@ def expand(packed: Path, target: Path) -> str | None:
                 file.write(data)
         except zstandard.ZstdError as error:
             n_bytes = file.tell()
-            loss = f'{packed.name} is unreadable behind {n_bytes} bytes of its content ({error})'
+            loss = f'{packed.name} is unreadable after {n_bytes} bytes of its content ({error})'
         if not file.tell():
-            raise DamagedError(loss or 'it holds nothing that can be decompressed')
+            raise DamagedError(loss or 'it has no content')
         return loss
 
 
 def inflate(
     compression: str, packed: Any, limit: int, step: int = _STEP_BYTES, *, is_torn: bool = False
 ) -> Bytes:
-    """Decompress bytes, a torn piece as far as they go; DamagedError for more than the limit."""
+    """Decompress bytes, of a torn piece the readable part; DamagedError beyond the limit."""
     if not compression:
         return np.asarray(packed)
     pieces: list[bytes] = []
@@ -261,23 +261,23 @@ def inflate(
 
 
 def inflate_ros1_chunk(packed: bytes) -> bytes:
-    """Decompress a chunk of a ROS 1 bag, which begins as its compression does."""
+    """Decompress a chunk of a ROS 1 bag, whose first bytes identify the compression."""
     compression = {b'BZh': 'bz2', b'\x04\x22\x4d': 'lz4'}.get(packed[:3], '')
     return inflate(compression, packed, MAX_CHUNK_BYTES).tobytes() if compression else packed
 
 
 def _pieces(compression: str, source: Any, limit: int, step: int) -> Iterator[bytes]:
-    """Decompress bytes, or with zstd a file, so many at a time; DamagedError beyond the limit."""
+    """Decompress bytes, or with zstd a file, by `step` bytes; DamagedError beyond the limit."""
     n_left = limit
     for piece in iter(partial(_reader(compression, source), step), b''):
         n_left -= len(piece)
         if n_left < 0:
-            raise DamagedError(f'it holds more than the {limit} bytes that it may')
+            raise DamagedError(f'its content exceeds the limit of {limit} bytes')
         yield piece
 
 
 def _reader(compression: str, source: Any) -> Callable[[int], bytes]:
-    """Give what decompresses so many bytes; none at the end."""
+    """Return a function that decompresses the next n bytes; empty bytes at the end."""
     if compression == 'zstd':
         decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
         return decompressor.stream_reader(source, read_across_frames=True).read

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns one number inside messages of any type: found by the type's definition, in many at once.
+Owns the reading of a number inside messages of any type, by the type's definition.
 
 A topic is named ``TOPIC:FIELD``, as for ``ros2 topic echo --field``. In plain CDR a field begins
-at a multiple of its size behind the encapsulation; strings and sequences have their length, a
-uint32, in front. Positions are kept for all messages together and moved on field by field.
+at a multiple of its size after the encapsulation; the length of a string or sequence, a uint32,
+precedes it. The positions in all messages advance together, field by field.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ _EXTREME = re.compile('(^|_)(min|max)(_|$)')
 _HEADER = 'std_msgs/msg/Header'
 _IDL = '=' * 80 + '\nIDL: '
 
-#: By type the constants and the fields, each a name and a description as `rosbags` has them.
+#: Constants and fields by type; a field is a name and a description as in `rosbags`.
 Definitions = Mapping[str, tuple[Any, list[tuple[str, Any]]]]
 
 
 @lru_cache(maxsize=1)
 def typestore() -> Any:
-    """Give the message types of ROS 2 Jazzy."""
+    """Return the message types of ROS 2 Jazzy."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitions:
-    """Find what a type is made of: by the bag's definitions, else those of ROS 2 Jazzy."""
+    """Find the definition of a type in the bag, or else in ROS 2 Jazzy."""
     from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
     own: dict[str, Any] = {}
@@ -83,19 +83,19 @@ def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A number in the messages of a type, by names that lead to it; RecordingError for none."""
+    """A number in the messages of a type, by its path; RecordingError if there is none."""
 
     kind: str
     path: str
     definitions: Definitions
 
     def __post_init__(self) -> None:
-        """Refuse a path that leads to no number."""
+        """Refuse a path that does not end at a number."""
         self._find(Messages.of([], [], []), self.path)
 
     @property
     def has_stamp(self) -> bool:
-        """Whether the messages have a header, or one within their own kind of header."""
+        """Whether the messages have a header, or a special header that contains one."""
         return bool(self._header)
 
     @property
@@ -111,7 +111,7 @@ class Field:
         return ''
 
     def read(self, messages: Messages) -> tuple[Ints, Floats]:
-        """Read stamps [ns], `NO_STAMP_NS` where messages have none, and numbers, shape (n,)."""
+        """Read stamps [ns] (`NO_STAMP_NS` without a header) and numbers, shape (n,)."""
         values = self._find(messages, self.path).astype(np.float64)
         if not self.has_stamp:
             return np.full(len(messages), NO_STAMP_NS), values
@@ -143,7 +143,7 @@ class Field:
                 description = cursor.enter(description, int(match[2]))
             kind = description[1] if description[0] == _NAME else ''
         if description[0] != _BASE or description[1][0] not in _KINDS:
-            raise RecordingError(f'`{path}` of {self.kind} is no number')
+            raise RecordingError(f'`{path}` of {self.kind} is not a number')
         return cursor.number(_KINDS[description[1][0]])
 
 
@@ -151,11 +151,11 @@ _BASE, _NAME, _ARRAY = (
     1,
     2,
     3,
-)  # of a description: a basic type, a message, an array; or a sequence
+)  # node kinds of a description: basic type, message, array, sequence
 
 
 class _Cursor:
-    """Positions in many messages [bytes behind the encapsulation]."""
+    """Positions in many messages [bytes after the encapsulation]."""
 
     def __init__(self, messages: Messages, definitions: Definitions) -> None:
         self._messages, self._definitions = messages, definitions
@@ -166,7 +166,7 @@ class _Cursor:
         self._is_big = heads == 0
 
     def number(self, kind: str) -> Any:
-        """Read a number of each message, and go behind it."""
+        """Read a number of each message, and advance past it."""
         size = int(kind[1:])
         self._at = (self._at + size - 1) // size * size
         at, self._at = self._at + 4, self._at + size
@@ -177,7 +177,7 @@ class _Cursor:
         return np.where(self._is_big, big, little)
 
     def skip(self, description: Any) -> None:
-        """Go behind a field."""
+        """Advance past a field."""
         node, content = description
         if node == _NAME:
             for _, one in self._definitions[content][1]:
@@ -194,12 +194,12 @@ class _Cursor:
         elif content[0] in _KINDS:
             self._leap(np.ones_like(self._at), int(_KINDS[content[0]][1:]))
         else:
-            raise RecordingError(f'a {content[0]} in front of the field is not understood')
+            raise RecordingError(f'a {content[0]} before the field is not supported')
 
     def enter(self, description: Any, place: int) -> Any:
-        """Go to an element of an array or a sequence, and give its description."""
+        """Advance to an element of an array or a sequence; return its description."""
         if description[0] in (_BASE, _NAME):
-            raise RecordingError(f'[{place}] of what is no array')
+            raise RecordingError(f'[{place}] of a field that is not an array')
         counts, element = self._count(description), description[1][0]
         if (counts <= place).any():
             raise RecordingError(f'[{place}] of an array of {int(counts.min())}')
@@ -219,7 +219,7 @@ class _Cursor:
             raise RecordingError('damaged message: it ends inside a field')
 
     def _skip_each(self, element: Any, counts: Ints) -> None:
-        """Go behind elements of which no two need have one size."""
+        """Advance past elements of variable size."""
         while (rows := np.flatnonzero(counts > 0)).size:
             some = _Cursor(self._messages.take(rows), self._definitions)
             some._at = self._at[rows]

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns messages while they come: what is new in somebody else's bag, and numbered bags of ours.
+Owns live recording: new messages of a bag that another program writes, and our numbered bags.
 
-Each look reads a growing bag from its beginning, so looks are as far apart as they take long. What
-comes becomes a folder of bags, `01.mcap`, ... under the node's own names; where one ends is known
-a little late, so the newest messages are held back.
+Each pass reads the growing bag from its beginning, so the pauses grow with the duration of a pass.
+The messages are written to a folder of bags, `01.mcap`, ... with the node's topic names. The end
+of a position is recognised with a delay, so the newest messages are held back.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from .topics import Topics
 from .writer import BagWriter
 
 _USUAL = Topics()
-_CHUNK_BYTES = 1 << 17  # little is lost with a process that is killed: half a minute at 100 Hz
+_CHUNK_BYTES = 1 << 17  # data lost if the process is killed: half a minute at 100 Hz
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
-#: The hidden name of a bag that is being written: its number, the process.
+#: Hidden name of a bag that is being written: its number and the process number.
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
-_SHARE = 0.2  # a look may take this part of the time
+_SHARE = 0.2  # largest share of the time spent reading
 
-#: What has come: a block with its serialized messages, and from which bag.
+#: A new block with its serialized messages, and the bag that it comes from.
 News = tuple[Block, RecordingInfo | None]
 
 
@@ -42,8 +42,8 @@ def growing_blocks(
     path: Path, topics: Topics, wait: Callable[[float], bool]
 ) -> Iterator[News | None]:
     """
-    Give what is new in a bag, and None at the end of each look, until the bag is whole;
-    `wait` waits so long [s] and tells whether to end.
+    Yield the new blocks of a bag, and None at the end of each pass, until the bag is complete;
+    `wait` waits for a time [s] and returns whether to end.
     """
     if not path.exists():
         raise RecordingError('no such file or directory', path)
@@ -54,7 +54,7 @@ def growing_blocks(
         try:
             reader = open_recording(path, topics, require=())
         except RecordingError:
-            # A recorder creates its files before it has anything to write, or whole records.
+            # A recorder creates its files before it writes complete records.
             before, size = size, _size(path)
             if n_seen or 0 < size == before:
                 raise
@@ -82,13 +82,13 @@ def _size(path: Path) -> int:
 
 
 def numbered_bags(folder: Path) -> list[Path]:
-    """List the bags that a folder has, in the order of their numbers."""
+    """List the bags of a folder, in the order of their numbers."""
     found = {int(one.stem): one for one in folder.glob('*.mcap') if one.stem.isdecimal()}
     return [found[number] for number in sorted(found)]
 
 
 def leftovers(folder: Path) -> dict[Path, int]:
-    """List the bags that runs which ended in a crash have left, with the numbers they had."""
+    """List the unfinished bags left by crashed runs, with their numbers."""
     found: dict[Path, int] = {}
     for path in sorted(folder.glob('.*.partial.mcap')):
         named = _LEFT.fullmatch(path.name)
@@ -99,8 +99,8 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Make a bag, numbered so or by the next free number, of what a crash has left, which then goes;
-    None where no message was in it. RecordingError where nothing can be read of it.
+    Turn an unfinished bag into a bag with this number, or the next free one, and delete it; None
+    if it has no message. RecordingError if nothing can be read.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(one.stem) for one in numbered_bags(path.parent)}
@@ -117,7 +117,7 @@ def finish(path: Path, number: int) -> Path | None:
 
 
 class PositionBags:
-    """Writes the bags; the next number is taken when its first message is written."""
+    """Writes the bags; a bag gets its number when its first message is written."""
 
     def __init__(self, folder: Path, serial: str | None, number: int | None = None) -> None:
         self._folder, self._serial = folder, serial
@@ -126,16 +126,16 @@ class PositionBags:
         check_output(folder / f'{self._number:02d}.mcap', MCAP)
         self._writer: BagWriter | None = None
         self._held: list[Block] = []
-        self.written: list[Path] = []  # bags that were begun
+        self.written: list[Path] = []  # bags begun so far
 
     def add(self, block: Block, info: RecordingInfo | None) -> None:
-        """Take the serialized messages, and from where they come."""
+        """Take a block with its serialized messages, and the description of its bag."""
         if info is not None and self._serial is None:
             self._serial = info.metadata.get('serial')
         self._held.append(block)
 
     def release(self, stamp_ns: int) -> None:
-        """Write what is older than a stamp."""
+        """Write the messages older than a stamp."""
         held, self._held = self._held, []
         try:
             for block in held:
@@ -149,7 +149,7 @@ class PositionBags:
             if self._writer is not None:
                 self._writer.flush()
         except OutputError:
-            self._writer, self._held = None, []  # it is said once, and not tried again
+            self._writer, self._held = None, []  # report the error once, do not try again
             raise
 
     def _write(self, block: Block) -> None:
@@ -170,7 +170,7 @@ class PositionBags:
                 self._writer.write_raw(topic, kind, one.log_ns, one)
 
     def close(self, before_ns: int = _NEVER_NS) -> None:
-        """End the bag before a stamp, or with all that is held."""
+        """End the bag before a stamp, by default with all messages held back."""
         self.release(before_ns)
         writer, self._writer = self._writer, None
         if writer is not None:

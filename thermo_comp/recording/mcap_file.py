@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the fast path: one MCAP file, and its messages chunk by chunk in bounded memory.
+Owns the fast path: an MCAP file, read chunk by chunk in bounded memory.
 
-An ordinary file says in its summary which stretches hold its messages. One without a usable
-summary, or cut off anywhere, is gone through record by record, and its messages are counted.
-Whatever is no message is read by the `mcap` library.
+The summary of a complete file lists the spans that hold messages. A file without a usable summary,
+or cut off anywhere, is read record by record, and its messages are counted. Records other than
+messages are read by the `mcap` library.
 """
 
 from __future__ import annotations
@@ -42,30 +42,30 @@ _FOOTER_BYTES = PREFIX.size + 20 + len(MAGIC)
 _MAX_SUMMARY_BYTES = 1 << 28
 _MAX_SMALL_RECORD = 1 << 22
 _WINDOW_BYTES = 1 << 22
-_MAX_HELD_BYTES = 1 << 26  # messages of overlapping chunks that are held back at most [bytes]
-#: What ends inside a record, by its opcode, or -1 for the others.
+_MAX_HELD_BYTES = 1 << 26  # largest memory for messages of overlapping chunks [bytes]
+#: Texts for a file that ends inside a record, by its opcode; -1 for the others.
 _CUTS = {
     0: 'it is unreadable from byte {at} on',
     int(Opcode.CHUNK): 'it ends inside a chunk, of which the first {} messages are read',
     int(Opcode.MESSAGE_INDEX): 'it ends inside the index of its last chunk, which is read whole',
     -1: 'it ends inside a record, everything before that is read',
 }
-#: The records beside messages that matter.
+#: The record types, other than messages, that are used.
 _KINDS: Mapping[int, Any] = {
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
     Opcode.METADATA: Metadata,
 }
-#: What the summary says of a chunk, in the order of the fields of a `Span`.
+#: Attributes of a chunk index, in the order of the fields of a `Span`.
 _SPAN_FIELDS = attrgetter(
     *('chunk_start_offset', 'chunk_length', 'message_index_length'),
     *('uncompressed_size', 'message_start_time', 'message_end_time'),
 )
-_new_stream: Any = ReadDataStream  # versions of mcap differ in what of it is typed
+_new_stream: Any = ReadDataStream  # versions of mcap differ in its type hints
 
 
 class McapFile(BagFile):
-    """One open MCAP file; its `spans` hold messages, in their order."""
+    """An open MCAP file; `spans` are the parts that hold messages, in order."""
 
     def __init__(self, path: Path, name: Path) -> None:
         super().__init__(name)
@@ -91,7 +91,7 @@ class McapFile(BagFile):
         return loaded
 
     def _load(self, channels: Collection[int], span: Span) -> Messages:
-        """Read a stretch; records that matter were read when the file was opened."""
+        """Read a span; other records than messages were read when the file was opened."""
         return load(self._read_at, span, lambda *_: None).of_channels(channels).in_order()
 
     def _read_at(self, at: int, n_bytes: int) -> bytes:
@@ -105,7 +105,7 @@ class McapFile(BagFile):
             raise RecordingError('not an MCAP file')
         begin = len(head) + int.from_bytes(head[len(_BEGIN) :], 'little')
         if len(head) < len(_BEGIN) + 8 or begin > self._size:
-            raise RecordingError('cut off inside its header, there is nothing to read')
+            raise RecordingError('cut off inside its header: nothing can be read')
         end = self._read_footer(begin)
         if not self.spans:
             self._scan(begin, end)
@@ -123,7 +123,7 @@ class McapFile(BagFile):
                 self.definitions[schema.name] = (schema.encoding, text)
 
     def _read_footer(self, begin: int) -> int | None:
-        """Where the data section ends, and what the summary says; None where there is no end."""
+        """Read footer and summary; return the end of the data section, None without a footer."""
         at = self._size - _FOOTER_BYTES
         footer = self._read_at(at, _FOOTER_BYTES) if at >= begin else b''
         if not footer.startswith(b'\x02\x14' + bytes(7)) or not footer.endswith(MAGIC):
@@ -138,7 +138,7 @@ class McapFile(BagFile):
         return summary
 
     def _read_summary(self, content: bytes) -> None:
-        """Take what the summary says; a damaged or incomplete one is as good as none."""
+        """Read the summary; ignore it if damaged or incomplete."""
         found: dict[type, list[Any]] = {}
         try:
             reader = StreamReader(BytesIO(content), skip_magic=True, emit_chunks=True)
@@ -172,7 +172,7 @@ class McapFile(BagFile):
                 self._on_record(Opcode.METADATA, pairs)
 
     def _on_record(self, opcode: int, content: bytes) -> None:
-        """Take a record of the data section that is no message."""
+        """Take a record of the data section other than a message."""
         if opcode not in _KINDS:
             return
         try:
@@ -187,7 +187,7 @@ class McapFile(BagFile):
             self.metadata.update(record.metadata)
 
     def _scan(self, at: int, end: int | None) -> None:
-        """Go through the file's records; where it has no end, up to the last whole message."""
+        """Read the file record by record; without an end, up to the last complete message."""
         stop = self._size if end is None else end
         words = 'it ends between two records, so more may have followed'
         spans = [Span(0, 0)]
@@ -201,7 +201,7 @@ class McapFile(BagFile):
                     raise DamagedError(f'the record at byte {at} is not whole')
                 words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
-                    # With the zeros that follow, which end the walk: its own end may be zeros too.
+                    # Include the following zeros, which end the span: its end may be zeros too.
                     kind = last.kind if last.kind == 'loose' else 'torn'
                     spans[-1] = replace(last, length=last.length + PREFIX.size, kind=kind)
                 elif opcode == Opcode.CHUNK:
@@ -231,7 +231,7 @@ class McapFile(BagFile):
             self.truncated = f'the file is cut off at byte {self._size}: {words}'
 
     def _count(self, spans: Sequence[Span], words: str, is_whole: bool) -> str:
-        """Read all messages once: how many there are, and from when to when."""
+        """Read all messages once to get their number and times."""
         n_torn = 0
         for span in spans:
             try:
@@ -252,9 +252,9 @@ class McapFile(BagFile):
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
-    """Merge stretches, given with their numbers and the first log time of what follows."""
-    # Once the next one begins at time t, whatever was read before t is final. So only the messages
-    # of chunks that overlap at one instant are ever held back.
+    """Merge pieces, given with their numbers and the first log time of the next piece."""
+    # Messages before the first log time of the next piece are final, so only messages of chunks
+    # that overlap in time are held back.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:
         held[row] = piece

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the MCAP file being written: chunks with their message indexes, the summary at the end, and
-what rosbag2 says of it (metadata.yaml of version 9). Messages and their indexes are numpy bytes;
-the few other records go through the `mcap` library's classes.
+Owns the writing of an MCAP file: chunks with message indexes, the summary at the end, and the
+metadata.yaml of rosbag2 (version 9). Messages and their indexes are numpy bytes; the few other
+records use the classes of the `mcap` library.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from .mcap_file import MAGIC, METADATA_NAME
 
 Compression = Literal['none', 'lz4', 'zstd']
 
-#: Each with a level that zstd has.
+#: Compression of data with a zstd level.
 _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
     'none': lambda data, _: data,
     'lz4': lambda data, _: lz4.frame.compress(data),
@@ -44,9 +44,9 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
 #: Topics of which a late reader gets the last message, perhaps in a namespace.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
-# Versions of mcap differ in which of its methods are typed.
+# Versions of mcap differ in its type hints.
 _new_builder: Callable[[], Any] = RecordBuilder
-#: Opcode, length, channel, sequence, log time, publish time.
+#: Head of a message record: opcode, length, channel, sequence, log time, publish time.
 _RECORD_HEAD = np.dtype('u1, <u8, <u2, <u4, <i8, <i8')
 _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
@@ -54,8 +54,8 @@ _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 @lru_cache(maxsize=64)
 def known_definition(kind: str) -> tuple[str, str, str]:
     """
-    Look up encoding, text with all it depends on, and hash (RIHS01) of a message type of ROS 2
-    Jazzy; RecordingError for one that it does not have.
+    Look up encoding, full text (with dependencies) and hash (RIHS01) of a message type of ROS 2
+    Jazzy; RecordingError if Jazzy does not have the type.
     """
     store = typestore()
     if kind not in store.fielddefs:
@@ -65,7 +65,7 @@ def known_definition(kind: str) -> tuple[str, str, str]:
 
 
 class McapOutput:
-    """One new MCAP file, its metadata at the front, so that even a torn one has them."""
+    """A new MCAP file; its metadata are at the front, so that a torn file has them, too."""
 
     def __init__(
         self,
@@ -87,14 +87,14 @@ class McapOutput:
         self._tail: list[Messages] = []
         self._at = 0
         self._stream = path.open('xb', buffering=0)
-        self.close = self._stream.close  # as it is
+        self.close = self._stream.close  # without finishing the file
         self._put(MAGIC)
         self._put_record(records.Header('ros2', f'thermo_comp {__version__}'))
         if metadata:
             self._put_metadata(METADATA_NAME, metadata)
 
     def channel(self, topic: str, kind: str, definition: tuple[str, str, str]) -> int:
-        """Give the number of a topic's channel, made where it is new."""
+        """Return the channel number of a topic; create the channel if it is new."""
         encoding, text, type_hash = definition
         schema, known = self._schemas.get(kind), self._channels.get(topic)
         if known is not None:
@@ -121,7 +121,7 @@ class McapOutput:
         return channel.id
 
     def append(self, batches: Sequence[Messages]) -> None:
-        """Add messages in log-time order; whole chunks are written, the rest waits for more."""
+        """Add messages in log-time order; full chunks are written, the rest is kept."""
         messages = join_messages([*self._tail, *batches])
         n_old = sum(map(len, self._tail))
         order = np.argsort(messages.log_ns[n_old:], kind='stable')
@@ -135,7 +135,7 @@ class McapOutput:
         self._tail = [messages.take(slice(begin, None)).packed()]
 
     def finish(self) -> dict[str, Any]:
-        """Write the last chunk, the summary and the footer; gives what metadata.yaml says."""
+        """Write the last chunk, summary and footer; return the content of metadata.yaml."""
         for messages in self._tail:
             if len(messages):
                 self._put_chunk(messages)
@@ -148,7 +148,7 @@ class McapOutput:
         return found
 
     def _information(self) -> dict[str, Any]:
-        """Build metadata.yaml as Jazzy has it."""
+        """Build metadata.yaml as in Jazzy."""
         start_ns, end_ns = self._times()
         kinds = {one.id: kind for kind, one in self._schemas.items()}
         counted: list[dict[str, Any]] = [
@@ -183,7 +183,7 @@ class McapOutput:
         }
 
     def _times(self) -> tuple[int, int]:
-        """Give the log times of the first and the last message."""
+        """Return the log times of the first and the last message."""
         start = min((one.message_start_time for one in self._chunks), default=0)
         return start, max((one.message_end_time for one in self._chunks), default=0)
 
@@ -207,7 +207,7 @@ class McapOutput:
         self._metadata_index.append(records.MetadataIndex(begin, self._at - begin, name))
 
     def _put_chunk(self, messages: Messages) -> None:
-        """Lay messages out as the records of a chunk, and write it with its message indexes."""
+        """Write messages as a chunk with its message indexes."""
         log_ns, channel, size = messages.log_ns, messages.channel, messages.size
         laid = messages.packed(MESSAGE_HEAD_BYTES)
         data, at = laid.data, laid.start - MESSAGE_HEAD_BYTES
@@ -269,7 +269,7 @@ class McapOutput:
 
 
 def _offered_qos(topic: str) -> dict[str, Any]:
-    """Give the QoS profile that is recorded as offered: reliable, so that any reader matches."""
+    """Return the QoS profile recorded as offered: reliable, so that any reader matches."""
     is_flag = topic.endswith(_LATCHED)
     return {
         'history': 'keep_last',
@@ -286,6 +286,6 @@ def _offered_qos(topic: str) -> dict[str, Any]:
 
 def dump_yaml(content: Any) -> str:
     """Write YAML in block style with the keys in their order."""
-    # Values that stand twice are written twice.
+    # Repeated values are written out, without aliases.
     dumper: Any = type('Dumper', (yaml.SafeDumper,), {'ignore_aliases': lambda *_: True})
     return str(yaml.dump(content, None, dumper, sort_keys=False, allow_unicode=True, width=10_000))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the look at a recording before a fit: how long, how fast, how warm, how still, how whole.
+Owns the survey of a recording before a fit: duration, rates, temperatures, rests, losses.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from .reader import RecordingReader, open_recording
 from .stillness import STILL_SD, CellAccumulator, still_intervals, why_restless
 from .topics import PLAIN, Topics, shown
 
-#: What no board endures, and a thermometer in kelvins reads.
+#: Range of readings that are probably kelvins: no board endures them in degC.
 KELVINS = (180.0, 480.0)
-_RAMP_WINDOW_S = 120.0  # a ramp's rate is that of the board over so long
+_RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0
-_GAP_INTERVALS = 5.0  # a pause of this many usual intervals is a gap
+_GAP_INTERVALS = 5.0  # pause that counts as a gap, in usual intervals
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name yours with '
     '--topic counts=TOPIC or --topic imu=TOPIC'
@@ -35,7 +35,7 @@ _NO_SAMPLES = (
 
 @dataclass(frozen=True)
 class ThermometerSurvey:
-    """One thermometer: degC, largest mean rates over two minutes, smallest step of readings."""
+    """A thermometer: range [degC], largest mean rates over two minutes, smallest step."""
 
     n: int
     rate_hz: float
@@ -49,8 +49,8 @@ class ThermometerSurvey:
 @dataclass(frozen=True)
 class Survey:
     """
-    What a recording holds, as far as a fit is concerned. The rate is by the usual interval, still
-    intervals last at least 3 s; findings say what stands between it and a fit, and the next step.
+    Summary of a recording for a fit. The rate follows from the usual interval; still intervals
+    last at least 3 s; findings are obstacles to a fit, with the next step.
     """
 
     info: RecordingInfo
@@ -66,7 +66,7 @@ class Survey:
 def thermal_findings(
     thermometers: Mapping[str, ThermometerSurvey], candidates: Sequence[str] = ()
 ) -> list[str]:
-    """Say what of thermometers, span and ramps is missing; `candidates` are unused topics."""
+    """List missing thermometers, span and ramps; `candidates` are unused topics."""
     found = []
     among = f': {", ".join(candidates)}' if candidates else ''
     board = thermometers.get('board')
@@ -82,11 +82,11 @@ def thermal_findings(
             found.append(f'board temperature spans {span:.1f} K: {ADVISED_SPAN_K:g} are advised')
         for name, rate in (('heating', heating), ('cooling', cooling)):
             if rate < RAMP_K_MIN:
-                found.append(f'no {name} ramp: the dynamic set would not know {name}')
+                found.append(f'no {name} ramp: the dynamic set would be extrapolated to {name}')
     for name, one in thermometers.items():
         reads = f'{name} reads {one.lowest:.4g} .. {one.highest:.4g}'
         if one.lowest < COLDEST or one.highest > HOTTEST:
-            found.append(f'{reads}: that is no degC')
+            found.append(f'{reads}: that is not degC')
         elif KELVINS[0] < one.lowest and one.highest < KELVINS[1]:
             found.append(f'temperature/{reads} degC: that looks like kelvins')
     if 'case' not in thermometers:
@@ -98,7 +98,7 @@ def thermal_findings(
 
 
 def unused_thermometers(reader: RecordingReader) -> list[str]:
-    """List what else in a bag may be a thermometer: a barometer's, the air's, another IMU's."""
+    """List unused topics that may hold a temperature: a barometer's, the air's, another IMU's."""
     found = []
     paths = {role: one.path for role, one in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}
@@ -122,7 +122,7 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         cells, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        # A thermal test has few readings beside its samples.
+        # Kept in memory: a thermal test has few readings compared with its samples.
         readings: dict[str, list[Readings]] = {}
         n = n_gaps = n_backwards = first_ns = last_ns = 0
         longest_gap = step_ns = 0.0
@@ -163,13 +163,13 @@ def survey_recording(
         (cause, cause),
         (
             n and not still and not cause,
-            f'it never rests for 3 s, and a fit works on rests: {why_restless(reduced)}',
+            f'it never rests for 3 s, and a fit needs rests: {why_restless(reduced)}',
         ),
         (n_backwards, f'{n_backwards} stamps do not rise: those samples are left out'),
         (n_gaps, f'{n_gaps} gaps, the longest {longest_gap:.3g} s'),
     ]
     duration_s = (last_ns - first_ns) * 1e-9
-    # whole cells: the first and the last may reach beyond the samples
+    # The first and the last cell may extend beyond the samples.
     still_s = min(sum((upper - lower) * reduced.cell_s for lower, upper in still), duration_s)
     return Survey(
         info,
@@ -184,7 +184,7 @@ def survey_recording(
 
 
 def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:
-    """Describe one thermometer by its readings, in pieces; None where there is no number."""
+    """Describe a thermometer by pieces of its readings; None without a finite reading."""
     if not readings:
         return None
     stamp_ns = np.concatenate([one.stamp_ns for one in readings])
@@ -193,7 +193,7 @@ def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None
     stamp_ns, celsius = stamp_ns[use], celsius[use]
     if not len(celsius):
         return None
-    # Rates from means over two minutes, so that a quantum is not a ramp.
+    # Rates of two-minute means, so that a quantum does not look like a ramp.
     time = (stamp_ns - stamp_ns[0]) * 1e-9
     bins = np.maximum(time // _RAMP_WINDOW_S, 0).astype(np.int64)
     _, place = np.unique(bins, return_inverse=True)

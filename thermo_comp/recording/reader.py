@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the door to recordings: open a bag of any storage, say what it holds, read it as columns.
+Owns the reader of recordings: opens a bag of any storage, describes it, reads it as columns.
 
-Reading order is that of a ROS player: log time, and for equal log times the place in the file. The
-split files of one bag follow each other as its metadata.yaml lists them.
+Reading order is that of a ROS player: log time, and for equal log times the position in the file.
+The files of a split bag are read in the order of its metadata.yaml.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from .wire import Feed, decode_blocks
 
 _MAX_BYTES = 1 << 24
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
-#: What is decoded at once of a foreign file.
+#: Largest batch decoded at a time of a foreign file: messages, bytes, time [ns].
 _BATCH_MESSAGES = 1 << 14
 _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
 
@@ -55,11 +55,10 @@ class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
 
-    Roles that are required are an error where they are absent. `info` is what the bag says of
-    itself; once all blocks are read, its `truncated` names what did not come. `topics` are the
-    bag's own names, `fields` what is read of messages that hold more than the role, and
-    `definitions` encoding and text of message types. Raises RecordingError for
-    what is no bag, a damaged one, a missing or ambiguous topic.
+    An absent role in `require` is an error. `info` describes the bag; after all blocks are read,
+    its `truncated` names the missing messages. `topics` are the bag's names by role, `fields` the
+    fields read from messages with more content, `definitions` encoding and text of message types.
+    Raises RecordingError if it is not a bag or damaged, or a topic is missing or ambiguous.
     """
 
     def __init__(
@@ -86,9 +85,9 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Where the part that is read begins, since the bag's first sample [s]; known then.
+        #: Begin of the part that is read since the bag's first sample [s]; set by that sample.
         self.since_s = 0.0
-        self.apart = ''  # which thermometer has another clock, as far as is read
+        self.apart = ''  # warning about a thermometer with another clock, so far
 
     def _fields(self, found: Selected) -> Iterator[tuple[Role, Field]]:
         for role, path in found.fields.items():
@@ -100,7 +99,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(error.message, key=shown(f'{topic}:{path}')) from error
 
     def _open(self, path: Path) -> RecordingInfo:
-        """Open the files; those that rosbag2 has compressed as a whole are expanded beside."""
+        """Open the files; files that rosbag2 has compressed are expanded to temporary files."""
         found = _described(path)
         folder = ''
         if found.compression == 'file':
@@ -177,7 +176,7 @@ class RecordingReader(ExitStack):
                 self.info = replace(self.info, truncated=told)
 
     def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
-        """Read topics, by the bag's own names, as they are, about in order of log time."""
+        """Read serialized messages of topics (the bag's names), roughly in log-time order."""
         for _, own, messages in self._read(topics, {'cdr'}):
             for number, topic in own.items():
                 if len(one := messages.of_channels([number])):
@@ -186,7 +185,7 @@ class RecordingReader(ExitStack):
     def _read(
         self, names: Collection[str], encodings: Collection[str]
     ) -> Iterator[tuple[Path, Mapping[int, Topic], Messages]]:
-        """Read the messages of topics, file by file, with the file and its channels."""
+        """Read the messages of topics by file: path, its channels, messages."""
         if not self._files:
             raise RecordingError('the recording is closed', self.info.path)
         for file in self._files:
@@ -200,13 +199,13 @@ class RecordingReader(ExitStack):
                     yield file.path, own, messages
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
-        """Read the bag for whoever walks its time: without the jumps of its clock."""
+        """Read the bag without the jumps of its clock, for uses that need a grid over time."""
         if self._part.is_stamped:
             return without_jumps(self.blocks(), self.info.path)
         return self._cut(without_jumps(self._blocks(), self.info.path))
 
     def _cut(self, blocks: Iterator[Block]) -> Iterator[Block]:
-        """Leave out what is outside the part; RecordingError where no sample is left."""
+        """Drop messages outside the part; RecordingError if no sample is left."""
         if self._part == WHOLE:
             yield from blocks
             return
@@ -246,13 +245,13 @@ def read_recording(
 
 
 def inspect_recording(path: str | Path, topics: Topics | None = None) -> RecordingInfo:
-    """Say what a bag holds without reading its messages; raises as `open_recording` does."""
+    """Describe a bag without reading its messages; raises as `open_recording` does."""
     with open_recording(path, topics, require=()) as reader:
         return reader.info
 
 
 def _described(path: Path) -> _Description:
-    """Find the files of a bag; RecordingError for no bag."""
+    """Find the files of a bag; RecordingError if it is not a bag."""
     if not path.exists():
         raise RecordingError('no such file or directory', path)
     if path.is_dir():
@@ -264,8 +263,7 @@ def _described(path: Path) -> _Description:
             if files:
                 if len({re.sub(r'_[0-9]+$', '', one.stem) for one in files}) > 1:
                     raise RecordingError(
-                        f'a folder of {len(files)} bags, and no bag itself: give *{suffix} in it',
-                        path,
+                        f'a folder of {len(files)} bags, not a bag: give *{suffix} in it', path
                     )
                 note = 'metadata.yaml is missing, the recording was not finished'
                 return _Description(suffix[1:], tuple(sorted(files, key=_place_of)), note=note)
@@ -279,7 +277,7 @@ def _described(path: Path) -> _Description:
 
 @dataclass(frozen=True, slots=True)
 class _Description:
-    """The files of a bag: what was compressed by itself, counted per topic, and is missing."""
+    """The files of a bag, with compression, counts per topic and a note on missing parts."""
 
     storage: str
     files: tuple[Path, ...]
@@ -290,7 +288,7 @@ class _Description:
 
 
 def _read_metadata(directory: Path) -> _Description | None:
-    """Read the metadata.yaml of a bag; None if it is missing or empty: the recorder was killed."""
+    """Read a bag's metadata.yaml; None if missing or empty, as after a killed recorder."""
     path = directory / 'metadata.yaml'
     try:
         text = read_bounded(path, _MAX_BYTES)
@@ -328,7 +326,7 @@ def _read_metadata(directory: Path) -> _Description | None:
 
 
 def _place_of(file: Path) -> tuple[int, str]:
-    """Give the number at the end of a file's name, by which the files of a split bag follow."""
+    """Return the sort key of a file of a split bag: the number at the end of its name."""
     number = re.search(r'_([0-9]+)$', file.stem)
     return (int(number[1]) if number else 0, file.name)
 
@@ -336,13 +334,13 @@ def _place_of(file: Path) -> tuple[int, str]:
 def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
     if n_read >= n_promised:
         return None
-    return f'{shown(topic)}: {n_read} of the {n_promised} messages promised are there'
+    return f'{shown(topic)}: {n_read} of the {n_promised} messages listed are there'
 
 
 class ForeignFile(BagFile):
     """
-    A file that is not plain MCAP (sqlite3, ROS 1), read by `rosbags`, and decoded many messages
-    at a time; `is_packed` where each message is compressed by itself.
+    A file other than plain MCAP (sqlite3, ROS 1), read by `rosbags` and decoded in batches;
+    `is_packed`: each message is compressed separately.
     """
 
     def __init__(self, path: Path, name: Path, *, is_packed: bool = False) -> None:
@@ -364,7 +362,7 @@ class ForeignFile(BagFile):
                 self.start_ns = int(reader.start_time)
                 self.end_ns = int(reader.end_time) - 1
             for number, one in enumerate(reader.connections):
-                # A database holds whatever it was given, in any column.
+                # Columns of an SQLite database have no fixed type.
                 if not (isinstance(one.topic, str) and isinstance(one.msgtype, str)):
                     raise RecordingError('a topic has no name or no type')
                 self.topics[number] = Topic(one.topic, one.msgtype, encoding, one.msgcount)
@@ -373,7 +371,7 @@ class ForeignFile(BagFile):
                     self.definitions[one.msgtype] = kind, one.msgdef.data
 
     def read(self, channels: Collection[int]) -> Iterator[Messages]:
-        """Read messages of channels, the numbers of the reader's connections, in reading order."""
+        """Read the messages of channels (the reader's connections) in reading order."""
         chosen = [self._reader.connections[number] for number in channels]
         known = {(one.topic, one.msgtype): n for n, one in zip(channels, chosen, strict=True)}
         batch: list[tuple[bytes, int, int]] = []

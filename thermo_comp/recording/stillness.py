@@ -3,12 +3,12 @@
 """
 Owns still intervals: raw samples -> short cells (count, mean, variance) -> where nothing moved.
 
-Two tests are relative to the bag's own quiet level: the variance inside a cell (vibration,
-handling) and the step between neighbouring cells (a turn, a knock): a step starts a new interval,
-because a shift of one microradian is already one micro-g. Temperature moves a unit at rest, too:
-what the cells around do in one direction, slower than the Earth turns, is a drift and no step.
-Two are absolute, because a flight has a quietest tenth, too: a sensor at rest scatters by no more
-than its noise, and does not turn.
+Two tests are relative to the quiet level of the bag: the variance inside a cell (vibration,
+handling) and the step between adjacent cells (a turn, a knock). A step starts a new interval,
+because a tilt of one microradian is already one micro-g. Temperature tilts a unit at rest, too: a
+steady change over the cells around, slower than the Earth rotates, is a drift and not a step. Two
+tests are absolute, because a flight also has a quietest tenth: a sensor at rest scatters by no
+more than its noise, and does not rotate.
 """
 
 from __future__ import annotations
@@ -21,27 +21,28 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..typing import Bools, Floats, Ints
 from .colour import roughest_at_rest, spread_of_variances
 
-#: How many times the quiet level a cell's variance, of n >= 30 samples, may be: 4 is exceeded by
-#: chance with probability below 1e-11, and vibration worth cutting out is far above.
+#: Largest variance of a cell at rest (n >= 30 samples) / quiet level: noise exceeds 4 with a
+#: probability below 1e-11, and vibration that must be cut out is far above.
 VARIANCE_RATIO = 4.0
-#: The noisiest sensors scatter by less than this at rest [parts of g]; few things that fly do.
+#: Largest scatter at rest [g]: above that of the noisiest sensors, below that of most flights.
 STILL_SD = 0.05
-# What a gyroscope at rest shows: scatter within a cell, and a mean away from its level, which
-# drifts with temperature and is taken over stretches [rad/s, s].
+# Largest scatter of a gyroscope within a cell at rest, and largest distance of a cell's mean from
+# its level [rad/s]; the level drifts with temperature and is averaged over this time [s].
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
-# A drift is the median step of so many around, and no faster than this [parts of g per s].
+# Number of steps whose median is the drift, and the largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
+# Samples searched for a quantum, and smallest number of different steps that prove it.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # how many windows a cell lasts where the samples are slow
-_LONGEST_CELL_NS = 86400e9  # stamps may lie anywhere; no unit rests in one cell for a day
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # possible lengths of a cell of slow samples, in windows
+_LONGEST_CELL_NS = 86400e9  # a longer cell comes from wrong stamps
 MIN_SAMPLES = 30
-_LARGEST = 1e100  # a sample beyond has a square that is no number; it is none itself
-_WORD = 32768.0  # the middle of words of 16 bits
-_LONGER = (23, 31)  # bits beside the sign of longer words
-_STUCK = 0.3  # noise below this many quanta leaves a sensor on one number for long
+_LARGEST = 1e100  # largest valid sample: the square of a larger one may overflow
+_WORD = 32768.0  # the middle of unsigned 16-bit words
+_LONGER = (23, 31)  # magnitude bits of longer words
+_STUCK = 0.3  # noise / quantum below which a sensor repeats one number for long
 
 
 @dataclass(frozen=True)
@@ -73,15 +74,15 @@ class Cells:
     rate_variance: Floats
 
     def part(self, which: slice) -> Cells:
-        """Choose a run of them."""
+        """Select consecutive cells."""
         names = 'time count index mean variance roughness seam rate rate_variance'
         return replace(self, **{name: getattr(self, name)[which] for name in names.split()})
 
 
 class CellAccumulator:
     """
-    Reduces samples to cells of `cell_s`, or of `least` samples if that is longer, while they
-    stream by; a whole number of cells fills `window_s`, or one of `STRETCHES` of them.
+    Reduces streamed samples to cells of `cell_s`, or of `least` samples if that is longer; a whole
+    number of cells fills `window_s`, or a cell lasts one of `STRETCHES` windows.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class CellAccumulator:
         self._middle, self._quantum = 0.0, np.zeros(3)
 
     def add(self, stamp_ns: Ints, samples: Floats, rate: Floats | None = None) -> None:
-        """Take the next samples, shape (n, 3), in file order, and the gyroscope's rates."""
+        """Take the next samples, shape (n, 3), in file order, and the angular rates."""
         if not len(stamp_ns):
             return
         use = (np.abs(samples) < _LARGEST).all(axis=1)
@@ -141,16 +142,15 @@ class CellAccumulator:
         self._sums = [self._sums[0][n:]]
 
     def finish(self) -> Cells:
-        """Return all cells so far, the last one as it is."""
+        """Return all cells so far, including the open one."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # whoever asks again asks for little more
+        self._sums = [sums]  # so that the next call joins only new sums
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)
         mean = total / count[:, None]
         spread = np.maximum(square - count[:, None] * mean**2, 0.0)
         variance = spread / np.maximum(count[:, None] - 1.0, 1.0)
-        # The gyroscope's, where there is one.
         rate, rate_variance = (
             one[:, 3:] if one.shape[1] > 3 else np.zeros((len(one), 3)) for one in (mean, variance)
         )
@@ -165,7 +165,7 @@ class CellAccumulator:
         )
 
     def _look_for_sign(self, samples: Floats) -> None:
-        """See whether words of 16 bits have none: whole, never negative, beyond what is signed."""
+        """Detect unsigned 16-bit words: integers, never negative, beyond the signed range."""
         self._is_negative |= bool((samples < 0.0).any())
         if not self._is_negative and np.max(samples, initial=0.0) > _WORD:
             is_word = (samples == np.rint(samples)) & (samples < 2.0 * _WORD)
@@ -207,7 +207,7 @@ class CellAccumulator:
 
 
 def widened(full_scale: float, samples: Floats) -> float:
-    """Give the full scale of longer words, of 24 or 32 bits, where most samples are such."""
+    """Return the full scale of 24- or 32-bit words if most samples exceed shorter words."""
     size = np.max(np.abs(samples), axis=1) if len(samples) else np.zeros(1)
     if np.median(size) < 2.0 * _WORD or (samples != np.rint(samples)).any():
         return full_scale
@@ -215,7 +215,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least: float) -> float:
-    """Find the length of a cell of which a whole number fills the window, or some windows [ns]."""
+    """Find a cell length [ns] of which a whole number fills the window, or some windows."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
         if n_cells:
@@ -224,16 +224,16 @@ def _part_of(window_s: float, least: float) -> float:
 
 
 def _quantum_of(samples: Floats) -> Floats:
-    """Step of each axis, from the changes between samples; 0 where they are all different."""
+    """Step of each axis, from the changes between samples; 0 if there is none."""
     result = np.zeros(3)
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
         changes = np.sort(changes[changes > 0.0])
         if not len(changes):
             continue
-        # Changes of one step differ by rounding only; without a step no two are alike.
+        # Equal multiples of a step differ by rounding only.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
-        # Nor are larger ones whole numbers of the smallest; those of hands are, of many levels.
+        # All changes must be whole multiples of the smallest.
         steps = changes / changes[0]
         is_whole = len(changes) >= _STEPS_NEEDED and (np.abs(steps - np.rint(steps)) < 0.1).all()
         if n_levels < 0.2 * len(changes) or n_levels == 1 or is_whole:
@@ -245,21 +245,21 @@ def still_intervals(
     cells: Cells, min_rest_s: float, still_sd: float = STILL_SD, ratio: float = VARIANCE_RATIO
 ) -> list[tuple[int, int]]:
     """
-    Find the runs of cells in which nothing moved: half-open ranges of cell numbers, in order.
-    `still_sd` is the largest scatter at rest [parts of g], `ratio` of a variance to the quiet one.
+    Find the runs of still cells: half-open ranges of cell numbers, in order. `still_sd` is the
+    largest scatter at rest [g], `ratio` that of a cell's variance to the quiet level.
     """
     full = _is_full(cells)
     believable = full & is_under(cells, still_sd) & ~_is_turning(cells)
     if not believable.any():
         return []
-    # A sensor that reads the same number for long is no measure of its noise: toggling between two
-    # neighbours has a variance of a quarter step squared. A tenth-percentile of a chi-square
-    # variance lies a little below its mean; 1.3 covers it for cells of 32 samples.
+    # A sensor that repeats one number does not show its noise: toggling between two adjacent
+    # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
+    # variance is a little below its mean; 1.3 covers it for cells of 32 samples.
     drift = _drift(cells, believable)
     level = np.quantile(cells.variance[believable], 0.1, axis=0)
     wider = spread_of_variances(cells, believable, level)
     limit = ratio * np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
-    # A drift of d within a cell has a variance of d^2 / 12, give or take what noise makes of it.
+    # A drift of d within a cell has a variance of d^2 / 12; twice that allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
     limit = limit + within**2 / 6.0 if len(within) else limit
     quiet = believable & (cells.variance <= limit).all(axis=1)
@@ -268,7 +268,7 @@ def still_intervals(
     # A single change of so many sd is one as rough as a whole cell.
     is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
     broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
-    # A cell beside a moving one, or on either side of a step, holds the edge of the motion.
+    # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.
     moved = ~quiet
     near = moved.copy()
     near[1:] |= moved[:-1] | broken
@@ -283,16 +283,16 @@ def still_intervals(
 
 
 def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
-    """Say what speaks against rests in a bag that has none."""
+    """Describe why a bag has no rests."""
     full, under = _is_full(cells), is_under(cells, still_sd)
     if full.any() and not (full & under).any():
         least = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
         return (
-            f'its samples scatter by {1e3 * least:.3g} mg where they are quietest, and by less '
-            f'than {1e3 * still_sd:.3g} mg at rest (--still-sd): worn, driven or shaken?'
+            f'its samples scatter by at least {1e3 * least:.3g} mg, the limit at rest is '
+            f'{1e3 * still_sd:.3g} mg (--still-sd): was the unit worn, driven or shaken?'
         )
     if (full & under & _is_turning(cells)).sum() > 0.5 * full.sum():
-        return 'its gyroscope turns all the time (is it in rad/s?)'
+        return 'its angular rate is never that of a rest (is it in rad/s?)'
     edges = np.diff(np.r_[0, (full & under).astype(np.int8), 0])
     runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
     longest_s = float(np.max(runs, initial=0)) * cells.cell_s
@@ -309,19 +309,19 @@ def _is_full(cells: Cells) -> Bools:
 
 
 def _one_g(cells: Cells) -> float:
-    """Typical reading: gravity, on average, of whatever does not fall."""
+    """Typical norm of the readings, which is gravity in input units."""
     norms = np.linalg.norm(cells.mean - cells.middle, axis=1)
     return float(np.median(norms)) if len(norms) else 0.0
 
 
 def is_under(cells: Cells, still_sd: float) -> Bools:
-    """Whether a cell scatters by no more than a sensor at rest, or its own rounding."""
+    """Whether a cell scatters by no more than a sensor at rest, or by rounding."""
     ceiling = np.maximum((still_sd * _one_g(cells)) ** 2, cells.quantum**2)
     return np.asarray((cells.variance <= ceiling).all(axis=1))
 
 
 def _is_turning(cells: Cells) -> Bools:
-    """Whether the gyroscope saw a cell shake or turn; it has a level that drifts, and is found."""
+    """Whether the gyroscope shows a cell to shake or turn, relative to its drifting level."""
     shakes = (cells.rate_variance > _STILL_RATE_SD**2).any(axis=1)
     calm = np.flatnonzero(~shakes)
     if not len(calm) or not cells.rate.any():
@@ -336,7 +336,7 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, believable: Bools) -> Floats:
-    """Say what of the step behind each cell is a drift of all around it, shape (n - 1, 3)."""
+    """Return the drift in the step after each cell: the common step around, shape (n - 1, 3)."""
     both = believable[1:] & believable[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2
@@ -350,20 +350,20 @@ def _drift(cells: Cells, believable: Bools) -> Floats:
 
 def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
     """
-    Whether cell i + 1 continues cell i, shape (n - 1,): no gap in time, no step in the mean but
-    for the drift.
+    Whether cell i + 1 continues cell i, shape (n - 1,): no gap in time, no step of the mean
+    besides the drift.
     """
     step = np.diff(cells.mean, axis=0) - drift
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():
         return np.zeros(len(step), dtype=bool)
-    # Of many short rests most steps are turns, and no measure.
+    # With many short rests most steps are turns: limit the spread.
     spread = np.minimum(
         1.4826 * np.median(np.abs(step[both]), axis=0), STILL_SD / _STEP_SDS * _one_g(cells)
     )
     square = cells.variance / cells.count[:, None]
     noise = np.sqrt(np.maximum(2.0 * np.median(square[quiet], axis=0), square[1:] + square[:-1]))
-    # One that mostly reads the same number goes from one to the next in a step that is no knock.
+    # A sensor that mostly repeats one number moves by a whole quantum without a knock.
     is_stuck = np.median(cells.variance[quiet], axis=0) < (_STUCK * cells.quantum) ** 2
     limit = np.maximum(
         _STEP_SDS * np.maximum(spread, noise), np.where(is_stuck, 1.1 * cells.quantum, 0.0)

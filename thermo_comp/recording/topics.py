@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the search for the inputs' topics in a bag, and the sentences said when one is not there.
+Owns the search for the inputs' topics in a bag, and the messages for missing topics.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from ..text import one_line
 from ..topics import BOARD, CASE, COUNTS, FLAGS, IMU_IN, IMU_OUT, INPUTS, TEMPERATURE, thermometer
 from .blocks import Input, Role
 
-#: What a thermometer may be without naming a field, and the field that it is then.
+#: Types accepted for a thermometer without a named field, and the field read.
 PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {key: topic.type for key, topic in INPUTS.items()}
 #: The driver's topic in REP 145, and the node's output: what is beside it tells which.
 _RAW = IMU_OUT.name
-#: Words in the names of vector topics that are no specific force.
+#: Words in the names of vector topics that are not a specific force.
 _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
 
-#: Names of further thermometers: those that a role has not.
+#: Names of further thermometers; the names of roles are reserved.
 _NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
-#: What is said of a topic for two inputs, offline and live.
+#: Message for a topic used for two inputs, offline and live.
 TWINS = 'one topic for both {} and {}: a single thermometer is the board, leave the other out'
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
-_FIRST_STAMP_S = 1e8  # no bag lasts three years, and no clock that was set stands before 1973 [s]
+_FIRST_STAMP_S = 1e8  # larger times are stamps: no bag lasts 3 years, no clock shows before 1973
 
 #: The topics of a bag with their type and number of messages.
 Present = Mapping[str, tuple[str, int]]
@@ -44,7 +44,7 @@ Present = Mapping[str, tuple[str, int]]
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """From `begin` to before `end`: seconds since the bag's first sample; from 1e8 on stamps."""
+    """From `begin` to before `end`: seconds since the bag's first sample; from 1e8 stamps."""
 
     begin: float | None = None
     end: float | None = None
@@ -52,7 +52,7 @@ class Part:
     def __post_init__(self) -> None:
         limits = [limit for limit in (self.begin, self.end) if limit is not None]
         if not all(isfinite(limit) and limit >= 0.0 for limit in limits):
-            raise ValueError('the part of a bag begins and ends at 0 or a positive time')
+            raise ValueError('the part of a bag must begin and end at 0 or a positive time')
         if len({limit >= _FIRST_STAMP_S for limit in limits}) > 1:
             raise ValueError("give both times from the bag's first sample, or both as stamps")
         if len(limits) == 2 and not limits[0] < limits[1]:
@@ -64,13 +64,13 @@ class Part:
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
 
     def limits_ns(self, first_ns: float) -> tuple[float, float]:
-        """Give begin and end as stamps; `first_ns` is the first sample's, inf until it comes."""
+        """Return begin and end as stamps; `first_ns` is the first sample's, inf before it."""
         origin = 0 if self.is_stamped else first_ns
         begin = -inf if self.begin is None else origin + round(self.begin * 1e9)
         return begin, inf if self.end is None else origin + round(self.end * 1e9)
 
     def __str__(self) -> str:
-        """Write it behind a bag's name."""
+        """Return the part as a suffix of a bag's name."""
         begin, end = ('' if limit is None else f'{limit:.12g}' for limit in (self.begin, self.end))
         return '' if self == WHOLE else f'[{begin}:{end}]'
 
@@ -81,12 +81,12 @@ WHOLE = Part()  # all of a bag
 @dataclass(frozen=True, slots=True)
 class Topics:
     """
-    Where the inputs stand in a bag, which of counts and Imu is read, and which part of it.
-    A name matches with or without its leading slash and, where only one topic fits, with any
-    namespace in front. Where no usual name is there, imu/data_raw is taken, else the bag's only
-    topic of the type, an Imu rather than a Vector3Stamped. Further thermometers are found beside
-    the board's, ``temperature/<name>``, or named. A thermometer may be a field of any message,
-    ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
+    Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
+    A name matches with or without its leading slash and, if only one topic fits, with any
+    namespace. Without a usual name imu/data_raw is used, or else the bag's only topic of the
+    type, preferably an Imu. Further thermometers are named, or found as ``temperature/<name>``
+    in the board's namespace. A thermometer may be a field of any message, ``TOPIC:FIELD``, as for
+    ``ros2 topic echo --field``.
     """
 
     counts: str = COUNTS.name
@@ -100,8 +100,8 @@ class Topics:
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> Topics:
         """
-        Take topics by ``counts``, ``imu``, ``board``, ``case`` or ``temperature/<name>``; of
-        counts and Imu the only one that is named is read.
+        Build from topics by ``counts``, ``imu``, ``board``, ``case`` or ``temperature/<name>``; if
+        only one of counts and Imu is named, that one is read.
         """
         roles: dict[str, Any] = {}
         further = {}
@@ -119,7 +119,7 @@ class Topics:
                 further[own] = topic
             else:
                 raise ValueError(
-                    f'`{name}` is no input; expected {", ".join(_TYPES)} or temperature/NAME'
+                    f'`{name}` is not an input; expected {", ".join(_TYPES)} or temperature/NAME'
                 )
         given = [key for key in ('counts', 'imu') if key in roles]
         if len(given) == 1 and others.get('input', 'auto') == 'auto':
@@ -131,7 +131,7 @@ _USUAL = Topics()
 
 
 class Selected(NamedTuple):
-    """Which topics feed the roles, by which fields, what the input is and what was chosen."""
+    """Topics and fields of the roles, the input, and a note on topics chosen by type."""
 
     topics: dict[Role, str]
     fields: dict[Role, str]
@@ -140,10 +140,10 @@ class Selected(NamedTuple):
 
 
 def read_names(path: str | Path) -> dict[str, str]:
-    """Read a file of ``INPUT: TOPIC`` lines, as the drivers' in config/drivers."""
+    """Read a file of ``INPUT: TOPIC`` lines, as in config/drivers."""
     found = read_plain_yaml(path)
     if not isinstance(found, dict) or not all(isinstance(one, str) for one in found.values()):
-        raise ThermoCompError('expected INPUT: TOPIC, one a line', path)
+        raise ThermoCompError('expected lines of INPUT: TOPIC', path)
     return found
 
 
@@ -156,23 +156,23 @@ def parse_name(text: str) -> tuple[str, str]:
 
 
 def split_field(topic: str) -> tuple[str, str]:
-    """Part a topic from the field of its messages that is read; none is ''."""
+    """Split a topic from the field of its messages; '' without a field."""
     name, _, field = topic.partition(':')
     return name, field
 
 
 def is_thermometer(name: str) -> bool:
-    """Tell whether a further thermometer may be called so."""
+    """Whether a name is allowed for a further thermometer."""
     return _NAME.fullmatch(name) is not None
 
 
 def shown(name: str) -> str:
-    """Make a name that comes from a bag fit for one line: no control characters, not too long."""
+    """Make a name from a bag safe to print: no control characters, limited length."""
     return one_line(name if len(name) <= _MAX_SHOWN else name[:_MAX_SHOWN] + '...')
 
 
 def said_choice(name: str, key: str, wanted: str, among: str = 'only') -> str:
-    """Say that a topic was taken for an input by its type; nothing where it is the one wanted."""
+    """Note that a topic was chosen for an input by its type; empty if it has the wanted name."""
     kind = _TYPES[key].rpartition('/')[2]
     is_named = is_called(name, split_field(wanted)[0])
     return '' if is_named else f'{shown(name)}, its {among} {kind}, is taken for {key}'
@@ -185,9 +185,9 @@ def select_topics(
     metadata: Mapping[str, str] = MappingProxyType({}),
 ) -> Selected:
     """
-    Find the topics that feed the roles, as far as they have messages, what the accelerometer's is,
-    and what was taken for want of the usual name. RecordingError for a topic that is ambiguous, of
-    another type, or required and not there.
+    Find the topics of the roles, as far as they have messages, the input of the accelerometer, and
+    the topics chosen by type. RecordingError for a topic that is ambiguous, of another type, or
+    required and missing.
     """
     if require and not any(count for _, count in present.values()):
         raise RecordingError('the bag holds no messages')
@@ -206,7 +206,7 @@ def select_topics(
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
             raise _missing(present, {key: getattr(topics, key) for key in wanted}, own)
-    among = ["driver's", 'only']  # the name that drivers use, else nothing else has the type
+    among = ["driver's", 'only']  # chosen by the name that drivers use, or as the only one
     chosen = [
         said_choice(
             found[role], key, getattr(topics, key), among[not is_called(found[role], _RAW)]
@@ -226,7 +226,7 @@ def select_topics(
 
 
 def _check_twins(found: Mapping[Role, str], fields: Mapping[Role, str]) -> None:
-    """Refuse one topic, or one field of it, for two inputs."""
+    """Refuse a topic, or a field of it, for two inputs."""
     roles: dict[tuple[str, str], Role] = {}
     for role, name in found.items():
         if (twin := roles.setdefault((name, fields.get(role, '')), role)) != role:
@@ -236,7 +236,7 @@ def _check_twins(found: Mapping[Role, str], fields: Mapping[Role, str]) -> None:
 def _candidates(
     present: Present, topics: Topics, keys: Sequence[str], own: str
 ) -> Iterator[tuple[str, str]]:
-    """Give topics that may feed an input: by name, by REP 145, by type; an Imu before counts."""
+    """Yield candidates for an input: by name, by REP 145, by type; an Imu before counts."""
     for key in keys:
         if (name := _match(present, getattr(topics, key), key)) is not None:
             yield key, name
@@ -262,11 +262,11 @@ def _candidates(
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
-            return  # several: no vector is taken for want of a choice
+            return  # several candidates: none is chosen
 
 
 def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
-    """Find the topic that the node or `replay` wrote; nothing where there is none."""
+    """Find the topic that the node or `replay` wrote; '' if there is none."""
     for name in present:
         front = name.removesuffix(_RAW)
         is_beside = any(front + flag.name in present for flag in FLAGS)
@@ -282,7 +282,7 @@ def _said_own(name: str) -> str:
 def _further(
     present: Present, topics: Topics, found: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
-    """Find the other thermometers: those named, and any beside the board's or the case's."""
+    """Find the further thermometers: those named, and those beside the board's or the case's."""
     both = {}
     for own, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(own))
@@ -314,12 +314,12 @@ def _of_type(present: Present, name: str, expected: str, wanted: str) -> str:
 
 
 def is_called(name: str, wanted: str) -> bool:
-    """Tell whether a bag's topic has a name, perhaps with a namespace in front."""
+    """Whether a bag's topic has a name, with or without a namespace."""
     return f'/{name.strip("/")}'.endswith(f'/{wanted.strip("/")}')
 
 
 def _match(present: Present, wanted: str, key: str) -> str | None:
-    """Find a topic by its name, or the only one that has the name behind a namespace."""
+    """Find a topic by its name, or the only topic with that name in a namespace."""
     bare = split_field(wanted)[0].strip('/')
     spaced = [name for name in present if name.strip('/') == bare][:1]
     spaced = spaced or sorted(name for name in present if name.endswith('/' + bare))

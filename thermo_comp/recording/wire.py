@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the serialized layout of stamped messages: many messages to blocks, and back, at once.
+Owns the serialized layout of stamped messages: batches of messages to blocks, and back.
 
-All three input types are a std_msgs/Header followed by nothing but float64 numbers. In CDR::
+All three input types are a std_msgs/Header followed only by float64 numbers. In CDR::
 
     0   encapsulation: 00, endianness (0 big, 1 little), options
     4   stamp: int32 seconds, uint32 nanoseconds
     12  uint32 length of frame_id with its final NUL, then its characters
     4 + align8(12 + length)   the float64 numbers
 
-Only `frame_id` makes the size vary: messages that are alike are gathered as rows of bytes, of
-which stamps and numbers are views. Messages of ROS 1 are serialized anew by `rosbags`, one by one.
+Only `frame_id` makes the size vary: messages of equal layout are gathered as rows of bytes, with
+stamps and numbers as views. ROS 1 messages are converted by `rosbags`, one by one.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _NS = 1_000_000_000
 
 
 class Feed(NamedTuple):
-    """Which role a channel of a bag feeds, with its topic; a field of its messages, or all."""
+    """The role that a channel of a bag feeds, its topic, and a field of its messages if any."""
 
     channel: int
     role: Role
@@ -53,9 +53,9 @@ def decode_blocks(
     messages: Messages, feeds: Collection[Feed], roles: Iterable[Role], *, keep_raw: bool = False
 ) -> list[Block]:
     """
-    Decode messages, in their order; a block ends where the frame changes. `roles` are those of the
-    whole bag. A field's reading is kept as a Temperature. RecordingError, without a path, for a
-    message whose bytes do not fit its type.
+    Decode messages in their order; a block ends where the frame changes. `roles` are those of the
+    whole bag. The reading of a field is kept as a Temperature. Raises RecordingError, without a
+    path, if the bytes of a message do not fit its type.
     """
     roles = tuple(dict.fromkeys((*ROLES, *roles)))
     topics = {feed.role: feed.topic for feed in feeds}
@@ -78,7 +78,7 @@ def decode_blocks(
         except RecordingError as error:
             raise RecordingError(error.message, key=shown(topics[role].name)) from error
         if role == 'accel':
-            # Whether they change is told faster than where.
+            # Fast test for a constant frame.
             text = frame.tobytes()
             is_one = text == text[: frame.itemsize] * len(frame)
             changes = [] if is_one else rank[1:][frame[1:] != frame[:-1]].tolist()
@@ -107,7 +107,7 @@ def decode_blocks(
 
 
 def _as_temperatures(messages: Messages, stamp_ns: Ints, values: Floats) -> Messages:
-    """Serialize readings in place of the messages that hold them."""
+    """Replace the messages that hold readings by serialized Temperature messages."""
     rows = encode_stamped(stamp_ns, '', N_NUMBERS[TEMPERATURE], [(0, values[:, None])])
     size = np.full(len(rows), rows.shape[1])
     begins = np.cumsum(size) - size
@@ -116,8 +116,8 @@ def _as_temperatures(messages: Messages, stamp_ns: Ints, values: Floats) -> Mess
 
 def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:
     """
-    Decode messages that are a header and the float64 numbers of `kind`, a key of `N_NUMBERS`, to
-    stamps, numbers, shape (n, k), and frames.
+    Decode messages of `kind`, a key of `N_NUMBERS` (a header and float64 numbers), to stamps,
+    numbers, shape (n, k), and frames.
     """
     n, n_numbers, size = len(messages), N_NUMBERS[kind], messages.size
     if not n:
@@ -126,7 +126,7 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
         raise _misfit(kind)
     width = int(size[0]) if (size == size[0]).all() else HEAD_BYTES
     rows = gather(messages.data, messages.start, width)
-    # Usually they are alike: of one length, in one byte order, with one length of the frame.
+    # Usually all have the same length, byte order and frame length.
     for key in (size, number_at(rows, 0, 'u2'), number_at(rows, 12, 'u4')):
         if (key != key[0]).any():
             found = np.empty(n, np.int64), np.empty((n, n_numbers)), np.empty(n, object)
@@ -164,14 +164,14 @@ def encode_stamped(
 ) -> Bytes:
     """
     Serialize (CDR, little-endian) a header and float64 numbers, as rows of bytes, shape (n, size).
-    Each piece is the first column of some of the numbers and their values, shape (n, width), or
-    (width,) for the same in each message; the others are 0.
+    Each piece is a first column and its values, shape (n, width), or (width,) if equal in all
+    messages; other numbers are 0.
     """
     text = frame_id.encode() + b'\0'
     head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text
     body = 4 + (len(head) + 3) // 8 * 8
     row = np.frombuffer(bytearray(head.ljust(body, b'\0') + bytes(8 * n_numbers)), np.uint8)
-    # What all have in common is written once, and copied with the rest.
+    # Write the common values to the template row, which is copied.
     for column, values in pieces:
         if values.ndim == 1:
             row[body:].view('<f8')[column : column + len(values)] = values
@@ -188,7 +188,7 @@ def encode_stamped(
 
 
 def as_cdr(messages: Messages, kind: str) -> Messages:
-    """Serialize messages of ROS 1 as ROS 2 does; RecordingError for bytes that are none."""
+    """Convert ROS 1 messages to CDR; RecordingError for invalid bytes."""
     convert = typestore().ros1_to_cdr
     try:
         pieces = [bytes(convert(one, kind)) for one in messages]

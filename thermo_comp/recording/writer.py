@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way out: columns to a rosbag2 directory or a bare MCAP file that other tools open, or,
-block by block, to a table: CSV or (extra ``parquet``) Parquet.
+Owns the writing of columns to a rosbag2 directory or a bare MCAP file, or block by block to a
+table: CSV or (extra ``parquet``) Parquet.
 
-Nothing stands under the target's name until `BagWriter.close` has succeeded; an output that was
-there before stays if writing fails.
+The target's name appears only when `BagWriter.close` has succeeded; if writing fails, an older
+output stays.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from .blocks import ImuColumns, Messages
 from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
 from .wire import encode_stamped
 
-STAMP_END_NS = 2**31 * 10**9  # the first stamp that no ROS message can hold; none is before 0 [ns]
+STAMP_END_NS = 2**31 * 10**9  # ROS stamps are from 0 to below this [ns]
 _AUTO_FLUSH_BYTES = 1 << 26
-#: What the suffix of a table stands for.
+#: Format of a table by its suffix.
 TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}
 WriteRows = Callable[[Mapping[str, NDArray[Any]]], None]
-#: Where among a message's numbers some stand, their name, values and how many they are.
+#: First index among a message's numbers, name, values, width.
 _Column = tuple[int, str, ArrayLike, int]
 
 
@@ -42,10 +42,10 @@ class BagWriter(AbstractContextManager['BagWriter']):
     """
     Write a bag, ``*.mcap`` or a rosbag2 directory; use it as a context manager.
 
-    Messages are buffered until `flush`, which merges all topics in log-time order, or 64 MiB.
-    What `is_precious` is not dropped where it cannot be finished. A process that is killed leaves
-    a torn bag in a hidden file beside the target. Raises OutputError for what may not or cannot be
-    written; ValueError for shapes that do not fit and times that no ROS stamp can hold.
+    Messages are buffered until `flush`, which merges all topics in log-time order, or 64 MiB. An
+    `is_precious` bag that cannot be finished is kept. A killed process leaves a torn bag in a
+    hidden file beside the target. Raises OutputError if the bag may not or cannot be written;
+    ValueError for wrong shapes and for times outside the range of ROS stamps.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         path: str | Path,
         *,
         compression: Compression = 'zstd',
-        # A sixth faster than 1 on Imu messages, and no larger by more than a few percent.
+        # On Imu messages a sixth faster than level 1, and at most a few percent larger.
         level: int = -1,
         metadata: Mapping[str, str] | None = None,
         overwrite: bool = False,
@@ -108,7 +108,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
     ) -> None:
         """
         Write sensor_msgs/Imu: m/s^2, shape (n, 3), with the covariance (n, 9) or (9,). Without
-        `imu` neither orientation nor rate is claimed: -1 begins their covariances.
+        `imu` orientation and rate are marked as absent: their covariances begin with -1.
         """
         columns: list[_Column] = [
             (25, 'linear_acceleration', linear_acceleration, 3),
@@ -132,21 +132,21 @@ class BagWriter(AbstractContextManager['BagWriter']):
         messages: Sequence[bytes] | Messages,
         definition: tuple[str, str] | None = None,
     ) -> None:
-        """Write what is serialized (CDR) already; without a `definition` Jazzy must have one."""
+        """Write serialized (CDR) messages; without a `definition` the type must be in Jazzy."""
         times = _as_times('log_ns', log_ns, len(messages))
         if not isinstance(messages, Messages):
             messages = Messages.of(messages, np.zeros(len(messages)), times)
         self._add(topic, type, replace(messages, log_ns=times), definition)
 
     def flush(self) -> None:
-        """Merge what is buffered in log-time order and hand it to the file."""
+        """Merge the buffered messages in log-time order and write them."""
         if self._batches and self._file is not None:
             batches, self._batches = self._batches, []
             with self._translated():
                 self._file.append(batches)
 
     def close(self) -> None:
-        """Finish the bag and give it its name; where that fails nothing is left: OutputError."""
+        """Finish the bag and rename it to its target; OutputError, and no output, on failure."""
         if self._file is None:
             return
         try:
@@ -166,7 +166,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise
 
     def abort(self) -> None:
-        """Drop the unfinished output; what stood under its name before stays."""
+        """Drop the unfinished output; an older output stays."""
         file, self._file = self._file, None
         if file is not None:
             with suppress(OSError):
@@ -175,7 +175,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             self._draft.drop()
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Finish the bag, or drop it where the block raised."""
+        """Finish the bag, or drop it if the block raised."""
         if kind is None:
             self.close()
         else:
@@ -232,14 +232,14 @@ class BagWriter(AbstractContextManager['BagWriter']):
             yield
         except OSError as error:
             self.abort()
-            kept = f'; what was written is {self._draft.partial.name}' * self._is_precious
+            kept = f'; the part written is in {self._draft.partial.name}' * self._is_precious
             raise OutputError(
                 f'cannot be written: {error.strerror or error}{kept}', self._path
             ) from error
 
 
 def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
-    """Check a column of nanoseconds: `n` integers, none negative; ValueError for another."""
+    """Check a column of nanoseconds: `n` integers, none negative; otherwise ValueError."""
     times = np.atleast_1d(values if np.size(values) else np.empty(0, np.int64))
     if times.dtype.kind not in 'iu' or times.ndim != 1:
         raise ValueError(f'`{name}` must be one row of integers, got {times.dtype}')
@@ -256,9 +256,9 @@ def table_writer(
     path: str | Path, metadata: Mapping[str, str], *, overwrite: bool = False
 ) -> Iterator[WriteRows]:
     """
-    Write a table, by its suffix one of `TABLES`, else CSV; named so when the block ends well.
-    Yields what takes columns by name, shape (n,) each, the same ones every time; CSV has no place
-    for the metadata. OutputError if it may not or cannot be written, or pyarrow is missing.
+    Write a table in the format of its suffix (`TABLES`, else CSV), which appears at the end.
+    Yields a function that takes columns by name, shape (n,), the same names every time; CSV drops
+    the metadata. OutputError if the table may not or cannot be written, or pyarrow is missing.
     """
     kind = TABLES.get(Path(path).suffix, CSV)
     with drafted(path, kind, overwrite=overwrite) as partial, ExitStack() as stack:

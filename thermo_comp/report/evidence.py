@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what a report is made of: of a fit, of bags, or of a calibration; nothing is drawn here."""
+"""Owns the data of a report of a fit, of bags, or of a calibration; nothing is drawn here."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from .trace import ShownBag, shown_bag, widest
 
 _T = TypeVar('_T')
 
-#: What is set side by side: the constants at the reference temperature, and the calibration.
+#: The compared corrections: the constants at the reference temperature, and the calibration.
 RAW = 'raw'
 CHOSEN = 'calibration'
-#: Beside them, of each position of a fit: the calibration that the other positions alone give.
+#: For each position of a fit: the calibration fitted to the other positions.
 LEFT_OUT = 'left out'
-# A ramp slower than this says nothing of its direction.
+# Rate range of a set below which it has no ramps in that direction [K/min].
 _SLOWEST_RAMP_K_MIN = 0.05
-#: The key of a bag's metadata under which our simulator tells what it simulated.
+#: Key of a bag's metadata in which the simulator stores the truth.
 _SIMULATED = 'truth'
 
 
 @dataclass(frozen=True)
 class Position:
-    """One still position: the force's direction in the output frame, RMS of |f| - g by rung."""
+    """A still position: direction of the force in the output frame, RMS of |f| - g by rung."""
 
     number: int
     bag: int
@@ -55,12 +55,12 @@ class Position:
 @dataclass(frozen=True)
 class Evidence:
     """
-    All that a report says; what is missing is None or empty.
+    The content of a report; missing parts are None or empty.
 
-    `windows` are at rest, of all bags, `judgement` what they tell; `steps` what each step of the
-    model leaves, `left_out`, by `Windows.position`, the RMS of ``|f| - g`` by what the others say
-    of the unit [m/s^2]; `findings` speak against calibration or bags, `checks` found them good;
-    `gravity_sd` is the uncertainty of gravity that the calibration's covariance holds [m/s^2].
+    `windows`: windows at rest of all bags; `judgement`: their judgement; `steps`: residuals of
+    each model step; `left_out`: by `Windows.position` the RMS of ``|f| - g`` of a fit to the
+    other positions [m/s^2]; `findings`: reservations about calibration or bags; `checks`: passed
+    checks; `gravity_sd`: uncertainty of gravity included in the covariance [m/s^2].
     """
 
     serial: str
@@ -103,14 +103,14 @@ class Evidence:
         if self.judgement is not None:
             return str(self.judgement)
         if self.calibration is not None:
-            return 'the calibration as it stands: no recording was judged with it'
+            return 'the calibration alone: no recording was judged with it'
         if not self.bags:
             return 'nothing to show yet: no file could be read'
         return 'a thermal record: no calibration was judged'
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """How the verdict is to be coloured: valid; with reservations; not; nothing was judged."""
+        """Colour of the verdict: valid; valid with reservations; not valid; nothing judged."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
@@ -120,7 +120,7 @@ class Evidence:
 
     @cached_property
     def shown(self) -> ShownBag | None:
-        """The bag of the time figures, as the node would see it."""
+        """The bag of the time figures, with the node's thermal state."""
         if not self.bags:
             return None
         one, index = self.calibration, widest(self.bags)
@@ -129,7 +129,7 @@ class Evidence:
 
     @property
     def forces(self) -> dict[str, Floats]:
-        """Specific force over the windows by what corrected it; empty where nothing gave one."""
+        """Specific force of the windows by rung; empty without windows."""
         windows = self.windows
         if windows is None or not len(windows):
             return {}
@@ -146,7 +146,7 @@ class Evidence:
 
     @cached_property
     def least_known(self) -> LeastKnown | None:
-        """The attitude of which the calibration knows least; None where it claims nothing."""
+        """The attitude with the largest uncertainty; None if the calibration states none."""
         if self.calibration is None:
             return None
         return least_known(self.calibration, np.array([one.up for one in self.positions]))
@@ -176,14 +176,14 @@ class Evidence:
 
     @property
     def positions_text(self) -> str:
-        """Count the directions of the positions, and the rests where there are more of them."""
+        """Count the distinct directions, and the rests if there are more of them."""
         n_rests = len(self.positions)
         n = len(distinct_directions(np.array([one.up for one in self.positions]).reshape(-1, 3)))
         said = counted(n, 'position')
         return said if n == n_rests else f'{said} ({counted(n_rests, "rest")})'
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """Give the residual of each axis by rung, (n, 3) [m/s^2], about its position's mean."""
+        """Return by rung the residual of each axis about its position's mean, (n, 3) [m/s^2]."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
@@ -193,7 +193,7 @@ class Evidence:
 
 
 def given(value: _T | None) -> _T:
-    """Return what a figure draws, which is drawn only where it is there."""
+    """Return a value that is not None: a figure is drawn only if its data exist."""
     if value is None:
         raise ValueError('`evidence` lacks what is to be drawn')
     return value
@@ -210,11 +210,11 @@ def evidence_of_bags(
     others: Sequence[Calibration] = (),
 ) -> Evidence:
     """
-    Judge bags, with a calibration or without; no bags report on the calibration alone.
+    Judge bags with or without a calibration; without bags, report on the calibration alone.
 
     `window_s` and `tolerance` are as for `evaluate`; an empty `serial` accepts any calibration;
-    `others` are of the unit's history. Raises CalibrationError for a calibration of another unit;
-    RecordingError if samples are too slow for such windows.
+    `others` are earlier or later calibrations of the unit. Raises CalibrationError for a
+    calibration of another unit; RecordingError if the samples are too slow for the windows.
     """
     windows = judgement = None
     said = sorted({bag.source.serial for bag in bags if bag.source.serial})
@@ -241,7 +241,7 @@ def evidence_of_bags(
 
 
 def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
-    """Gather what a fit has to show, on its own bags; `gravity_sd` is what it was told."""
+    """Collect the results of a fit on its bags; `gravity_sd` as given to the fit [m/s^2]."""
     found = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
     left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
     against = [f'{one.name}: {one.message}' for one in result.findings if _is_reservation(one)]
@@ -258,15 +258,15 @@ def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
 
 
 def _is_reservation(finding: Finding) -> bool:
-    # More positions than enough would be better still: no reservation.
+    # The advice to record more positions than needed is no reservation.
     return finding.level == 'advice' and finding.name != 'positions'
 
 
 def _against(calibration: Calibration) -> tuple[str, ...]:
-    """Give what speaks against a calibration by itself, but for its wish for more positions."""
+    """List the reservations about a calibration itself, except the advice of more positions."""
     lower, upper = calibration.dynamic.rate_range_k_min
     found = [
-        f'the dynamic set never saw {name}: its ramps are a guess there'
+        f'the bags hold no {name}: the dynamic set is extrapolated there'
         for name, rate in (('heating', upper), ('cooling', -lower))
         if rate < _SLOWEST_RAMP_K_MIN
     ]
@@ -275,9 +275,9 @@ def _against(calibration: Calibration) -> tuple[str, ...]:
         if one.section == 'all' and left_out is not None and left_out >= one.raw_rms_m_s2:
             found.append(
                 f'on positions left out {spoken(left_out)} are no better than '
-                f'{spoken(one.raw_rms_m_s2)} raw: the positions do not tell a new attitude'
+                f'{spoken(one.raw_rms_m_s2)} raw: the positions do not predict a new attitude'
             )
     if not calibration.has_uncertainty:
-        found.append('the calibration says nothing of its uncertainty')
+        found.append('the calibration states no uncertainty')
     found += [note for note in calibration.provenance.notes if not note.startswith('positions: ')]
     return tuple(dict.fromkeys(found))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the figures of bags: over time, as the paper's Fig. 3, 4, 6 and 7, and over positions."""
+"""Owns the figures of bags: over time, like the paper's Fig. 3, 4, 6 and 7, and by position."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from .evidence import LEFT_OUT, RAW, Evidence, Position, given
 from .html import number
 from .trace import ShownBag
 
-# Where the drift's zero is taken: long enough for the windows' noise, short against any ramp.
+# Time over which the zero of the drift is averaged [s]: against noise, short against any ramp.
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
-# Diameter of the ring of the position of which most is left [pt].
+# Diameter of the ring of the position with the largest residual [pt].
 _RING = 22.0
-# More rows fill no page.
+# Largest number of rows on a page.
 _MOST = 24
 
 
@@ -121,7 +121,7 @@ def draw_gravity(evidence: Evidence) -> Figure:
 def _panels(
     evidence: Evidence, heights: Sequence[float], *, more: float = 0.0, is_flagged: bool = False
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
-    """Make panels over the time of the shown bag, shaded where it is dynamic; [s] of a unit."""
+    """Make panels over the time of the shown bag, grey where dynamic; and their time unit [s]."""
     shown = given(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
@@ -129,7 +129,7 @@ def _panels(
     spans: list[tuple[float, float]] = []
     for one in shown.stretches:
         if one.regime == Regime.DYNAMIC:
-            # Heating into cooling is one span: no bright seam between two of them.
+            # Join heating and cooling that follow each other: no bright line between the spans.
             start = spans.pop()[0] if spans and spans[-1][1] == one.start else one.start
             spans.append((start, one.stop))
     for axes in panels[:-1] if is_flagged else panels:
@@ -141,7 +141,7 @@ def _panels(
 
 
 def _rows(evidence: Evidence) -> Bools:
-    """Tell which windows are of the bag that is shown."""
+    """Select the windows of the shown bag."""
     return np.asarray(given(evidence.windows).bag == given(evidence.shown).index)
 
 
@@ -153,7 +153,7 @@ def _plot(axes: Axes, evidence: Evidence, value: Floats, unit: float, **line: An
 
 
 def _drift(evidence: Evidence) -> tuple[Floats, str]:
-    """Give what the readings change by in each position, shape (n, 3), and its unit."""
+    """Return the change of the readings in each position, shape (n, 3), and its unit."""
     windows = evidence.windows
     if windows is None or not _rows(evidence).any():
         return np.zeros((0, 3)), ''
@@ -191,14 +191,14 @@ def _draw_flag(axes: Axes, shown: ShownBag, unit: float) -> None:
 
 
 def _symmetric(axes: Axes, residual: Floats) -> None:
-    """Put zero into the middle of a panel; single spikes may leave it."""
+    """Centre a panel on zero; isolated spikes may be cut off."""
     limit = 1.15 * float(np.quantile(np.abs(residual), 0.998)) / MICRO_G
     if limit > 0.0:
         axes.set_ylim(-limit, limit)
 
 
 def draw_every_position(evidence: Evidence) -> Figure:
-    """Draw what is left of |f| over the time in every position, or in those with most of it."""
+    """Draw |f| - g over time in every position, or in those with the largest residuals."""
     windows = given(evidence.windows)
     judged, residual = list(evidence.residuals.items())[-1]
     worst = sorted(evidence.positions, key=lambda one: -one.residual_rms[judged])[:_MOST]
@@ -214,7 +214,7 @@ def draw_every_position(evidence: Evidence) -> Figure:
         value = row - 0.5 * residual[rows] / limit
         dynamic = windows.is_dynamic[rows]
         axes.axhline(row, color='black', linewidth=0.4)
-        # Dashes would hide what is noise: the regimes differ by width.
+        # Dashes would hide noise: the regimes differ by line width.
         for is_drawn, color, width in ((~dynamic, style.BLACK, 1.4), (dynamic, style.RED, 0.7)):
             axes.plot(time, np.where(is_drawn, value, np.nan), color=color, linewidth=width)
     axes.set_ylim(len(shown) - 0.4, -0.6)
@@ -233,7 +233,7 @@ def draw_every_position(evidence: Evidence) -> Figure:
 
 
 def draw_positions(evidence: Evidence) -> Figure:
-    """Draw where the positions point on the sphere, and what is left on each of them."""
+    """Draw the directions of the positions on the sphere, and the residual of each."""
     figure = style.new_figure(3.0)
     up, down = figure.subplots(1, 2)
     least = evidence.least_known
@@ -244,7 +244,7 @@ def draw_positions(evidence: Evidence) -> Figure:
             place = equal_area(least.up, side)
             axes.plot(*place, 'x', markersize=7.0, color=style.RED, mew=1.6)
             said = '±' + spoken(least.sd_m_s2).replace('ug', 'µg')
-            # Towards the middle: outside stand the names of the axes.
+            # Towards the middle: the names of the axes are outside.
             by = (0.0, 6.0 if place[1] < 0.0 else -12.0)
             _note(axes, said, place, by, ha='center', color=style.RED)
         axes.set_title(name, loc='center')
@@ -252,7 +252,7 @@ def draw_positions(evidence: Evidence) -> Figure:
 
 
 def equal_area(up: tuple[float, ...], side: int) -> tuple[float, float]:
-    """Map a direction of one hemisphere into the unit disc, the pole its centre, areas kept."""
+    """Map a direction of a hemisphere into the unit disc around the pole, preserving areas."""
     x, y, z = up
     factor = 1.0 / np.sqrt(1.0 + max(side * z, 0.0))
     return float(x * factor), float(y * factor)

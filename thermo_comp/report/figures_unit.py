@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the figures of a calibration, from its curves to its history, and those of a fleet."""
+"""Owns the figures of a calibration, its curves to its history, and the figures of a fleet."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from .states import Curve, curves, slopes
 BAND_SDS = 1.96
 _N_CURVE = 61
 _BOARD = 'T board, °C'
-#: From a few readings to where the longest lag of the bank has forgotten.
+#: Time axis of the step response [min]: from a few readings to the end of the longest lag.
 _STEP_MINUTES = (0.2, 500.0)
 # Line, hatch and marker of a soak and of ramps.
 _LOOKS: dict[str, tuple[style.Line, str, str]] = {
@@ -66,7 +66,7 @@ def draw_rates(evidence: Evidence) -> Figure:
     triad = rate_triad(given(evidence.calibration))
     names = ('bias less the line, mdeg/s', '', '')
     figure, panels = _panels(2.5, names, _BOARD, sharex=True)
-    # What is said in m/s^2 of a triad is rad/s of this one.
+    # In the triad of a gyroscope m/s^2 stands for rad/s.
     factor = MICRO_G / MILLIDEGREE
     drawn = [one._replace(value=factor * one.value, sd=factor * one.sd) for one in curves(triad)]
     for i, axes in enumerate(panels):
@@ -78,7 +78,7 @@ def draw_rates(evidence: Evidence) -> Figure:
 def _panels(
     height: float, names: Sequence[str], xlabel: str = '', **shared: Any
 ) -> tuple[Figure, Any]:
-    """Make a figure of a panel beside another, as many as their names on the y axes."""
+    """Make a figure with a row of panels, one for each label of a y axis."""
     figure = style.new_figure(height)
     panels = figure.subplots(1, len(names), **shared)
     for axes, name in zip(panels, names, strict=True):
@@ -101,7 +101,7 @@ def _draw_less_line(
             look: style.Line = {'facecolor': color, 'edgecolor': color, 'hatch': hatch}
             axes.fill_between(at, value - half, value + half, alpha=0.25, linewidth=0, **look)
             widest = max(widest, float(half.max()))
-        # The ends of the valid range are marked; a range of a few K stays visible so.
+        # Mark the ends of the valid range, so that a range of a few K stays visible.
         look = {'marker': marker, 'markersize': 3.5, 'markevery': [0, -1]}
         axes.plot(at, value, label=curve.program.label, **look, **line)
     title = f'{AXES[k % 3]}: slope {minus(f"{slope:+.3g}")} {unit}/K'
@@ -129,7 +129,7 @@ def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
 
 
 def draw_step(evidence: Evidence) -> Figure:
-    """Draw what a step of the temperature does to each axis over time."""
+    """Draw the response of each axis to a temperature step over time."""
     minutes, *values = step_answer(given(evidence.calibration))
     names = ('still to come, µg/K', 'still to come, ppm/K')
     figure, panels = _panels(2.5, names, 'time since the step, min')
@@ -143,7 +143,7 @@ def draw_step(evidence: Evidence) -> Figure:
 
 
 def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
-    """Give minutes since a step by 1 K, what is to come of bias [ug] and scale [ppm] (n, 3)."""
+    """Return minutes since a step of 1 K, and the remaining change of bias [ug], scale [ppm]."""
     minutes = np.geomspace(*_STEP_MINUTES, _N_CURVE)
     since_s = np.append(minutes * 60.0, np.inf)
     states = step_states(calibration, calibration.reference_temperature_c, since_s)
@@ -152,7 +152,7 @@ def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
 
 
 def draw_hysteresis(evidence: Evidence) -> Figure:
-    """Draw the loop of each axis' bias in a slow run through the range and back."""
+    """Draw the hysteresis loop of each axis' bias in a slow run through the range and back."""
     temperature, heating, cooling = hysteresis_loop(given(evidence.calibration))
     figure, panels = _panels(2.5, ('loop, µg', '', ''), _BOARD, sharex=True, sharey=True)
     for i, axes in enumerate(panels):
@@ -168,7 +168,7 @@ def draw_hysteresis(evidence: Evidence) -> Figure:
 
 
 def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
-    """Give temperatures, and the bias [ug] on a slow way up them and down, shapes (n, 3)."""
+    """Return temperatures, and the bias [ug] in a slow run up and down, shapes (n, 3)."""
     lower, upper = calibration.static.temperature_range_c
     temperature = np.linspace(lower, upper, _N_CURVE)
     plays = StateLayout(Correction(calibration).memory).plays

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the spelling of pages and figures, and the way into HTML, where nothing can run or load."""
+"""Owns the typography of pages and figures, and the HTML, which can neither run nor load code."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..text import counted
 from ..unit.gravity import MICRO_G
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
-# What stands in the margin of a printed page has no more letters.
+# Largest number of characters in the margin of a printed page.
 _LONGEST_MARGIN = 90
 
 
@@ -61,16 +61,16 @@ def utc(stamp_ns: int) -> dt.datetime:
 
 
 def _css_text(value: str) -> Markup:
-    """Write a text as a string of a style sheet: all but letters and digits by their numbers."""
+    """Quote a text for a style sheet: characters other than letters and digits are escaped."""
     said = ''.join(
         c if c.isalnum() and c.isascii() else f'\\{ord(c):06x}'
         for c in label_text(value, _LONGEST_MARGIN)
     )
-    return Markup(f'"{said}"')  # noqa: S704 - nothing of it is markup any more
+    return Markup(f'"{said}"')  # noqa: S704 - everything is escaped
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Give a number in significant digits, with no more decimals than those."""
+    """Format a number with `digits` significant digits, without superfluous decimals."""
     if not math.isfinite(value):
         return '–'
     if value == 0.0:
@@ -84,12 +84,12 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def minus(text: str) -> str:
-    """Put the sign of a printed number for the hyphen."""
+    """Replace hyphens by minus signs."""
     return text.replace('-', '−')
 
 
 def spelt(text: str) -> str:
-    """Put the signs of print for those that a terminal shows."""
+    """Replace ASCII spellings by typographic signs."""
     text = re.sub(r'\bug\b', 'µg', text.replace('degC', '°C'))
     return text.replace('|f| - g', '|f| − g').replace('+-', '±')
 
@@ -107,6 +107,6 @@ def rounded(value: float, expanded: float) -> tuple[str, str]:
 
 
 def label_text(value: str, limit: int = 40) -> str:
-    """Make text that others wrote fit for a figure: one line, printable, not too long."""
+    """Make text from outside safe for a figure: one line, printable, at most `limit` long."""
     clean = ''.join(c if c.isprintable() else ' ' for c in value).strip()
     return clean if len(clean) <= limit else f'{clean[: limit - 1]}…'

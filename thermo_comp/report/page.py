@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the report as files, a page and PNGs, and the list of its figures: what each one asks."""
+"""Owns the report as files, a page and PNGs, and the list of its figures with their texts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _EARTH_RADIUS = 6.371e6
 
 
 class ReportFigure(NamedTuple):
-    """One figure: its file's name, the question it answers, how that is read, the drawing."""
+    """A figure: name of its file, the question it answers, how to read it, the drawing."""
 
     name: str
     question: str
@@ -59,8 +59,8 @@ def write_report(
     """
     Write a certificate as one self-contained HTML page.
 
-    What the laboratory does not state in `info` stays blank. The folder `figures` gets them as PNG
-    files, like ``1_temperatures.png``. Raises OutputError if a file may not or cannot be written.
+    Statements missing in `info` stay blank. The folder `figures` gets the figures as PNG files,
+    like ``1_temperatures.png``. Raises OutputError if a file may not or cannot be written.
     """
     page = render_report(evidence, info)
     if figures is not None:
@@ -77,7 +77,7 @@ def render_report(
     *,
     figures: Sequence[tuple[ReportFigure, str]] | None = None,
 ) -> str:
-    """Make the page, with these figures instead of all that the evidence allows."""
+    """Render the page with the given figures; by default all that the evidence allows."""
     if figures is None:
         figures = drawn_figures(figures_of(evidence))
     info = info or CertificateInfo()
@@ -114,17 +114,17 @@ def render_report(
 
 
 def position_error(bias: float, time: float) -> float:
-    """Give what a constant error [m/s^2] of a horizontal axis moves a position by, ``b t^2/2``."""
+    """Return the position error of a constant error [m/s^2] of a horizontal axis, ``b t^2/2``."""
     return 0.5 * bias * time * time
 
 
 def schuler_peak(bias: float) -> float:
-    """Give the largest position error [m] of a constant error, 2 R b / g, after 42 minutes."""
+    """Return the largest position error [m] of a constant error, 2 R b / g, after 42 minutes."""
     return 2.0 * _EARTH_RADIUS * bias / STANDARD_GRAVITY
 
 
 def remarks_of(bag: ReducedBag) -> list[str]:
-    """Say what of a bag was lost or is odd."""
+    """List losses and peculiarities of a bag."""
     n = len(bag.intervals)
     return [
         text
@@ -142,11 +142,11 @@ def remarks_of(bag: ReducedBag) -> list[str]:
 
 
 def _seen(evidence: Evidence) -> list[str]:
-    """Say which bags the verdict rests on, and where the regime was never known."""
+    """Describe the bags of the verdict, and whether the regime was never known."""
     said = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board
-        which = 'bags of its own fit' if evidence.is_seen else 'bags that the fit has not seen'
+        which = 'bags of the fit' if evidence.is_seen else 'bags that the fit did not use'
         said.append(
             f'{evidence.positions_text} in {which}, {np.min(board):.1f} to {np.max(board):.1f} °C.'
         )
@@ -164,7 +164,7 @@ def _programs(evidence: Evidence) -> str:
 
 
 def _test_dates(evidence: Evidence) -> str:
-    """Give the days on which the bags of the calibration's fit began, if it was fitted on some."""
+    """Return the days on which the bags of the calibration's fit began, empty without bags."""
     if not evidence.bags or not evidence.is_seen:
         return ''
     days = sorted(f'{utc(span_of(bag)[0]):%Y-%m-%d}' for bag in evidence.bags)
@@ -195,7 +195,7 @@ def figures_of(evidence: Evidence) -> list[ReportFigure]:
 
 
 def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
-    """Give the figures of the bag that is shown."""
+    """Yield the figures of the shown bag."""
     shown, windows = evidence.shown, evidence.windows
     if shown is None:
         return
@@ -205,7 +205,7 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         'How did the unit follow the chamber?',
         of_bags.draw_temperatures,
         'Readings of both thermometers. The board lags behind the case, so the case '
-        f'is the first to tell that a ramp has begun. {read} 3 of the paper.',
+        f'shows the start of a ramp first. {read} 3 of the paper.',
     )
     window_s = 0.0 if windows is None else windows.window_s
     yield (
@@ -214,7 +214,7 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
         f'rates of the temperatures and, below, the second derivative of the {shown.leader} '
         'temperature, whose pulses open and close the dynamic state; (c) the state that follows, '
-        'with its direction; before the detector has seen enough it is unknown. '
+        'with its direction; it is unknown until the detector has enough readings. '
         f'{read} 4 of the paper.',
     )
     if windows is None or not evidence.residuals or not (windows.bag == shown.index).any():
@@ -223,7 +223,7 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         'What does the correction leave on each axis?',
         of_bags.draw_residuals,
         'Residual of each axis in the output frame. The attitude in a position is not known: '
-        'the mean direction seen there stands for it. Each panel has a scale of its own. '
+        'the mean direction measured there replaces it. Each panel has a separate scale. '
         f'{read} 6 of the paper.',
     )
     yield (
@@ -231,13 +231,13 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         of_bags.draw_gravity,
         f'|f| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
         'a unit at rest must show zero whatever the temperature does. Above: before and after '
-        'the correction; below: after it, in a scale of its own. '
+        'the correction; below: after it, in a larger scale. '
         f'{read} 7 of the paper.',
     )
 
 
 def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
-    """Give the figures of the calibration."""
+    """Yield the figures of the calibration."""
     calibration = evidence.calibration
     if calibration is None:
         return
@@ -249,12 +249,12 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         'that begin in a soak at its end, less the value at '
         f'{calibration.reference_temperature_c:g} °C (grey line) and less a straight line, whose '
         'slope stands above each panel.',
-        'Hatched: 95 % band of all that was fitted, its largest half width above the panel; '
-        'where it is wider than the curves are apart, the bags do not tell them apart.'
+        'Hatched: 95 % band of the fit, its largest half width above the panel; where the band '
+        'is wider than the distance of two curves, the bags do not distinguish them.'
         if has_band
         else '',
-        'Circles: what was measured in each soak of each position, all of the residual taken for '
-        'one of bias or of scale; of scale only where the axis has half of gravity or more.'
+        'Circles: measurement in each soak of each position, with the whole residual attributed '
+        'to bias or to scale; to scale only if the axis has half of gravity or more.'
         if evidence.windows is not None and evidence.residuals
         else '',
     )
@@ -274,15 +274,15 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         yield (
             'For how long does the unit remember a change of temperature?',
             of_unit.draw_step,
-            'Board and case jump by 1 K together: how far bias and scale are from where they '
-            'will settle. Where a line meets zero, the unit has settled.',
+            'After a step of board and case by 1 K: distance of bias and scale from their final '
+            'values. Where a line reaches zero, the unit has settled.',
         )
     if any(term.kind == 'play' for term in calibration.response):
         yield (
-            'Does the bias come back on another way than it went?',
+            'Does the bias differ between warming and cooling?',
             of_unit.draw_hysteresis,
             'A run through the whole range and back, too slow for any lag: bias of each axis less '
-            'the middle of both ways. No curve over temperature can correct the width of the '
+            'the mean of both directions. No curve over temperature corrects the width of the '
             'loop.',
         )
     if len(evidence.history) > 1:
@@ -290,35 +290,35 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             'What has drifted between the calibrations of this unit?',
             of_unit.draw_history,
             'Bias and scale in a soak at the reference temperature, by the date of each '
-            'calibration, less those of the first; bars: 95 % of what each leaves open.',
+            'calibration, less those of the first; bars: 95 % interval of each.',
         )
 
 
 def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
-    """Give the figures of all positions."""
+    """Yield the figures of all positions."""
     if evidence.residuals and len(evidence.positions) > 1:
         yield (
             'Does the correction hold in every position?',
             of_bags.draw_every_position,
             'A row for each position: |f| − g after the correction, over the time since the '
-            'position began; all rows have the scale that is written above. Black and wide in '
-            'the static, red and thin in the dynamic regime. On the right the RMS.',
+            'position began; all rows have the scale that is written above. Black and wide: '
+            'static regime; red and thin: dynamic regime. On the right the RMS.',
         )
     if evidence.positions:
         yield (
-            'Are the positions well spread, and does one stand out?',
+            'Are the positions well spread, and is any of them an outlier?',
             of_bags.draw_positions,
             'Direction of the specific force in the output frame, position by position, in an '
             'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '
-            'of elevation. A position that stands out was moved, or is not of this unit.',
-            'The area of a red ring is in proportion to what is left there by a fit of the other '
-            'positions alone, which is what a new attitude will see.'
+            'of elevation. An outlier was moved, or is not of this unit.',
+            'The area of a red ring is proportional to the residual there of a fit to the other '
+            'positions alone, which is the error expected in a new attitude.'
             if evidence.left_out
-            else 'The area of a red ring is in proportion to what is left there.'
+            else 'The area of a red ring is proportional to the residual there.'
             if evidence.residuals
             else '',
-            'Red cross: the direction of which the calibration knows least, and the standard '
-            'deviation of |f| there: a position would tell most.'
+            'Red cross: the direction with the largest uncertainty, and the standard deviation '
+            'of |f| there. A position recorded there would improve the calibration most.'
             if evidence.least_known
             else '',
         )

@@ -58,11 +58,11 @@ _RC: dict[str, Any] = {
     'legend.borderaxespad': 0.0,
     'legend.borderpad': 0.0,
     'hatch.linewidth': 0.5,
-    # Names in figures come from files that others wrote: a dollar sign is a dollar sign.
+    # Names in figures come from outside: a dollar sign must not start a formula.
     'text.parse_math': False,
     'svg.fonttype': 'none',
     'svg.hashsalt': 'thermo_comp',
-    # Of many points in one pixel those at its ends are drawn.
+    # Of many points in one pixel matplotlib draws only the extremes.
     'path.simplify_threshold': 0.5,
 }
 _PNG_DPI = 160
@@ -70,17 +70,17 @@ _WIDTH = 7.1
 
 
 def drawing() -> AbstractContextManager[None]:
-    """Draw in the report's style, whatever the user's matplotlib settings are."""
+    """Draw in the report's style, independent of the user's matplotlib settings."""
     return style.context(_RC, after_reset=True)
 
 
 def new_figure(height: float) -> Figure:
-    """Make an empty figure as wide as a printed page, so many inches high."""
+    """Make an empty figure as wide as a printed page, `height` inches high."""
     return Figure(figsize=(_WIDTH, height), layout='constrained')
 
 
 def svg(figure: Figure, name: str, label: str) -> str:
-    """Write a figure as an SVG element; `name` makes its ids unique, `label` is for the blind."""
+    """Write a figure as an SVG element; `name` makes its ids unique, `label` is read aloud."""
     buffer = io.StringIO()
     nothing = {'Date': None, 'Creator': None, 'Format': None, 'Type': None}
     figure.savefig(buffer, format='svg', metadata=nothing)
@@ -100,7 +100,7 @@ def png(figure: Figure) -> bytes:
 
 
 def time_unit(duration_s: float) -> tuple[float, str]:
-    """Choose the unit of a time axis: the seconds in one of it, and what the axis is called."""
+    """Choose the unit of a time axis: its length in seconds, and the label of the axis."""
     if duration_s >= 2.5 * 3600.0:
         return 3600.0, 'time, h'
     if duration_s >= 300.0:
@@ -109,7 +109,7 @@ def time_unit(duration_s: float) -> tuple[float, str]:
 
 
 def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]:
-    """Put a NaN into a series of windows wherever it changes position or pauses."""
+    """Insert NaN into a series of windows at each change of position and each pause."""
     if len(time) < 2:
         return time, value
     steps = np.diff(time)
@@ -121,14 +121,14 @@ def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]
 def legend_above(axes: Axes, title: str | None = None, *, share: float = 1.0) -> None:
     """Put the legend above axes with a `share` of the width, in as many columns as fit."""
     if labels := axes.get_legend_handles_labels()[1]:
-        # An entry takes its label and a handle as wide as some eight letters.
+        # Width of a legend entry: its label, and a handle as wide as eight letters.
         n = min(max(1, int(share * 100 / (8 + max(map(len, labels))))), len(labels))
         look: Line = {'ncols': n, 'title': title, 'alignment': 'left'}
         axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.01), **look)
 
 
 def shared_legend(figure: Figure, axes: Axes, n_columns: int) -> None:
-    """Put the legend of panels that have it in common above all of them."""
+    """Put the common legend of panels above all of them."""
     handles, labels = axes.get_legend_handles_labels()
     place: Any = 'outside upper left'
     figure.legend(handles, labels, loc=place, borderaxespad=0.5, ncols=n_columns)

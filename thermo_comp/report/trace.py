@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the bag that the time figures show: what the node's own tracker makes of its readings."""
+"""Owns the bag that the time figures show, with the thermal state by the node's tracker."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from ..thermal.settings import DetectorSettings
 from ..thermal.tracker import ThermalTracker
 from ..typing import Floats
 
-# A line in a figure has fewer pixels.
+# Largest number of points of a line; a figure has fewer pixels.
 _MOST_POINTS = 4000
 
 
 class Stretch(NamedTuple):
-    """A run of one regime and direction (-1 cooling, +1 heating, 0 neither) [s since start]."""
+    """An interval [s since start] of one regime and direction (-1 cooling, +1 heating, 0 none)."""
 
     start: float
     stop: float
@@ -49,12 +49,12 @@ class ShownBag:
 
     @property
     def leader(self) -> str:
-        """The sensor that leads: the case's, where there is one."""
+        """The leading sensor: the case's, if there is one."""
         return 'case' if len(self.bag.case.value) else 'board'
 
 
 def span_of(bag: ReducedBag) -> tuple[int, float]:
-    """Give start [ns] and length [s] of a bag's samples, or of its readings without them."""
+    """Return start [ns] and length [s] of a bag's samples, or without samples of its readings."""
     start_ns, end_ns = bag.start_ns, bag.end_ns
     if not bag.n_samples:
         start_ns, end_ns = bag.board.stamp_ns[[0, -1]].tolist()
@@ -64,7 +64,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 def widest(bags: Sequence[ReducedBag]) -> int:
     """Choose the bag to show: the widest in temperature, then the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
-    # Spans within 5 % are equal, and so are lengths within a minute; the first of equals.
+    # Spans within 5 %, and lengths within a minute, count as equal; take the first of equals.
     wide = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
     return max(wide, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
 
@@ -82,7 +82,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
         rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *lead.acceleration))
         flags.append((tracker.detector.regime, tracker.detector.direction))
     time: Floats = np.array([stamp_ns - start_ns for _, stamp_ns, _ in readings]) * 1e-9
-    # Of several at once the last one holds, and equal ones after each other are one stretch.
+    # Of several states at one time the last holds; consecutive equal states are one stretch.
     state_at = {
         0.0: (Regime.UNKNOWN, 0),
         **dict(zip(np.clip(time, 0.0, end).tolist(), flags, strict=True)),
@@ -101,7 +101,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
 
 
 def _settled(value: Floats, variance: Floats) -> Floats:
-    """Leave out an estimate until it has settled: its sd has come down to thrice the usual."""
+    """Set an estimate to NaN until its sd has fallen to three times the usual sd."""
     known = np.isfinite(value) & np.isfinite(variance)
     if not known.any():
         return np.full(len(value), np.nan)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the node says about itself: the compensator's status as a `DiagnosticStatus`.
+Owns the node's diagnostics: the compensator's status as a `DiagnosticStatus`.
 
-ERROR: nothing good goes out, or samples are saturated. WARN: what goes out is worse than the
-calibration promises. The message names every reason, the worst first; the values hold the figures.
+ERROR: no valid output, or samples are saturated. WARN: the output is worse than the calibration
+states. The message names every reason, the worst first; the values hold the figures.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-IDLE_S = 5.0  # after so long without samples [s] readings take effect without them
-#: Readings stamped this much ahead of the samples wait too long to be of one clock with them [s].
+IDLE_S = 5.0  # time without samples after which readings take effect without them [s]
+#: Lead of the readings' stamps over the samples' [s] above which the clocks differ.
 AHEAD_S = 5.0
-#: Samples that are late by so many cycles, and by so long [s], do not come any more.
+#: Samples have stopped when the next one is late by both limits: cycles, and [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
-#: |f| at rest may miss gravity by this many of its own standard deviations.
+#: Largest error of |f| at rest, in its standard deviations.
 GRAVITY_SIGMAS = 5.0
 
 _ERROR, _WARN = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
 _DIRECTIONS = {-1: 'cooling', 0: 'none', 1: 'heating'}
 
-#: What is said of a counter that has risen, after the number.
+#: Level and text of a counter that has risen; the text follows the number.
 _RISEN = {
     'n_contested': (_ERROR, 'messages of more than one publisher, dropped'),
     'n_failures': (_ERROR, 'callbacks failed, see the log of the node'),
     'n_stuck': (_ERROR, 'samples stuck or all zero, dropped'),
     'n_too_fast': (_ERROR, 'samples too fast for their conversion cycle, dropped'),
-    'n_unsound': (_ERROR, 'samples of which nothing finite can be made, dropped'),
+    'n_unsound': (_ERROR, 'samples without a finite correction, dropped'),
     'n_saturated': (_ERROR, 'samples saturated (+-{full_scale:g}), dropped'),
     'n_not_finite': (_WARN, 'samples not finite, dropped'),
     'n_out_of_order': (_WARN, 'samples out of order, dropped'),
@@ -85,7 +85,7 @@ class Reporter:
         return self._relay.running.compensator
 
     def report(self) -> None:
-        """Say how the compensation is doing now, and what has happened since the last time."""
+        """Publish the present state, and the events since the last report."""
         loaded = self._relay.running.loaded
         self._count_lost()
         if self._compensator.counters.n_in != self._before['n_in']:
@@ -131,7 +131,7 @@ class Reporter:
         return {'n_in': counters.n_in, **asdict(counters), **traffic}
 
     def _count_lost(self) -> None:
-        """Count gaps in the driver's numbering, which mean something only while it is one."""
+        """Count gaps in the driver's numbering; valid only while there is one publisher."""
         samples = self._relay.samples
         n_lost, samples.n_lost = samples.n_lost, 0
         before, self._n_publishers = self._n_publishers, samples.count_publishers()
@@ -139,14 +139,14 @@ class Reporter:
             self._relay.traffic.n_lost += n_lost
 
     def _inputs(self) -> Iterator[Finding]:
-        """Say what is wrong with those who send."""
+        """List the problems of the publishers of the inputs."""
         for k, one in enumerate(self._relay.inputs.values()):
             n_publishers, topic = one.count_publishers(), one.subscription.topic_name
             if n_publishers > 1 and one.is_contested:
                 text = f'{n_publishers} publishers on {topic}'
-                yield _ERROR, f'{text}, it is not used until one of them sends alone'
+                yield _ERROR, f'{text}, the topic is not used until only one of them sends'
             elif n_publishers > 1:
-                # One that was killed is known for some time yet.
+                # The middleware lists a killed publisher until its lease ends.
                 yield _WARN, f'{n_publishers} publishers on {topic}, of which one sends'
             elif not n_publishers and (mismatch := _mismatch(self._node, one.subscription)):
                 level = _ERROR if k < 2 else _WARN
@@ -159,7 +159,7 @@ class Reporter:
         counts: dict[str, int],
         rate: float | None,
     ) -> dict[str, str]:
-        """List the figures, in the order in which a reader wants them."""
+        """List the figures, the most important first."""
         calibration, state, gravity = loaded.calibration, status.state, status.gravity
         values = {'regime': status.regime.name.lower()}
         if state:
@@ -227,7 +227,7 @@ def _of_axes(key: str, values: Iterable[float]) -> dict[str, str]:
 
 
 def _mismatch(node: Node, subscription: Subscription) -> str:
-    """Say why none of the publishers on a topic is heard; nothing where there is none."""
+    """Return why no publisher on a topic is heard: type or QoS; empty if there is none."""
     topic, expected = subscription.topic_name, type_name(subscription.msg_type)
     for found in node.get_publishers_info_by_topic(topic):
         if found.topic_type != expected:
@@ -246,7 +246,7 @@ def _findings(
     rate: float | None,
     silence_s: float,
 ) -> Iterator[Finding]:
-    """Say what is wrong with what comes in and what is made of it."""
+    """List the problems of the inputs and of the correction."""
     unit, needs_board = loaded.calibration.unit, loaded.calibration.needs_temperature
     if new['n_in'] == 0 and silence_s > max(SILENT_S, SILENT_CYCLES * unit.cycle_time_s):
         yield _ERROR, 'no samples are coming in'
@@ -294,7 +294,7 @@ def _findings(
 def _all_well(loaded: LoadedCalibration, status: CompensatorStatus) -> str:
     if not loaded.calibration.needs_temperature:
         reference = loaded.calibration.reference_temperature_c
-        return f'constants of {reference:g} degC, what temperature does is not known'
+        return f'constants of {reference:g} degC, not corrected for temperature'
     if status.regime == Regime.UNKNOWN:
         return 'regime not known yet, the static set applies'
     return f'{status.regime.name.lower()} regime'

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns temperatures in messages of any type, live: the type's class is found while the node runs.
+Owns the reading of temperatures from messages of any type; the class is imported at run time.
 
-So no message package is a dependency: that of a driver is installed where the driver runs.
+The package of a driver's messages is therefore no dependency: it is installed with the driver.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _STEP = re.compile(r'([A-Za-z]\w*)|\[([0-9]{1,6})\]|\.')
 
 
 class LiveField:
-    """A number in the messages of a topic; ThermoCompError for a type or field that is not."""
+    """A number in the messages of a topic; ThermoCompError if type or field does not exist."""
 
     def __init__(self, topic: str, kind: str, path: str) -> None:
         try:
@@ -39,7 +39,7 @@ class LiveField:
         try:
             self._value(self.kind())
         except IndexError:
-            pass  # of a sequence, which is empty in a new message
+            pass  # the field is in a sequence, which is empty in a new message
         except (AttributeError, TypeError, ValueError) as error:
             raise ThermoCompError(f'{kind} has no number `{path}`', key=topic) from error
 
@@ -49,11 +49,11 @@ class LiveField:
         return float(message)
 
     def read(self, data: bytes) -> tuple[int, float] | None:
-        """Read stamp [ns], `NO_STAMP_NS` without a header, and number; None if there is none."""
+        """Read stamp [ns] (`NO_STAMP_NS` without a header) and number; None without a number."""
         try:
             message = deserialize_message(data, self.kind)
             header = getattr(message, 'header', None)
-            # Some have a header of their own kind, and the usual one in it.
+            # Some types have a special header that contains the usual one.
             stamp = getattr(getattr(header, 'header', header), 'stamp', None)
             value = self._value(message)
         except (RuntimeError, ValueError, IndexError):
@@ -63,7 +63,7 @@ class LiveField:
         return stamp.sec * 1_000_000_000 + stamp.nanosec, value
 
     def as_temperature(self, data: bytes) -> bytes:
-        """Serialize the reading of a message as a Temperature; NaN where there is none."""
+        """Serialize the reading of a message as a Temperature; NaN without a reading."""
         stamp_ns, value = self.read(data) or (NO_STAMP_NS, float('nan'))
         message = Temperature(temperature=value)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
@@ -71,7 +71,7 @@ class LiveField:
 
 
 def live_field(node: Node, topic: str) -> LiveField | None:
-    """Find what is published on ``TOPIC[:FIELD]``; None before that, and for a Temperature."""
+    """Return the field of ``TOPIC[:FIELD]``; None for a Temperature, and without a publisher."""
     name, path = split_field(topic)
     name = node.resolve_topic_name(name)
     offers = node.get_publishers_info_by_topic(name)

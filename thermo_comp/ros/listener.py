@@ -3,9 +3,8 @@
 """
 Owns nodes that only listen: the node's output into a bag, its inputs as blocks.
 
-The log time of an output is the stamp of an Imu, and for anything else the newest such stamp
-before it, as in what `replay` writes, however fast a bag is played. That of an input is when it
-was received.
+As in a bag written by `replay`, the log time of an Imu is its stamp, and the log time of any other
+output the newest Imu stamp before it. The log time of an input is the time of reception.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from .fields import LiveField, live_field
 from .messages import message_class
 from .waitloop import RawSubscription, WaitLoop, own_node
 
-#: Time between two looks at what is published, and between two blocks [s].
+#: Interval of the search for publishers, and of the blocks [s].
 LOOK_S, BLOCK_S = 0.5, 1.0
 
 _ALL = HistoryPolicy.KEEP_ALL
@@ -44,12 +43,12 @@ _RESULTS = {topic.name: topic.type for topic in OUTPUTS}
 
 
 class _Listener:
-    """A node whose subscriptions are emptied in a thread of its own, while the context lasts."""
+    """A node whose subscriptions a thread reads while the context manager is active."""
 
     def __init__(self, name: str, ros_args: Sequence[str]) -> None:
         self._name, self._ros_args = name, ros_args
         self._heard: dict[str, RawSubscription] = {}
-        #: What came: whence, messages, when each was received [ns].
+        #: Received messages: topic, messages, times of reception [ns].
         self._came: list[tuple[str, list[bytes], list[int]]] = []
 
     def __enter__(self) -> Any:
@@ -65,7 +64,7 @@ class _Listener:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop, take what came last, destroy the node; do nothing the second time."""
+        """Stop, take the last messages, destroy the node; a second call does nothing."""
         self._stack.close()
 
     def _open(self) -> None:
@@ -83,7 +82,7 @@ class _Listener:
 
 
 class Recorder(_Listener):
-    """Records topics into a bag that any rosbag2 tool opens; it is written at the end."""
+    """Records topics into a rosbag2 bag, which is written at the end."""
 
     def __init__(
         self,
@@ -123,7 +122,7 @@ class Recorder(_Listener):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Messages that have come so far, by the relative topic name."""
+        """Number of messages received so far, by relative topic name."""
         counts = dict.fromkeys(self._topics, 0)
         for name, messages, _ in self._came:
             counts[name] += len(messages)
@@ -142,7 +141,7 @@ def _stamps(messages: list[bytes]) -> Ints:
 
 
 class LiveTopics(_Listener):
-    """Listens to the node's inputs: a topic is subscribed to once somebody publishes it."""
+    """Listens to the node's inputs; it subscribes to a topic once the topic has a publisher."""
 
     def __init__(self, topics: Topics, ros_args: Sequence[str] = ()) -> None:
         super().__init__('thermo_comp_record', ros_args)
@@ -150,7 +149,7 @@ class LiveTopics(_Listener):
         self._feeds: dict[Role, Topic] = {}
         self._fields: dict[Role, LiveField] = {}
         self._last_ns = NO_STAMP_NS
-        self.problems: tuple[str, ...] = ()  # why nothing comes, one sentence each
+        self.problems: tuple[str, ...] = ()  # reasons why a topic has no messages, as sentences
 
     def _open(self) -> None:
         self._look()
@@ -158,18 +157,18 @@ class LiveTopics(_Listener):
 
     @property
     def n_lost(self) -> int:
-        """Messages that were sent and did not get here."""
+        """Number of messages that were sent and not received."""
         return sum(one.n_lost for one in self._heard.values())
 
     def blocks(self, wait: Callable[[float], bool]) -> Iterator[News | None]:
-        """Give what has come, and None after each `wait` [s], until that tells to end."""
+        """Yield the received blocks, and None after each `wait` [s], until `wait` returns True."""
         is_over = False
         while not is_over:
             is_over = wait(BLOCK_S)
             if is_over:
                 self._stack.close()
             waiting = self._came[:]
-            # The thread may have put more behind them.
+            # The thread may have appended more meanwhile.
             del self._came[: len(waiting)]
             if waiting:
                 feeds = [Feed(k, *one) for k, one in enumerate(self._feeds.items())]
@@ -189,7 +188,7 @@ class LiveTopics(_Listener):
         return messages if field is None else list(map(field.as_temperature, messages))
 
     def _look(self) -> None:
-        """Subscribe to what is published; say what is not."""
+        """Subscribe to the published topics; note the others in `problems`."""
         problems: list[str] = []
         resolved = self._node.resolve_topic_name
         chosen = self._feeds.get('accel')
@@ -200,7 +199,7 @@ class LiveTopics(_Listener):
             and (chosen is None or chosen.type == usual.type)
         }
         if not any(self._hear('accel', name, kind, problems) for name, kind in inputs.items()):
-            problems.append(f'nobody publishes {" or ".join(map(resolved, inputs))}')
+            problems.append(f'no publisher on {" or ".join(map(resolved, inputs))}')
         front = resolved(thermometer('name')).removesuffix('name')
         further = {
             name.removeprefix(front): name
@@ -215,7 +214,7 @@ class LiveTopics(_Listener):
         self.problems = tuple(problems)
 
     def _hear(self, role: Role, topic: str, kind: str, problems: list[str]) -> bool:
-        """Subscribe to a topic if somebody publishes it; tell whether it is heard."""
+        """Subscribe to a topic if it has a publisher; whether there is a subscription."""
         name = self._node.resolve_topic_name(split_field(topic)[0])
         if role in self._heard:
             n_publishers = self._heard[role].count_publishers()

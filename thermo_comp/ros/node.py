@@ -3,8 +3,8 @@
 """
 Owns the node `thermo_comp`: samples and temperatures in, specific force, flag and diagnostics out.
 
-It publishes what the offline replay of a bag of the same messages writes, bit for bit. Parameters
-are checked when they are set and change what runs between two wake-ups.
+The output equals that of the offline replay of the same messages bit for bit. Parameters are
+checked when they are set, and applied between two wake-ups.
 """
 
 from __future__ import annotations
@@ -36,12 +36,11 @@ from .waitloop import WaitLoop, overrides
 
 NODE_NAME = 'thermo_comp'
 
-#: With best effort, samples that come at some 7 kHz or more are taken some at a time, so long
-#: after the last ones [s]: it saves a third of the CPU time at 10 kHz. At 5 kHz it would make each
-#: wait for longer than it takes to relay it.
+#: Pause after a wake-up, in which samples of 7 kHz or more gather [s], with best effort only. It
+#: saves a third of the CPU time at 10 kHz; at 5 kHz it would delay a sample longer than its relay.
 REST_S = 0.2e-3
 
-#: After a signal the process ends within this time, whatever hangs [s].
+#: Time within which the process ends after a signal, even if a call hangs [s].
 ENDING_S = 1.8
 
 USAGE = f"""\
@@ -55,10 +54,10 @@ example: thermo_comp_node --ros-args -p calibration_file:=unit42.yaml -r accel/c
 parameters:
 """
 
-#: What the launch file calls a parameter whose argument was not given.
+#: Prefix that the launch file gives to a parameter whose argument was not given.
 NOT_GIVEN = 'not_given.'
 
-#: What files, values, the environment and the middleware do: RuntimeError is its own, too.
+#: Errors of files, values, the environment and the middleware (which raises RuntimeError, too).
 _NOT_OURS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
 
 
@@ -86,7 +85,7 @@ class CompensationNode:
         self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
         self._report_every(config.diagnostics_period)
         topics = [self.node.resolve_topic_name(one.name) for one in SAMPLES.values()]
-        # The input that is not open may be opened later, with these.
+        # QoS overrides of the input that is not open: it may be opened later.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
         for name in overrides(self.node):
             if not (self.node.has_parameter(name) or name.startswith(known)):
@@ -97,7 +96,7 @@ class CompensationNode:
         self._loop.run(self._relay.on_data)
 
     def counts(self) -> tuple[int, int, int]:
-        """Give how many samples came in and went out, and how many flags went out."""
+        """Return the numbers of samples received and published, and of flags published."""
         counters, traffic = self._compensator.counters, self._relay.traffic
         return counters.n_in, counters.n_out - traffic.n_unpublished, traffic.n_flags
 
@@ -107,7 +106,6 @@ class CompensationNode:
 
     def close(self) -> None:
         """Destroy the node."""
-        # What is being read ends with its process.
         self._reader.close()
         self._requests.close()
         self.node.destroy_node()
@@ -128,7 +126,7 @@ class CompensationNode:
         return self._relay.running.compensator
 
     def _prepare(self, changes: list[Parameter]) -> tuple[LoadedCalibration, Model] | None:
-        """Read, try and build the calibration that a change asks for, beside the samples."""
+        """Read, try and build the calibration of a change, in parallel to the samples."""
         names = [one.value for one in changes if one.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
@@ -138,7 +136,7 @@ class CompensationNode:
     def _set(
         self, changes: list[Parameter], new: tuple[LoadedCalibration, Model] | None
     ) -> SetParametersResult:
-        """Apply a change as a whole between two samples, or leave everything as it was."""
+        """Apply a change as a whole between two samples, or change nothing."""
         before = after = self._relay.running
         loaded, model = new or (before.loaded, before.compensator.thermal.model)
         config = parameters.updated(before.config, changes)
@@ -148,14 +146,14 @@ class CompensationNode:
         try:
             after = self._relay.successor(loaded, model, config)
             self._run_with(after)
-            # rclpy has the last word: unknown and fixed parameters.
+            # rclpy refuses unknown and fixed parameters.
             result = self.node.set_parameters_atomically(changes)
             if not result.successful:
                 raise parameters.ParameterError(result.reason)
             if new:
                 self._say_calibration()
             self._loop.call_soon(partial(self._relay.release, before.samples))
-            # Whatever fails up to here has not happened.
+            # A failure up to here has changed nothing.
             return result  # noqa: TRY300
         except BaseException:
             self._run_with(before)
@@ -174,7 +172,7 @@ class CompensationNode:
     def _check(
         self, loaded: LoadedCalibration, config: parameters.NodeConfig, inputs: tuple[str, ...]
     ) -> None:
-        """Refuse a calibration that is for another unit, input or set of thermometers."""
+        """Refuse a calibration of another unit, input or set of thermometers."""
         unit, heard = loaded.calibration.unit, inputs[1:]
         message = key = ''
         taken = {'counts': 'counts', 'imu': 'm/s^2'}[config.input]
@@ -189,7 +187,7 @@ class CompensationNode:
         elif loaded.calibration.sensors != heard:
             named, key = ', '.join(loaded.calibration.sensors), 'sensors'
             message = f'must be {", ".join(heard)}, which this node listens to, got {named}: '
-            message += 'start the node anew with this file'
+            message += 'restart the node with this file'
         if message:
             raise CalibrationError(message, loaded.path, key)
 
@@ -201,7 +199,7 @@ class CompensationNode:
 
 @contextmanager
 def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
-    """Run the node in a thread of this process, in a context of its own."""
+    """Run the node in a thread of this process, in a separate context."""
     context = rclpy.context.Context()
     rclpy.init(args=['--ros-args', *ros_args], context=context)
     try:
@@ -233,7 +231,7 @@ def main(args: list[str] | None = None) -> int:
         try:
             print(text, file=sys.stdout if is_help else sys.stderr, flush=True)
         except OSError as error:
-            # The interpreter would try again at its end.
+            # Otherwise the interpreter would try to flush again at its end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0 if isinstance(error, BrokenPipeError) else _fail(error, 1)
         return 0 if is_help else 2
@@ -244,7 +242,7 @@ def main(args: list[str] | None = None) -> int:
             node = CompensationNode()
             try:
                 signals.on_signal(node.stop)
-                # What start-up left behind is never looked at again by the garbage collector.
+                # Exclude the objects of the start-up from later garbage collections.
                 gc.collect()
                 gc.freeze()
                 node.run()
@@ -260,7 +258,7 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _fail(error: Exception, code: int) -> int:
-    """Print the one line that a failed start leaves behind; return its exit code."""
+    """Print the reason of a failed start on one line; return the exit code."""
     with suppress(OSError):
         print(f'thermo_comp_node: {one_line(str(error))}', file=sys.stderr, flush=True)
     return code

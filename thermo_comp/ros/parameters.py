@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the node's parameters: the table of what they are, and the services that set them.
+Owns the node's parameters: their table, and the services that set them.
 
-The table is `NodeConfig`: what the node runs with is one such object, and a change makes another
-or is refused as a whole. A thread of its own waits for what takes time, the reading of a file; the
-loop exchanges one reference. Requests are answered in the order in which they came, but what names
-no file waits for none.
+The table is `NodeConfig`. The node runs with one immutable `NodeConfig`; a change makes a new one
+or is refused as a whole. A thread waits while a file is read; the loop then replaces one
+reference. Requests are answered in order of arrival, but a request without a file waits for none.
 """
 
 from __future__ import annotations
@@ -32,10 +31,10 @@ from ..recording.topics import Topics, parse_name, read_names
 from ..text import LONGEST_SERIAL, one_line
 from .waitloop import WaitLoop, overrides
 
-#: More requests than this that wait, or parameters in one of them, are refused.
+#: Largest number of waiting requests, and of parameters in a request.
 WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
-LONGEST_FRAME = 255  # the longest name of a frame that may be set, in bytes
-_LONGEST_REASON = 1000  # of a reason, which may repeat what came in
+LONGEST_FRAME = 255  # longest frame name that may be set [bytes]
+_LONGEST_REASON = 1000  # longest reason of a refusal [characters]; it may quote the request
 
 _DEFAULTS = CompensatorConfig()
 
@@ -50,7 +49,7 @@ def _parameter(
 
 @dataclass(frozen=True, slots=True)
 class NodeConfig:
-    """The parameters, live but for two; descriptions have the units."""
+    """The parameters; all but two can be changed while the node runs. Descriptions have units."""
 
     calibration_file: str = _parameter(
         '',
@@ -59,25 +58,25 @@ class NodeConfig:
     )
     calibration_directory: str = _parameter(
         '',
-        'Folder that `calibration_file` must lie in, wherever links lead; empty allows any. Only '
-        'at start.',
+        'Folder that `calibration_file` must be in after links are resolved; empty allows any. '
+        'Only at start.',
         longest=4096,
         is_fixed=True,
     )
     serial: str = _parameter(
-        '', 'Serial number that the calibration must be for; empty accepts any.'
+        '', 'Serial number that the calibration must have; empty accepts any.'
     )
     topics: str = _parameter(
         '',
-        'Topics of the inputs other than above: INPUT=TOPIC[:FIELD] by commas, or a file of such '
-        'lines, as config/drivers has. Only at start.',
+        'Topics of inputs with other names: INPUT=TOPIC[:FIELD], separated by commas, or a file '
+        'of such lines, as in config/drivers. Only at start.',
         longest=4096,
         is_fixed=True,
     )
     input: str = _parameter(
         'counts',
-        'What is compensated: accel/counts (Vector3Stamped) or imu/uncompensated (Imu); the one '
-        'that `topics` names, if it names one.',
+        'Input to compensate: accel/counts (Vector3Stamped) or imu/uncompensated (Imu). Default: '
+        'the input that `topics` names.',
         choices=('counts', 'imu'),
     )
     frame_id: str = _parameter(
@@ -87,8 +86,8 @@ class NodeConfig:
     )
     transition_time: float = _parameter(
         _DEFAULTS.transition_time_s,
-        'Time over which the sets cross over at a switch [s], up to ten times as long where the '
-        'output would move faster than 1 ug per second; 0 switches at once.',
+        'Time over which the sets are blended at a switch [s], up to ten times as long if the '
+        'output would change faster than 1 ug per second; 0 switches at once.',
         (0.0, 3600.0),
     )
     temperature_timeout: float = _parameter(
@@ -103,8 +102,8 @@ class NodeConfig:
     )
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
-        'Time after which samples that are equal to the bit are not published [s]; three exact '
-        'zeros never are; 0 publishes any sample.',
+        'Time after which repeated equal samples are not published [s]; three exact zeros never '
+        'are; 0 publishes any sample.',
         (0.0, 3600.0),
     )
     local_gravity: float = _parameter(
@@ -114,17 +113,16 @@ class NodeConfig:
     )
     gravity_tolerance: float = _parameter(
         _DEFAULTS.gravity_tolerance_m_s2,
-        'Error of the magnitude at rest [m/s^2] at which publishing stops: another unit, a '
-        'reversed axis; 0 never stops.',
+        'Error of |f| at rest [m/s^2] at which publishing stops (another unit, a reversed axis); '
+        '0 never stops.',
         (0.0, 100.0),
     )
     diagnostics_period: float = _parameter(1.0, 'Time between diagnostics [s].', (0.01, 60.0))
 
     def compensator_config(self) -> CompensatorConfig:
-        """Return the part that the compensator takes."""
-        # There the names say the units.
-        names = [one.name for one in fields(CompensatorConfig)]
-        own = (getattr(self, one.removesuffix('_m_s2').removesuffix('_s')) for one in names)
+        """Return the settings of the compensator, whose names end in the unit."""
+        names = [field.name for field in fields(CompensatorConfig)]
+        own = (getattr(self, name.removesuffix('_m_s2').removesuffix('_s')) for name in names)
         return CompensatorConfig(**dict(zip(names, own, strict=True)))
 
 
@@ -132,25 +130,25 @@ _TABLE: Mapping[str, Field[Any]] = {entry.name: entry for entry in fields(NodeCo
 
 
 class ParameterError(ThermoCompError):
-    """A parameter value that the node can't take; names the parameter, the rule and the value."""
+    """A value that the node refuses; the message names parameter, rule and value."""
 
 
 def declare(node: Node) -> NodeConfig:
-    """Declare every parameter with the user's value; ParameterError where it does not fit."""
+    """Declare every parameter with the user's value; ParameterError if it breaks the rule."""
     values, given = {}, overrides(node)
     names = named_topics(_checked('topics', given.get('topics', '')))
     inputs = [one for one in ('counts', 'imu') if one in names]
     if len(inputs) == 1:
         given['input'] = inputs[0]
     for name, entry in _TABLE.items():
-        # Not by rclpy, to whom a whole number is no float.
+        # Checked here: rclpy refuses an integer for a float.
         values[name] = _checked(name, given.get(name, entry.default))
         node.declare_parameter(name, values[name], descriptor(name), ignore_override=True)
     return NodeConfig(**values)
 
 
 def named_topics(text: str) -> dict[str, str]:
-    """Read the parameter `topics`: by input the topic; ParameterError for what is none."""
+    """Read the parameter `topics`: topics by input; ParameterError if it is malformed."""
     try:
         names = dict(map(parse_name, text.split(','))) if '=' in text else {}
         names = read_names(text) if text and not names else names
@@ -178,7 +176,7 @@ def descriptor(name: str) -> ParameterDescriptor:
 
 
 def updated(config: NodeConfig, parameters: Iterable[Parameter]) -> NodeConfig:
-    """Apply values set together, passing over others' parameters; ParameterError as above."""
+    """Apply values set together, skipping unknown parameters; ParameterError as in `declare`."""
     values = {one.name: _checked(one.name, one.value) for one in parameters if one.name in _TABLE}
     return replace(config, **values)
 
@@ -192,7 +190,7 @@ def parameters_help() -> str:
 
 
 def _checked(name: str, value: Any) -> Any:
-    """Return a value in its parameter's type; ParameterError where it does not fit."""
+    """Return a value in its parameter's type; ParameterError if it breaks the rule."""
     metadata, rule, got = _TABLE[name].metadata, '', f'{value!r:.60}'
     if isinstance(_TABLE[name].default, str):
         longest, choices = metadata['longest'], metadata['choices']
@@ -217,10 +215,10 @@ def _checked(name: str, value: Any) -> Any:
 
 
 class ParameterRequests:
-    """What answers a node's parameter services."""
+    """Answers a node's parameter services."""
 
-    # `prepare` does what takes time about a change, beside the samples, `apply` sets what comes
-    # of it, between two of them. Exceptions are refusals.
+    # `prepare` does the slow part of a change in parallel to the samples, `apply` sets its result
+    # between two samples. An exception of either refuses the change.
     def __init__(
         self,
         loop: WaitLoop,
@@ -237,7 +235,7 @@ class ParameterRequests:
                 loop.handlers[service] = partial(_reply, service)
 
     def close(self) -> None:
-        """Finish what is being prepared; nothing is applied any more."""
+        """Wait for the running preparation; apply nothing any more."""
         self._beside.shutdown(cancel_futures=True)
 
     def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
@@ -250,7 +248,7 @@ class ParameterRequests:
             answer(kind.Response(results=results) if is_each else kind.Response(result=results[0]))
 
         def end(prepared: Future[Any]) -> None:
-            """Apply a group in the loop's thread; after the last one answer."""
+            """Apply a group in the loop's thread; after the last group send the answer."""
             try:
                 self._set(prepared, results)
             finally:
@@ -261,7 +259,7 @@ class ParameterRequests:
         if n > PARAMETERS_LIMIT:
             reason = f'{n} parameters at once, at most {PARAMETERS_LIMIT}'
         elif waits and self._n_waiting >= WAITING_LIMIT:
-            reason = 'too many requests wait already, try again'
+            reason = 'too many requests are waiting, try again'
         elif groups:
             self._n_waiting += waits
             for group in groups:
@@ -269,7 +267,7 @@ class ParameterRequests:
                 future = self._beside.submit(read) if waits else _done(read)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
-        # Not one for each: to write so many would take as long as to read them.
+        # Limited: to write a result per parameter would take as long as to read them.
         results += [_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT)
         respond()
 
@@ -278,7 +276,7 @@ class ParameterRequests:
         return changes, self._prepare(changes)
 
     def _set(self, prepared: Future[Any], results: list[SetParametersResult]) -> None:
-        """Apply one group; what nobody foresaw is refused and logged by the loop."""
+        """Apply one group; an unexpected error refuses it and is logged by the loop."""
         try:
             changes, found = prepared.result()
             news = [one for one in changes if not self._is_in_force(one)]
@@ -293,7 +291,7 @@ class ParameterRequests:
             raise
 
     def _is_in_force(self, change: Parameter) -> bool:
-        """Tell whether it leaves a fixed parameter as it is, as `param load` of a dump does."""
+        """Whether a change keeps a fixed parameter's value, as `param load` of a dump does."""
         node = self._loop.node
         return bool(
             node.has_parameter(change.name)
@@ -303,33 +301,32 @@ class ParameterRequests:
 
 
 def _done(call: Callable[[], Any]) -> Future[Any]:
-    """Call at once, and keep what comes of it."""
+    """Call at once, and keep the result or the exception."""
     future: Future[Any] = Future()
     try:
         future.set_result(call())
-    except Exception as error:  # noqa: BLE001 - it is kept
+    except Exception as error:  # noqa: BLE001 - kept in the future
         future.set_exception(error)
     return future
 
 
 def _reply(service: Service, request: Any, answer: Callable[[Any], None]) -> None:
-    """Let rclpy answer a question; one of too many names as if it knew none of them."""
+    """Let rclpy answer a request; with too many names, answer as if none of them existed."""
     names = request.prefixes if service.srv_type is srv.ListParameters else request.names
     response = service.srv_type.Response()
     answer(response if len(names) > PARAMETERS_LIMIT else service.callback(request, response))
 
 
 def read_parameter(message: ParameterMessage) -> Parameter:
-    """Read a parameter off the network, whole numbers as floats where this node wants floats."""
+    """Read a received parameter; integers become floats if the parameter is a float."""
     if not message.name:
-        # rclpy takes it for declared.
+        # rclpy would treat the empty name as declared.
         raise ParameterError('a parameter without a name')
     try:
         one = Parameter.from_parameter_msg(message)
     except (ValueError, TypeError) as error:
         raise ParameterError(
-            f'parameter {message.name!r:.60} has no value that can be read '
-            f'(type {message.value.type})'
+            f'parameter {message.name!r:.60} has no readable value (type {message.value.type})'
         ) from error
     is_whole = one.type_ == Parameter.Type.INTEGER and one.name in _TABLE
     if is_whole and isinstance(_TABLE[one.name].default, float):

@@ -1,12 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the player: a bag onto the node's live input topics, with `/clock`, paced or flow controlled.
+Owns the player: publishes a bag on the node's input topics, with `/clock`, paced or as fast as the
+subscribers take it.
 
-Topics go out under the node's own relative names, messages byte for byte in the bag's order; ROS 1
+Topics have the node's relative names, messages are unchanged and in the bag's order; ROS 1
 messages are rewritten in CDR. After `WINDOW` messages of a topic the player waits until every
-reliable subscriber has acknowledged them. Fast DDS asks for that with every message only while the
-history is full, and else every 3 s: hence small ones, which transient-local durability keeps full.
+reliable subscriber has acknowledged them. Fast DDS requests that with every message only while the
+history is full, and otherwise every 3 s: therefore the histories are small, and transient-local
+durability keeps them full.
 """
 
 from __future__ import annotations
@@ -38,26 +40,26 @@ from .waitloop import own_node, wait_until
 
 NODE_NAME = 'thermo_comp_player'
 
-#: Messages of a topic under way at most; so many are kept to be sent again.
+#: Largest number of unacknowledged messages of a topic; depth of its history.
 WINDOW: dict[Role, int] = defaultdict(lambda: 50, accel=200)
 CLOCK_PERIOD = 0.01  # wall time between two messages on `/clock` [s]
-#: Time between two looks at what is acknowledged; that takes Fast DDS some 5 ms [s].
+#: Interval of the checks for acknowledgements, which Fast DDS sends within some 5 ms [s].
 ACKNOWLEDGEMENT_NAP = 0.0005
-#: Time the subscribers are given to find the player too where nobody tells when they have [s].
+#: Time for subscribers to discover the player if the middleware does not report it [s].
 SETTLING = 0.3
 PATIENCE = 30.0  # how long a subscriber may leave a window unacknowledged [s]
 
 
 @dataclass(frozen=True, slots=True)
 class PlayReport:
-    """What a player did; topics by their full names."""
+    """Summary of a playback; topics by their full names."""
 
     n_messages: dict[str, int]
     duration_s: float  # wall time from the first message to the last acknowledgement [s]
-    #: Topics to which nobody listened, and those with a best-effort subscriber, which can lose.
+    #: Topics without a subscriber, and with a best-effort subscriber, which may lose messages.
     unheard: list[str]
     lossy: list[str]
-    #: The bag: which of its topics were taken by their type, what of it could not be read.
+    #: The bag: topics chosen by their type, and parts that could not be read.
     info: RecordingInfo
 
 
@@ -70,7 +72,7 @@ def play(
     ros_args: Sequence[str] = (),
     progress: Callable[[float], None] = lambda _: None,
 ) -> PlayReport:
-    """Play a bag, as `opened_player`, when all topics have subscribers, after `wait_s` at most."""
+    """Play a bag as `opened_player` once all topics have subscribers, or after `wait_s` [s]."""
     with opened_player(path, rate, topics, ros_args) as player:
         wait_until(lambda: not player.unheard(), wait_s)
         if wait_s > 0.0:
@@ -82,7 +84,7 @@ def play(
 def opened_player(
     path: str | Path, rate: float, topics: Topics | None = None, ros_args: Sequence[str] = ()
 ) -> Iterator[Player]:
-    """Open a bag to be played, `rate` seconds of it per second, 0 as fast as they are taken."""
+    """Open a bag for playing at `rate` times real time; 0 is as fast as subscribers take it."""
     if not rate >= 0.0:
         raise ValueError(f'`rate` must be zero or positive, got {rate}')
     with (
@@ -120,7 +122,7 @@ class Player:
     def run(
         self, progress: Callable[[float], None], throttle: Callable[[int], object] = lambda _: None
     ) -> PlayReport:
-        """Send the bag; `throttle` is told the samples sent after each window, and may block."""
+        """Send the bag; after each window `throttle` gets the number of samples, and may block."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
         topics = {one.topic_name: role for role, one in self._publishers.items()}
@@ -155,7 +157,7 @@ class Player:
         )
 
     def _pace(self, started: float, start_ns: int, log_ns: int) -> None:
-        """Sleep until a message is due; tell the time meanwhile."""
+        """Sleep until a message is due; publish `/clock` meanwhile."""
         due = started + (log_ns - start_ns) * 1e-9 / self._rate if self._rate else started
         while True:
             now = time.monotonic()
@@ -171,15 +173,15 @@ class Player:
 
     def _await_acknowledgement(self, role: Role) -> None:
         publisher = self._publishers[role]
-        # Asked again and again: waiting inside rclpy would keep this process's other threads out.
+        # Polled: waiting inside rclpy would block this process's other threads.
         is_done = partial(publisher.wait_for_all_acked, Duration())
         if not wait_until(is_done, PATIENCE, ACKNOWLEDGEMENT_NAP):
             name = publisher.topic_name
-            raise ThermoCompError(f'{name}: a subscriber took nothing for {PATIENCE:g} s')
+            raise ThermoCompError(f'{name}: a subscriber acknowledged nothing for {PATIENCE:g} s')
 
 
 def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> list[str]:
-    """Give the ROS arguments under which a node loses nothing, at the price of latency."""
+    """Return ROS arguments under which a node loses no message, at the price of latency."""
     inputs = [*(one.name for one in SAMPLES.values()), *map(thermometer, thermometers)]
     overrides = [
         *(f'{topic}.subscription.reliability:=reliable' for topic in inputs),
@@ -191,12 +193,12 @@ def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> li
 
 
 def _in_order(block: Block) -> list[tuple[float, int, Role, bytes]]:
-    """Give a block's messages in the order of the bag: place, log time, role, bytes."""
+    """List a block's messages in the order of the bag: place, log time, role, bytes."""
     rows: list[tuple[float, int, Role, bytes]] = []
     places: dict[Role, Any] = {role: one.after - 0.5 for role, one in block.temperatures.items()}
     places['accel'] = np.arange(len(block))
     for role, messages in block.raw.items():
         log_ns = block.log_ns[role].tolist()
         rows += zip(places[role].tolist(), log_ns, repeat(role), messages, strict=False)
-    # Readings between the same two samples: by log time.
+    # Readings between the same two samples are ordered by log time.
     return sorted(rows, key=itemgetter(0, 1))

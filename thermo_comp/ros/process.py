@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what a process sets up before its first node: its end by a signal, its Fast DDS profile.
+Owns the set-up of a process before its first node: handling of signals, Fast DDS profile.
 
-The middleware's own handlers shut the context down under whatever is using it, which seldom ends
-in a segmentation fault. Here a thread asks the loop to stop, which takes everything down in order.
+The middleware's signal handlers shut the context down while it is in use, which sometimes ends in
+a segmentation fault. Here a thread asks the loop to stop, which shuts everything down in order.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pathlib import Path
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-#: Where Fast DDS 2 is told of a profile, and the file of the working directory that it takes else.
+#: Environment variable of a Fast DDS 2 profile, and the default file in the working directory.
 VARIABLE, LOCAL_PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE', 'DEFAULT_FASTRTPS_PROFILES.xml'
 PROFILE = Path(__file__).with_name('fastdds_profile.xml')
 
 
 def use_profile() -> None:
-    """Make the node's profile that of this process, before its first context, if none is set."""
+    """Set the node's profile for this process, unless a profile is set; before any context."""
     # It saves a quarter of the CPU time with reliable subscribers (docs/benchmarks.md).
     if VARIABLE not in os.environ and not Path(LOCAL_PROFILE).is_file():
         os.environ[VARIABLE] = str(PROFILE)
@@ -32,13 +32,13 @@ def use_profile() -> None:
 
 class SignalWatch:
     """
-    Turn the first signal into a call, entered in the main thread; the second ends at once.
+    Turns the first signal into a call; the second ends the process. Enter in the main thread.
 
-    Where that call has not led to the end within `ending_s` [s], the process ends all the same.
+    If the process has not ended `ending_s` [s] after the call, it is ended.
     """
 
-    # The call comes from another thread, so that it also comes while the main one waits in the
-    # middleware, where the interpreter runs no handlers.
+    # The call comes from another thread: while the main thread waits in the middleware, the
+    # interpreter runs no signal handlers.
 
     def __init__(self, ending_s: float | None = None) -> None:
         self._ending_s = ending_s
@@ -49,14 +49,14 @@ class SignalWatch:
     def __enter__(self) -> SignalWatch:
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._writer, False)
-        # The interpreter has written the signal's number already.
+        # Empty handlers: the interpreter writes the signal's number to the wake-up socket.
         self._handlers = {number: signal.signal(number, lambda *_: None) for number in SIGNALS}
         self._wakeup = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Give the signals back to whom they belonged before."""
+        """Restore the previous handlers."""
         signal.set_wakeup_fd(self._wakeup)
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
@@ -65,7 +65,7 @@ class SignalWatch:
         os.close(self._reader)
 
     def on_signal(self, stop: Callable[[], None]) -> None:
-        """Say what is to be called, once or twice; called at once after a signal."""
+        """Set the function to call, once or twice; a past signal calls it at once."""
         self._stop = stop
         if self._is_over:
             stop()
@@ -75,9 +75,9 @@ class SignalWatch:
             self._is_over = True
             self._stop()
             if not select.select([self._reader], [], [], self._ending_s)[0]:
-                # Nothing is left to be kept: who asked for the end has it.
+                # The orderly end has hung for `ending_s`.
                 os._exit(0)
             number = os.read(self._reader, 1)
             if number:
-                # Whoever asks twice does not want to wait for the order.
+                # The second signal does not wait for an orderly end.
                 os._exit(128 + number[0])

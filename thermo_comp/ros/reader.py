@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the reading of calibrations beside the samples, in a process of its own.
+Owns the reading of calibrations in a separate process, in parallel to the samples.
 
-A parser holds the interpreter for milliseconds at a time, which no thread can help; and whatever
-a file makes of its reader, the node only hears that it has ended, or nothing, for a time.
+A parser holds the interpreter lock for milliseconds at a time, so a thread would delay samples.
+If a file makes its reader crash or hang, the node only sees a process that ended or timed out.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from ..online.trial import tried
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
 
-#: A file that has not been read within this time hangs: a network drive that is gone [s].
+#: Time limit for reading a file [s]; beyond it the file hangs, as on a lost network drive.
 LIMIT_S = 10.0
-_ENDING_S = 0.5  # how long a process that was killed is waited for [s]
-_PR_SET_PDEATHSIG = 1  # of Linux: the signal that comes when the parent's thread has ended
-NICENESS = 5  # added to the niceness of the process: the samples go first
+_ENDING_S = 0.5  # time to wait for a killed process [s]
+_PR_SET_PDEATHSIG = 1  # option of Linux prctl: the signal sent when the parent ends
+NICENESS = 5  # added to the niceness of the process, so that samples have priority
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class LoadedCalibration:
 
 
 def read(name: str, directory: str = '') -> LoadedCalibration:
-    """Read and try a calibration; CalibrationError, which quotes nothing of what is none."""
+    """Read and try a calibration; a CalibrationError quotes nothing of a file that is none."""
     if not name:
         raise CalibrationError(
             'parameter `calibration_file` is not set; start with '
@@ -57,7 +57,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
         path = Path(name).expanduser()
         root = Path(directory).expanduser().resolve() if directory else None
         try:
-            # Links included; a folder that may not be looked into is not told from one outside.
+            # After links are resolved; an unreadable folder gives the same error as one outside.
             if root is not None and not path.resolve().is_relative_to(root):
                 raise PermissionError
             content = read_bounded(path, SIZE_LIMIT, root)
@@ -73,10 +73,9 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
             raise
         raise CalibrationError(error.rule, name) from error
     except Exception as error:
-        # RuntimeError: the home folder of a user that there is not. Whatever else it may be, a
-        # file does not end the node.
-        is_told = isinstance(error, OSError) or type(error) is ValueError
-        reason = getattr(error, 'strerror', None) or (is_told and str(error))
+        # RuntimeError: the home folder of an unknown user. No error of a file may end the node.
+        has_reason = isinstance(error, OSError) or type(error) is ValueError
+        reason = getattr(error, 'strerror', None) or (has_reason and str(error))
         raise CalibrationError(
             f'cannot be read: {reason or type(error).__name__}', name
         ) from error
@@ -84,16 +83,16 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
 
 
 def read_within(name: str, directory: str, limit_s: float = LIMIT_S) -> LoadedCalibration:
-    """Do what `read` does, beside; CalibrationError where a file hangs."""
+    """Do `read` in a thread; CalibrationError if the file hangs."""
     answers: SimpleQueue[LoadedCalibration | Exception] = SimpleQueue()
 
     def answer() -> None:
         try:
             answers.put(read(name, directory))
-        except Exception as error:  # noqa: BLE001 - it is the answer
+        except Exception as error:  # noqa: BLE001 - returned as the answer
             answers.put(error)
 
-    # Where a file hangs, nobody waits for it at the end either.
+    # A daemon: if the file hangs, the end of the process does not wait for it.
     threading.Thread(target=answer, name='first reading', daemon=True).start()
     try:
         found = answers.get(timeout=limit_s)
@@ -109,7 +108,7 @@ def _hanging(name: str, limit_s: float) -> CalibrationError:
 
 
 class Reader:
-    """A process that reads calibrations, begun when the first is asked for, and when one hangs."""
+    """A process that reads calibrations; started at the first request and after a hang."""
 
     def __init__(self, limit_s: float = LIMIT_S) -> None:
         self._limit_s = limit_s
@@ -117,7 +116,7 @@ class Reader:
         self._process: subprocess.Popen[bytes] | None = None
 
     def read(self, name: str, directory: str) -> LoadedCalibration:
-        """Do what the function `read` does, there, within the time limit."""
+        """Do the function `read` in the process, within the time limit."""
         try:
             if self._process is None:
                 self._begin()
@@ -135,7 +134,7 @@ class Reader:
         return answer
 
     def close(self) -> None:
-        """End the process, and whatever is read there; from any thread, once and for all."""
+        """End the process and any reading in it for good; callable from any thread."""
         self._is_closed = True
         self._end()
 
@@ -143,10 +142,10 @@ class Reader:
         if self._is_closed:
             raise EOFError
         self._pipe, theirs = Pipe()
-        # The very package that runs here; a Ctrl-C is for the node, with whom this ends.
+        # Same package path as here; Ctrl-C goes to the node only, which ends this process.
         code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve'
         with theirs:
-            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and words
+            self._process = subprocess.Popen(  # noqa: S603 - fixed interpreter and arguments
                 [sys.executable, '-c', f'{code}; serve({theirs.fileno()}, {os.getpid()})'],
                 pass_fds=[theirs.fileno()],
                 start_new_session=True,
@@ -156,14 +155,14 @@ class Reader:
         process, self._process = self._process, None
         if process is not None:
             process.kill()
-            # One that a dead file system holds ends when that lets it go.
+            # A process held by a dead file system ends when the file system releases it.
             with suppress(subprocess.TimeoutExpired):
                 process.wait(_ENDING_S)
             self._pipe.close()
 
 
 def serve(handle: int, parent: int) -> None:
-    """Read what the process is asked for, until nobody can ask any more."""
+    """Answer reading requests until the connection closes."""
     os.nice(NICENESS)
     pipe = Connection(handle)
     with suppress(AttributeError, OSError):
@@ -175,5 +174,5 @@ def serve(handle: int, parent: int) -> None:
         while True:
             try:
                 pipe.send(read(*pipe.recv()))
-            except CalibrationError as error:  # noqa: PERF203 - it is the answer
+            except CalibrationError as error:  # noqa: PERF203 - returned as the answer
                 pipe.send(error)

@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way of the samples through the node: in the order of arrival, however the wake-ups fell.
+Owns the way of the samples through the node, in order of arrival and independent of wake-ups.
 
-A message does not tell whose it is, so while an input has two sources nothing of it is used, nor
-what comes just after it, which may still be of the one that left (`waitloop.Sources`).
+Messages do not identify their publisher. While a topic has more than one publisher it is ignored,
+and so is the first batch afterwards, which may still be from the publisher that left
+(`waitloop.Sources`).
 
-A sample is read and an Imu is written at fixed places of their plain form, little-endian CDR:
+Samples are read, and an Imu is written, at fixed offsets of their plain form, little-endian CDR:
 4 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with
-its final NUL, the string, and, at the next multiple of 8 counted from behind the encapsulation,
-float64 values. A message of any other form is brought into this one by rclpy first.
+its final NUL, the string, and, at the next multiple of 8 from the end of the encapsulation,
+float64 values. A message in any other form is first converted to this form by rclpy.
 """
 
 from __future__ import annotations
@@ -39,43 +40,43 @@ from .parameters import NodeConfig, named_topics
 from .reader import LoadedCalibration
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, readings take effect but for those not older than the newest by this [ns]: a
-#: sample that Fast DDS has to repeat can be 3 s late.
+#: Without samples, readings take effect once they are older than the newest by this [ns]: a sample
+#: that Fast DDS has to repeat can be 3 s late.
 IDLE_NS = 1_000_000_000
 
-#: Compensates one sample: stamp and three components in, force and covariance out, None = drop.
+#: Compensates a sample: stamp and three components in, force and covariance out; None = dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
-#: Corrects the angular rate that came with that sample: rate and variances out.
+#: Corrects the angular rate of that sample: rate and variances out.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 
-#: An Imu with the longest name of a frame is shorter; what is longer is not even read.
+#: Longest message read [bytes]; an Imu with the longest frame name is shorter.
 _LONGEST_MESSAGE = 1024
 
 _ENCAPSULATION = b'\0\1\0\0'
 _HEADER = struct.Struct('<4siI4x')
-# An Imu is orientation 4 + 9, angular velocity 3 + 9, linear acceleration 3 + 9 float64 values;
-# all but the last twelve are passed on.
+# Bytes of an Imu that are passed on: orientation 4 + 9 and angular velocity 3 + 9 float64 values;
+# linear acceleration 3 + 9 follow.
 _PASSED = 8 * 25
 _NO_GYRO = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
-#: Where the rate stands in what is passed on, and its form with the first of its covariance.
+#: Offset of the angular rate in these bytes; its format with the first covariance element.
 _RATE_AT = 8 * 13
 _RATE_IN, _RATE_OUT = struct.Struct('<4d'), struct.Struct('<12d')
 _CELSIUS = struct.Struct('<d')
 
-# A temperature that has arrived: received [ns]; of which thermometer, stamp [ns], degC.
+# A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
 _Reading = tuple[int, tuple[str, int, float]]
 
 
 @dataclass(slots=True)
 class Traffic:
-    """What the node itself counts, beside the compensator's counters."""
+    """The node's counters, in addition to the compensator's."""
 
-    n_lost: int = 0  # samples that the driver sent and the node did not get
+    n_lost: int = 0  # samples that the driver sent and the node did not receive
     n_unpublished: int = 0  # output messages that the middleware did not accept
     n_malformed: int = 0  # messages that could not be read
-    n_flags: int = 0  # regime flags published, one for each reading that decides
-    n_fallback: int = 0  # samples that rclpy had to bring into the plain form
-    n_contested: int = 0  # messages not used because more than one publisher may have sent them
+    n_flags: int = 0  # regime flags published, one for each deciding reading
+    n_fallback: int = 0  # samples that rclpy had to convert to the plain form
+    n_contested: int = 0  # messages dropped because more than one publisher may have sent them
 
 
 class SampleConverter:
@@ -84,18 +85,18 @@ class SampleConverter:
     def __init__(self, kind: Any, frame_id: str = '', traffic: Traffic | None = None) -> None:
         self._kind, self._frame_id = kind, frame_id
         self.traffic = traffic or Traffic()
-        # Of the last kind of message: its frame, what unpacks it, where what it passes on begins;
-        # of the Imu: its frame and what packs it.
+        # Last layout of input message: frame, struct to unpack it, offset of the bytes passed on.
+        # Imu: frame and struct to pack it.
         self._name, self._passed, self._frame = b'', 0, b''
         self._unpack: Callable[[bytes], tuple[Any, ...]] = struct.Struct('').unpack
         self._pack: Callable[..., bytes] = struct.Struct('').pack
-        #: What `process` last gave, for reports.
+        #: Last result of `process`, for reports.
         self.last_result: tuple[float, ...] | None = None
 
     def convert(
         self, data: bytes, process: Process, correct_rate: CorrectRate | None = None
     ) -> bytes | None:
-        """Compensate one sample; None if it is not readable or `process` dropped it."""
+        """Compensate a sample; None if it is unreadable or `process` dropped it."""
         try:
             encapsulation, sec, nanosec, name, x, y, z = self._unpack(data)
             is_known = name == self._name and encapsulation == _ENCAPSULATION
@@ -127,7 +128,7 @@ class SampleConverter:
         )  # fmt: skip
 
     def _learn(self, data: bytes) -> bytes:
-        """Note where a message of a new kind has its values; return its plain form, or nothing."""
+        """Note the offsets of a message of new layout; return its plain form, or empty bytes."""
         is_imu = self._kind is Imu
         skip, rest = (_PASSED, 72) if is_imu else (0, 0)
         size = skip + 24 + rest
@@ -137,7 +138,7 @@ class SampleConverter:
         self.traffic.n_fallback += data is not given
         self._passed = start if is_imu else 0
         end = 16 + int.from_bytes(data[12:16], 'little')
-        # Behind the name there is anything.
+        # The padding after the name may hold any bytes.
         self._name, gap = data[12:end], start - end + skip
         self._unpack = struct.Struct(f'<4siI{len(self._name)}s{gap}x3d{rest}x').unpack
         frame = self._frame_id.encode() + b'\0' if self._frame_id else self._name[4:]
@@ -148,7 +149,7 @@ class SampleConverter:
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """What the node runs with: one reference, exchanged as a whole between two samples."""
+    """Everything that a reload replaces: one reference, exchanged between two samples."""
 
     loaded: LoadedCalibration
     config: NodeConfig
@@ -158,7 +159,7 @@ class Running:
 
 
 class Relay:
-    """What stands between the inputs of a node and its outputs."""
+    """Connects the inputs of a node with its outputs."""
 
     def __init__(
         self,
@@ -172,7 +173,7 @@ class Relay:
         self.traffic = Traffic()
         samples = self._open_samples(config)
         self.running = Running(loaded, config, compensator, samples, self._converter(config))
-        #: By their names; and the fields of those that are no Temperature.
+        #: Subscriptions by thermometer; fields of thermometers with other types than Temperature.
         self.thermometers = {
             name: loop.subscribe(
                 Temperature, split_field(self._topic(name))[0], qos_of(BOARD), is_hot=False
@@ -192,12 +193,12 @@ class Relay:
         self._newest_reading_ns: int | None = None
 
     def _topic(self, name: str) -> str:
-        """Give the topic of a thermometer, with the field of its messages if one is named."""
+        """Return the topic of a thermometer, with the field of its messages if named."""
         usual = thermometer(name)
         return self._names.get(name, self._names.get(usual, usual))
 
     def _check_topics(self, output: str) -> None:
-        """Refuse one topic for two thermometers, and an output that is the input."""
+        """Refuse a topic shared by two thermometers, and an output equal to the input."""
         roles: dict[tuple[str, str], str] = {}
         for name, one in self.thermometers.items():
             topic = one.subscription.topic_name
@@ -209,7 +210,7 @@ class Relay:
             raise ThermoCompError(reason, key=output)
 
     def look(self) -> None:
-        """Subscribe anew to thermometers whose messages turn out to be of another type."""
+        """Subscribe again to thermometers whose messages have another type."""
         for name, one in list(self.thermometers.items()):
             if name in self._fields or one.count_publishers():
                 continue
@@ -223,7 +224,7 @@ class Relay:
             if field is not None:
                 self._fields[name], topic = field, one.subscription.topic_name
                 self._loop.unsubscribe(self.thermometers.pop(name))
-                # The middleware has one type a topic: when the loop has let go of the first.
+                # The middleware allows one type per topic: after the loop has released the first.
                 self._loop.call_soon(partial(self._hear, name, topic, field))
 
     def _hear(self, name: str, topic: str, field: LiveField) -> None:
@@ -254,7 +255,7 @@ class Relay:
         )
 
     def successor(self, loaded: LoadedCalibration, model: Model, config: NodeConfig) -> Running:
-        """Make what is to run next; what runs stays as it is."""
+        """Build the next `Running`; the present one does not change."""
         now, settings = self.running, config.compensator_config()
         compensator, converter, samples = now.compensator, now.converter, now.samples
         if model is not compensator.thermal.model or settings != compensator.config:
@@ -266,12 +267,12 @@ class Relay:
         return Running(loaded, config, compensator, samples, converter)
 
     def release(self, samples: RawSubscription) -> None:
-        """Destroy a subscription to samples that is not in use any more, or was never."""
+        """Destroy a subscription to samples that is not in use."""
         if samples is not self.samples:
             self._loop.unsubscribe(samples)
 
     def on_data(self) -> None:
-        """Work through everything that has arrived."""
+        """Process everything that has arrived."""
         messages, received_ns, n_others = self.samples.drain_of_one()
         for name, subscription in self.thermometers.items():
             readings, read_ns, n_more = subscription.drain_of_one()
@@ -286,19 +287,19 @@ class Relay:
         self._relay(messages)
 
     def advance_without_samples(self, silence_ns: int) -> None:
-        """Let readings take effect without samples, so that the flag stays alive."""
+        """Apply readings without samples, so that the regime flag is still published."""
         if self._newest_reading_ns is None:
             return
         horizon_ns = self._newest_reading_ns - IDLE_NS
         compensator = self.running.compensator
         last_ns = compensator.now_ns
         if last_ns is not None:
-            # None is newer than the last sample by much more, whatever its stamp says.
+            # No real stamp is later than the last sample by more than the silence.
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:
             if reading[1] == NO_STAMP_NS:
-                continue  # only a sample tells when it came
+                continue  # such a reading gets its time from a sample
             if reading[1] <= horizon_ns:
                 compensator.push(*reading)
             else:
@@ -318,7 +319,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay up to the last reading that came before the last sample; return the rest."""
+        """Relay up to the last reading received before the last sample; return the rest."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))
@@ -360,16 +361,16 @@ class Relay:
             self.traffic.n_flags += 1
 
     def _count_unpublished(self) -> None:
-        """Go on after a message that the middleware did not take, but not after the shutdown."""
+        """Count a message that the middleware refused; raise after the shutdown."""
         if not self._loop.node.context.ok():
             raise ExternalShutdownException
         self.traffic.n_unpublished += 1
 
 
 def read_temperature(data: bytes) -> tuple[int, float] | None:
-    """Read the stamp [ns] and the temperature of a serialized Temperature; None if it is none."""
-    # A node that sleeps between samples pays for each line of code it has not touched for long:
-    # rclpy's deserialization costs it as much as several samples.
+    """Read stamp [ns] and temperature of a serialized Temperature; None if it is malformed."""
+    # rclpy's deserialization would cost as much as several samples: its code is not in the cache
+    # of a node that sleeps between samples.
     data, start = _plain(data, 16, Temperature)
     if not start:
         return None
@@ -378,7 +379,7 @@ def read_temperature(data: bytes) -> tuple[int, float] | None:
 
 
 def _values_at(data: bytes, size: int) -> int:
-    """Find where the values of a stamped message begin, so many bytes; 0 in another form."""
+    """Return the offset of the `size` bytes of values of a message; 0 if not in plain form."""
     if not 16 < len(data) <= _LONGEST_MESSAGE or data[:4] != _ENCAPSULATION:
         return 0
     length = int.from_bytes(data[12:16], 'little')
@@ -393,10 +394,10 @@ def _values_at(data: bytes, size: int) -> int:
 
 
 def _plain(data: bytes, size: int, message_type: Any) -> tuple[bytes, int]:
-    """Give a message, in another form as rclpy writes it, and where its values begin or 0."""
+    """Return a message in plain form, by rclpy if needed, and the offset of its values or 0."""
     start = _values_at(data, size)
     if not start and len(data) <= _LONGEST_MESSAGE:
-        # RuntimeError is rclpy's own, ValueError that of a name that is not UTF-8.
+        # RuntimeError: rclpy cannot read it. ValueError: a name is not UTF-8.
         with suppress(RuntimeError, ValueError):
             data = serialize_message(deserialize_message(data, message_type))
             start = _values_at(data, size)

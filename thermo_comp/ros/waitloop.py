@@ -3,9 +3,9 @@
 """
 Owns the loop around a node's wait sets, and everything that leaves rclpy's documented API.
 
-rclpy's executor costs ten times the compensation itself. Here messages stay serialized, and while
-samples flow a wake-up waits for them alone and empties their queue; services and ordinary
-subscriptions are looked at now and then. Timers, clients and middleware events are nobody's.
+rclpy's executor costs ten times the compensation itself. Here messages stay serialized. While
+samples flow, a wake-up waits only for samples and empties their queue; services and ordinary
+subscriptions are polled. Timers, clients and middleware events are not served by this loop.
 
 Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
 `take_message`, `get_publisher_count`, `service_take_request` and `publish_raw` of handles, and the
@@ -35,56 +35,55 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from ..errors import ThermoCompError
 from ..text import one_line
 
-#: While samples flow, the rest of the node is looked after this often [ns].
+#: Polling period of services and other subscriptions while samples flow [ns].
 OTHERS_PERIOD_NS = 20_000_000
-#: The most messages taken in one go, so that a flood cannot keep the rest of the node waiting.
+#: Largest number of messages taken at a time, so that a flood does not block the rest of the node.
 DRAIN_LIMIT = 4096
 
-#: Longer than any machine runs, and what the middleware can still count [ns].
+#: A time that is never reached, and the longest wait of the middleware without overflow [ns].
 _NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
 
-#: A failure is logged with all its lines, but not more often than this [ns].
+#: Shortest time between two logged failures [ns].
 _LOG_PERIOD_NS = 10 * 10**9
 
-#: Messages that are numbered one after the other for so long, and so many of them, are of one
-#: publisher that sends alone [ns].
+#: Consecutive numbering over this time [ns] and number of messages proves a single publisher.
 ALONE_NS, ALONE_MESSAGES = 10**9, 5
 
 _KINDS = {Subscription: 'subscription', Service: 'service', GuardCondition: 'guard_condition'}
 
 RCLError = rclpy_implementation.RCLError
 
-#: Takes a request and what sends the answer, now or later, in the loop's thread.
+#: Takes a request and a function that sends the answer, now or later, in the loop's thread.
 Serve = Callable[[Any, Callable[[Any], None]], None]
 
 
 class Sources:
     """
-    Tells whether the messages of a topic are of one publisher, while more than one is known.
+    Decides whether the messages of a topic are from one publisher while several are known.
 
-    One that was killed stays known to the middleware for the time of its lease, 20 s. Messages do
-    not say whose they are, but each publisher numbers its own: what is numbered one after the
-    other, for long enough, is of one.
+    The middleware lists a killed publisher for the time of its lease, 20 s. Messages do not
+    identify their publisher, but each publisher numbers its messages: consecutive numbers over a
+    long enough time come from one publisher.
     """
 
     def __init__(self) -> None:
         self._n_known = 0
         self._number: int | None = None
         self._n_in_row, self._since_ns = 0, 0
-        #: Whether more than one sends, or it is not known yet that one alone does.
+        #: False only when a single publisher is proven.
         self.is_contested = False
 
     def of_one(
         self, n_known: int, numbers: Sequence[int | None], received_ns: Sequence[int]
     ) -> int:
-        """Say which of the messages on is the first that is surely of the only one that sends."""
+        """Return the index of the first message that is surely from the only active publisher."""
         was_contested, n_before, self._n_known = self.is_contested, self._n_known, n_known
         if n_known <= 1:
-            # The first ones after it may still be of the one that left.
+            # The first messages afterwards may still be from the publisher that left.
             self.is_contested, self._number = False, numbers[-1]
             return len(numbers) if was_contested else 0
         if n_known > n_before:
-            # Who is new is not known by its first message.
+            # The first message does not show which of the publishers is new.
             self._begin(None, 0)
         first = 0
         for place, (number, at_ns) in enumerate(zip(numbers, received_ns, strict=True)):
@@ -106,34 +105,34 @@ class Sources:
 
 
 class RawSubscription:
-    """A subscription of `WaitLoop.subscribe`, read by whoever runs the loop."""
+    """A subscription of `WaitLoop.subscribe`, to be read in the loop's thread."""
 
     def __init__(self, subscription: Subscription, is_hot: bool) -> None:
         self.subscription = subscription
         self.is_hot = is_hot
         self.sources = Sources()
         self._take = partial(subscription.handle.take_message, subscription.msg_type, True)
-        #: How many publishers the middleware has found; cheap, to be asked while the loop runs.
+        #: Number of publishers that the middleware has discovered; cheap enough for each wake-up.
         self.count_publishers: Callable[[], int] = subscription.handle.get_publisher_count
         self._sequence: int | None = None
         self._newest_ns = 0
-        #: Messages that were sent and did not get here, as far as one publisher numbers them.
+        #: Number of messages sent and not received, by the numbers of a single publisher.
         self.n_lost = 0
-        #: What lay between the last two messages, on average over one drain [ns].
+        #: Mean interval between the messages of the last drain [ns].
         self.interval_ns = 0
 
     @property
     def is_contested(self) -> bool:
-        """Whether more than one publisher sends, as far as is known."""
+        """Whether more than one publisher may be sending."""
         return self.sources.is_contested
 
     def drain(self) -> tuple[list[bytes], list[int]]:
-        """Take what waits, oldest first and `DRAIN_LIMIT` at most; each with its arrival [ns]."""
+        """Take up to `DRAIN_LIMIT` waiting messages, oldest first, with arrival times [ns]."""
         messages, received_ns, _ = self.drain_numbered()
         return messages, received_ns
 
     def drain_of_one(self) -> tuple[list[bytes], list[int], int]:
-        """Take what waits and is surely of one publisher, and tell how much else there was."""
+        """Take the waiting messages that are surely from one publisher, and count the others."""
         messages, received_ns, numbers = self.drain_numbered()
         if not messages:
             return messages, received_ns, 0
@@ -143,7 +142,7 @@ class RawSubscription:
         )
 
     def drain_numbered(self) -> tuple[list[bytes], list[int], list[int | None]]:
-        """Take what waits, with the numbers that publishers gave; None where they gave none."""
+        """Take the waiting messages with arrival times and the publishers' numbers (or None)."""
         messages: list[bytes] = []
         received_ns: list[int] = []
         numbers: list[int | None] = []
@@ -160,22 +159,22 @@ class RawSubscription:
         self.interval_ns = (self._newest_ns - before_ns) // len(messages)
         before, self._sequence = self._sequence, numbers[-1]
         if before is not None and self._sequence is not None:
-            # Another publisher's numbers can go back.
+            # max: the numbers of another publisher can be smaller.
             self.n_lost += max(0, self._sequence - before - len(messages))
         return messages, received_ns, numbers
 
 
 class WaitLoop:
-    """A loop over a node of no executor: raw subscriptions are for the caller, the rest served."""
+    """Runs a node without an executor; raw subscriptions are left to the caller."""
 
-    # Messages of a best-effort subscription gather until `rest_s` after each wake-up [s], where
-    # they come often enough for it: four within three such times, so that none rests alone.
+    # Messages of a best-effort subscription gather for `rest_s` [s] after each wake-up if they are
+    # frequent enough: four within three such pauses, so that no message waits alone.
     def __init__(self, node: Node, rest_s: float = 0.0) -> None:
         self.node = node
         self._rest_ns = int(rest_s * 1e9)
         self._guard = node.create_guard_condition(lambda: None)
         self._raw: list[RawSubscription] = []
-        #: What takes the requests of services in place of callbacks that have to answer at once.
+        #: Handlers of services that may answer later than their callback returns.
         self.handlers: dict[Service, Serve] = {}
         self._soon: deque[Callable[[], None]] = deque()
         self.n_failures = 0  # callbacks that ended in an exception
@@ -188,8 +187,8 @@ class WaitLoop:
     def subscribe(
         self, message_type: Any, topic: str, qos: QoSProfile, *, is_hot: bool = True
     ) -> RawSubscription:
-        """Subscribe in serialized form; the first hot one wakes the loop, others wait a little."""
-        # Its callback is never called: that is for an executor to do.
+        """Subscribe in serialized form; the first hot subscription wakes the loop at once."""
+        # The callback is never called: only an executor would call it.
         create = partial(self.node.create_subscription, callback=lambda _: None, raw=True)
         subscription = _opened(create, message_type, topic, qos)
         self._raw.append(RawSubscription(subscription, is_hot))
@@ -207,13 +206,13 @@ class WaitLoop:
         self.node.destroy_subscription(raw.subscription)
 
     def call_soon(self, callback: Callable[[], None]) -> None:
-        """Call back in the loop's thread, one callback a wake-up; callable from any thread."""
+        """Call back in the loop's thread, one callback per wake-up; callable from any thread."""
         self._soon.append(callback)
         with suppress(InvalidHandle):
             self._guard.trigger()
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call back every so often [s], in place of the last one; a timer costs ten times it."""
+        """Call back with a period [s], replacing the last such call; cheaper than a timer."""
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
         self._callback = callback
@@ -225,7 +224,7 @@ class WaitLoop:
             self._guard.trigger()
 
     def run(self, on_data: Callable[[], None]) -> None:
-        """Serve until the end; `on_data` is called when woken and drains all subscriptions."""
+        """Serve until `stop`; `on_data` is called at wake-ups and drains all subscriptions."""
         try:
             while not self._is_stopping:
                 self._guarded(partial(self._serve, on_data), (RCLError, ExternalShutdownException))
@@ -234,14 +233,14 @@ class WaitLoop:
                 raise
 
     def _serve(self, on_data: Callable[[], None]) -> None:
-        """Wait and serve until the entities change or the loop is to stop."""
+        """Wait and serve until the entities change or the loop stops."""
         node, self._is_stale = self.node, False
         raw = [one.subscription for one in self._raw]
         others = {one: partial(_take_message, one) for one in node.subscriptions if one not in raw}
         others |= {one: partial(self._take_request, one) for one in node.services}
         hot = next((one for one in self._raw if one.is_hot), None)
         rest_ns = 0
-        # Only there a wake-up costs more than to sleep a little.
+        # Only with best effort is a wake-up more expensive than a short sleep.
         if hot and hot.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             rest_ns = self._rest_ns
         crowd_ns = rest_ns * 3 // 4
@@ -257,12 +256,12 @@ class WaitLoop:
                 if self._soon:
                     self._guarded(self._soon.popleft())
                     on_data()
-                    # It may have made or destroyed anything.
+                    # The callback may have created or destroyed entities.
                     self._is_stale = True
                     continue
                 now = now_ns()
                 if now >= self._call_ns:
-                    # One that was missed is not made up for.
+                    # Missed calls are not repeated.
                     late_ns = (now - self._call_ns) % self._period_ns
                     self._call_ns = now - late_ns + self._period_ns
                     self._guarded(self._callback)
@@ -277,9 +276,9 @@ class WaitLoop:
                 if woken_ns >= look_ns:
                     ready = [others[one] for one in everything.wait(0) if one in others]
                     served = [self._guarded(serve) for serve in ready]
-                    # After a request the next one may wait already.
+                    # After a request the next request may wait already.
                     look_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
-                # No interval at all: the middleware does not tell the time.
+                # An interval of 0 means that the middleware gives no arrival times.
                 if hot and 0 < hot.interval_ns < crowd_ns:
                     left_ns = woken_ns + rest_ns - now_ns()
                     if left_ns > 0:
@@ -302,7 +301,7 @@ class WaitLoop:
         callback: Callable[[], bool | None],
         fatal: tuple[type[Exception], ...] = (ExternalShutdownException,),
     ) -> bool | None:
-        """Call back; samples go on where that fails, which is logged now and then."""
+        """Call back; log a failure (at most every `_LOG_PERIOD_NS`) and go on with the samples."""
         try:
             return callback()
         except fatal:
@@ -321,7 +320,7 @@ class WaitLoop:
 
 
 class _WaitSet:
-    """A wait set, filled anew for each wait."""
+    """A wait set, filled again for each wait."""
 
     def __init__(self, context: rclpy.context.Context, entities: Sequence[Any]) -> None:
         types = [type(one) for one in entities]
@@ -333,7 +332,7 @@ class _WaitSet:
         ]
 
     def wait(self, timeout_ns: int) -> list[Any]:
-        """Wait at most so long [ns]; return the entities at which something waits."""
+        """Wait at most `timeout_ns`; return the entities that are ready."""
         self._set.clear_entities()
         places = [(one, kind, add(handle)) for one, kind, add, handle in self._content]
         self._set.wait(timeout_ns)
@@ -341,7 +340,7 @@ class _WaitSet:
 
 
 def _opened(create: Callable[..., Any], message_type: Any, topic: str, qos: QoSProfile) -> Any:
-    """Open a topic with the overrides of its QoS; ThermoCompError where name or QoS are wrong."""
+    """Open a topic with its QoS overrides; ThermoCompError if name or QoS is invalid."""
     policies = QoSOverridingOptions.with_default_policies()
     try:
         # rclpy writes the overrides into the profile.
@@ -358,7 +357,7 @@ def _take_message(subscription: Subscription) -> bool:
 
 @contextmanager
 def own_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
-    """Open a node in a context of its own."""
+    """Open a node in a separate context."""
     context = rclpy.context.Context()
     rclpy.init(args=['--ros-args', *ros_args], context=context)
     try:
@@ -366,14 +365,14 @@ def own_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
         try:
             yield node
         finally:
-            # Else its publishers stay until the garbage collector comes by.
+            # Otherwise its publishers live until the next garbage collection.
             node.destroy_node()
     finally:
         context.try_shutdown()
 
 
 def wait_until(is_done: Callable[[], object], timeout_s: float, nap_s: float = 0.02) -> bool:
-    """Look now and then whether it is as wanted; False after the time-out [s]."""
+    """Poll `is_done` until it is true; False after the time-out [s]."""
     deadline = time.monotonic() + timeout_s
     while not is_done():
         if time.monotonic() > deadline:
@@ -383,5 +382,5 @@ def wait_until(is_done: Callable[[], object], timeout_s: float, nap_s: float = 0
 
 
 def overrides(node: Node) -> dict[str, Any]:
-    """Give the parameters that the user set at the start, known to the node or not, by name."""
+    """Return the parameters that the user set at the start, known or not, by name."""
     return {name: one.value for name, one in node._parameter_overrides.items()}  # noqa: SLF001

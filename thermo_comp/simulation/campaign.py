@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what a test is: the chamber's program, ready-made or typed in, and the attitudes."""
+"""Owns the plan of a test: the chamber's program, ready-made or typed in, and the attitudes."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ _PROGRAMS = {
     'paper': '20 60min, 35@0.5 90min, 20 60min, 5 90min, 20 60min, 35 60min',
     # Four hours, one bag of a calibration: the whole range, both directions, two ramp rates.
     'chamber': '20 20min, 35@0.75 35min, 5@0.6 45min, 20@0.75 35min, 8@1 23min',
-    # The shortest that shows the whole range, both directions and some rest.
+    # The shortest program with the whole range, both directions and some rest.
     'three-hours': '20 10min, 35@0.8 30min, 5@1.2 40min, 22@0.5 22.25min',
-    # Nine hours and a half: slow and quick ramps both ways, so that no other is beyond them.
+    # Nine and a half hours: slow and fast ramps in both directions, which bound all others.
     'long': '20 30min, 35@0.5 60min, 5@1 60min, 25@0.3 40min, 10@0.7 45min, 33@0.9 40min, '
     '15@0.35 40min, 20@0.5 19.92063492063492min',
-    # Other rates, other soak temperatures and another order: what a fit never saw.
+    # Rates, soak temperatures and an order that no fit has used.
     'held-out': '12 40min, 31@0.35 45min, 17@0.9 30min, 26@0.6 50min, 7@0.7 60min, 22@0.25 40min',
     'slow': '20 60min, 35@0.1 60min, 5@0.2 60min, 20@0.15 60min',
     'fast': '20 45min, 35@3 75min, 5@2 90min, 25@1.5 75min, 10@3 60min',
-    # Ninety minutes: short enough for a bag that ships, with both regimes and both directions.
+    # Ninety minutes, for the sample bags: both regimes and both directions.
     'demo': '15 12min, 30@1 22min, 8@1.1 21min',
     'soak': '20 4h',
 }
 CYCLOGRAM_NAMES = tuple(_PROGRAMS)
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-# Edges of the cube: one per pair of axes and adding up to nothing, their opposites, the rest.
+# Edges of the cube: one per pair of axes with sum 0, their opposites, the rest.
 _EDGES = [
     *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
     *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
@@ -49,16 +49,16 @@ _CORNERS = [
     *[(1, 1, 1), (-1, -1, -1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1), (1, -1, 1)],
     *[(-1, -1, 1), (1, 1, -1)],
 ]
-# Of the small turn about each transverse direction, since nobody levels the block.
+# Sd of the tilt about each transverse direction, as the block is not levelled [deg].
 _SPREAD_DEG = 3.0
-# Each axis has both signs, and none sees the same gravity throughout.
+# Attitudes of three positions: each axis has both signs of gravity.
 _THREE = np.array([(1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
 PLAN_NAMES = ('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out')
 
 
 @dataclass(frozen=True)
 class Cyclogram:
-    """Air temperature [degC] over time [s]: straight lines between points, at rest outside."""
+    """Air temperature [degC] over time [s]: linear between points, constant outside."""
 
     time_s: tuple[float, ...]
     temperature_c: tuple[float, ...]
@@ -71,7 +71,7 @@ class Cyclogram:
 
 def parse_cyclogram(text: str) -> Cyclogram:
     """
-    Read a program as a user types it, or the name of a ready-made one, `CYCLOGRAM_NAMES`.
+    Read a program as a user types it, or the name of a ready-made program, `CYCLOGRAM_NAMES`.
 
     Steps are separated by commas, semicolons or lines: ``TARGET[@RATE] [SOAK]`` with the target in
     degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is the
@@ -110,12 +110,12 @@ def positions(n: int, seed: int = 0) -> Floats:
     Return attitudes of a calibration test as unit vectors of the specific force, shape (n, 3).
 
     Six are the faces of a cube, nine the corners of a three-capped prism, twelve those of an
-    icosahedron: the sets that tell bias, scale and misalignment apart best for their number. Other
-    sets take the faces of a cube, then its edges, then its corners; beyond 26, an even spiral over
-    the sphere. 6, 9, 12, 18, 24 and 26 are balanced. `seed` turns each by a small random angle.
+    icosahedron: for their number the best sets to determine bias, scale and misalignment. Other
+    sets take the faces of a cube, then its edges, then its corners; beyond 26 a uniform spiral on
+    the sphere. 6, 9, 12, 18, 24 and 26 are balanced. `seed` tilts each by a small random angle.
     """
     if n == 9:
-        # Three on the equator, six 44 degrees above and below between them.
+        # Three on the equator, six between them at elevations of +-44 degrees.
         third = np.arange(3) * 2.0 * math.pi / 3.0
         ring = np.stack([np.cos(third), np.sin(third)], axis=1)
         height, radius = 0.7, math.sqrt(1.0 - 0.7**2)
@@ -142,7 +142,7 @@ def positions(n: int, seed: int = 0) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """One position of a test: the chamber's program, and the direction of the specific force."""
+    """A position of a test: the chamber's program, and the direction of the specific force."""
 
     program: Cyclogram
     up: Floats
@@ -153,13 +153,13 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     Return the positions of a test in the order of their recording: 'chamber-18' (of 9.5 h each),
     'chamber-9' (3 h), 'tumble' (18 of 20 min at room temperature), 'tumble-3', 'tumble-1' (the
     same and 3 or 1 of 3 h in the chamber) or 'held-out' (3 with other ramps and attitudes).
-    `seed` is that of the attitudes and of the room's temperature.
+    `seed` determines the attitudes and the room temperature.
     """
     if name not in PLAN_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')
     rng = generator(seed, Stream.CYCLOGRAM, PLAN_NAMES.index(name))
     if name == 'held-out':
-        # Attitudes that no plan has: any direction, but no axis upright.
+        # Attitudes that no plan has: random directions without a vertical axis.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(parse_cyclogram('held-out'), ups)
     if name.startswith('chamber'):

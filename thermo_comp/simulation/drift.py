@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the physics of the errors: each effect sits in the part where it arises, and counts from the
-still state in which the board's thermometer shows the reference temperature.
+Owns the physics of the errors: each effect belongs to a part, and is zero in the steady state in
+which the board's thermometer shows the reference temperature.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ZERO: Triple = (0.0, 0.0, 0.0)
 
 
 def triple(values: Floats) -> Triple:
-    """Give the values of three axes as plain numbers."""
+    """Return the values of three axes as plain numbers."""
     x, y, z = values.tolist()
     return x, y, z
 
@@ -29,8 +29,8 @@ def triple(values: Floats) -> Triple:
 @dataclass(frozen=True, eq=False)
 class PartHistory:
     """
-    What the parts went through, on an even grid of `step` seconds: deviations from the reference's
-    still state [K], shape (m, n_parts), and the temperatures in that state [degC].
+    Temperatures of the parts on a uniform grid of `step` seconds: deviations from the reference's
+    steady state [K], shape (m, n_parts), and the temperatures in that state [degC].
     """
 
     nodes: tuple[str, ...]
@@ -46,7 +46,7 @@ class PartHistory:
 @dataclass(frozen=True, kw_only=True)
 class Effect(ABC):
     """
-    One cause of errors; per axis ``bias * first + bias_curvature * second``, the scale likewise.
+    A cause of errors; per axis ``bias * first + bias_curvature * second``, the scale likewise.
 
     Bias changes in ug and scale changes in ppm per unit of the first and the second signal.
     """
@@ -70,8 +70,8 @@ class Effect(ABC):
 @dataclass(frozen=True)
 class PartEffect(Effect):
     """
-    Tempco of a part, or a stress or thermo-EMF between two: the deviation of `part` less that of
-    `cold` [K] and, where coefficients change with temperature, of the squares.
+    Tempco of a part, or stress or thermo-EMF between two parts: the deviation of `part` less that
+    of `cold` [K] and, for coefficients that change with temperature, the same of the squares.
     """
 
     part: str
@@ -88,11 +88,11 @@ class PartEffect(Effect):
 @dataclass(frozen=True)
 class FlowEffect(Effect):
     """
-    What a heat flow does whichever way it goes, less what it does at rest.
+    Effect of a heat flow in either direction, less its effect at rest.
 
-    With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent``: a gas that rises in
-    a gap (1.25), the load of a heat pump (1), its losses (2); times the deviation of `cold` to the
-    `power`. Where the pump's supply limits it, it levels off at 1, ``x^e / (1 + x^e)``. The second
+    With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent``: convection in a gap
+    (1.25), the load of a heat pump (1), its losses (2); times the deviation of `cold` to the
+    `power`. If the pump's supply is limited, it saturates at 1, ``x^e / (1 + x^e)``. The second
     signal is the first times the deviation of `cold`.
     """
 
@@ -127,14 +127,14 @@ class LeakageEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """Slow relaxation in a part: follows a quick change of temperature [K], then dies away."""
+    """Slow relaxation in a part: follows a fast change of temperature [K], then decays."""
 
     part: str
     time_constant: float
 
     def _signals(self, history: PartHistory) -> tuple[Floats, float]:
         d = history.of(self.part)
-        # The first-order lag of what is straight on the grid, settled at its start.
+        # First-order lag of an input that is linear between grid points, settled at the start.
         kept = np.exp(-history.step / self.time_constant)
         new = 1.0 - self.time_constant / history.step * (1.0 - kept)
         lagged = lfilter([new, 1.0 - kept - new], [1.0, -kept], d - d[0]) + d[0]
@@ -144,9 +144,9 @@ class CreepEffect(Effect):
 @dataclass(frozen=True)
 class SlipEffect(Effect):
     """
-    A joint that is strained with a part's temperature and slips: stress [K of free strain], by the
-    way, not the time. It gives way at once at `width` (Jenkins) or bit by bit towards it (Dahl,
-    Bouc-Wen); it starts relaxed.
+    A joint that is strained by a part's temperature and slips; its stress [K of free strain]
+    depends on the path, not the time. It slips abruptly at `width` (Jenkins) or gradually towards
+    it (Dahl, Bouc-Wen); it starts relaxed.
     """
 
     part: str

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the heat paths: lumped parts joined by conductances, self-heating, the thermostat; solved.
+Owns the thermal network and its solution: lumped parts, conductances, self-heating, thermostat.
 
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
-parts, then the thermostat's integral; `u` is the air temperature; `p` holds what is constant.
-Between knots of the air the solution is a straight line plus decaying modes. What convection
-carries beyond the line through its flow at 1 K is held from second to second.
+parts, then the thermostat's integral; `u` is the air temperature; `p` is constant. Between knots
+of the air the solution is linear plus decaying modes. The nonlinear part of convection, beyond its
+conductance at 1 K, is held constant for a second.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from scipy.optimize import root
 from ..typing import Floats
 
 AIR = 'air'
-_STEP_S = 1.0  # of convection
+_STEP_S = 1.0  # step of convection
 
 
 @dataclass(frozen=True)
 class Link:
     """
-    Heat path between two parts, or a part and the chamber's air, `AIR`: W/K (at 1 K, with
-    convection). Heat flows as the power `exponent` of the difference, 1.25 by free convection.
+    Heat path between two parts, or a part and the chamber's air, `AIR`: W/K (at 1 K). The flow is
+    proportional to the difference to the power `exponent`, 1.25 for free convection.
     """
 
     a: str
@@ -38,7 +38,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Thermostat:
-    """Heater of one part, 0 to `max_power` W, that holds `set_point` [degC]; W/K and W/(K s)."""
+    """Heater of a part, 0 to `max_power` W, controlled to `set_point` [degC]; W/K and W/(K s)."""
 
     node: str
     set_point: float
@@ -49,7 +49,7 @@ class Thermostat:
 
 @dataclass(frozen=True)
 class ThermalNetwork:
-    """Parts with heat capacities [J/K], the paths between them, and the power [W] they spend."""
+    """Parts with heat capacities [J/K], the paths between them, and their dissipation [W]."""
 
     capacity: Mapping[str, float] = field(hash=False)
     links: tuple[Link, ...]
@@ -63,7 +63,7 @@ class ThermalNetwork:
 
     @property
     def is_convective(self) -> bool:
-        """Whether a path's flow is no multiple of the difference."""
+        """Whether the flow of any path is nonlinear."""
         return any(link.exponent != 1.0 for link in self.links)
 
     @property
@@ -97,7 +97,7 @@ class ThermalNetwork:
         return A, b, p
 
     def convection(self, state: Floats, air: float) -> Floats:
-        """Return what exponents other than 1 add to ``dx/dt`` of one state, shape (k,)."""
+        """Return the part of ``dx/dt`` due to exponents other than 1, for a state, shape (k,)."""
         index, at = self._places, np.append(state, air)
         flow = np.zeros(len(at))
         for link in self.links:
@@ -126,7 +126,7 @@ class ThermalNetwork:
         return self.settled(air)[: len(self.nodes)]
 
     def air_for(self, node: str, temperature: float) -> float:
-        """Return the air temperature whose endless soak brings a part to a temperature."""
+        """Return the air temperature that brings a part to a temperature in an endless soak."""
         i = self.nodes.index(node)
 
         def miss(air: Floats) -> float:
@@ -137,11 +137,11 @@ class ThermalNetwork:
 
 class ThermalResponse:
     """
-    Temperatures of a network over a program, at any instant.
+    Temperatures of a network over a program, at any time.
 
-    `air` are the chamber's at the knots `time` [s], shape (m,); `power` is what the parts
-    dissipate between the knots beside the constant powers, W, shape (m - 1, n_parts). At the start
-    all is on and in equilibrium.
+    `air` are the chamber's temperatures at the knots `time` [s], shape (m,); `power` is the
+    dissipation between the knots in addition to the constant powers [W], shape (m - 1, n_parts).
+    At the start everything is on and in equilibrium.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class ThermalResponse:
         self.network, self._time = network, time
         heat = network.thermostat
         if heat is not None:
-            # The state behind the parts' temperatures.
+            # Index of the thermostat's integral.
             n = len(network.nodes)
             watts = [network.settled(float(a))[n] for a in (air.max(), air.min())]
             if watts[0] < 0.0 or watts[1] > heat.max_power:
@@ -173,14 +173,14 @@ class ThermalResponse:
         self._rate, self._modes = rate, modes
 
         length = np.diff(self._time)
-        # Straight part of each interval, alpha + beta (t - t_knot), and each mode at its start.
+        # Linear part of each interval, alpha + beta (t - t_knot), and each mode at its start.
         self._beta = -(np.diff(air) / length)[:, None] * (inverse @ b)
         self._alpha = (self._beta - np.outer(air[:-1], b) - drive) @ inverse.T
         self._amplitude = np.empty((len(length), len(rate)), dtype=complex)
         state = network.settled(air[0], drive[0])
         before = network.convection(state, air[0])
         for k, lasts in enumerate(length):
-            # The mean over the interval, foreseen from the last two (Adams and Bashforth).
+            # Mean over the interval, extrapolated from the last two values (Adams-Bashforth).
             now = network.convection(state, air[k])
             self._alpha[k] -= inverse @ (1.5 * now - 0.5 * before)
             self._amplitude[k] = unmix @ (state - self._alpha[k])

@@ -42,11 +42,11 @@ class _Specimen:
         return float(self._rng.uniform(low, high))
 
     def axes(self, value: float, spread: float) -> Triple:
-        # Around one value, the sign kept.
+        # Spread around a value, with the same sign.
         return triple(value * (1.0 + spread * self._rng.uniform(-1.0, 1.0, 3)))
 
     def signed(self, low: float, high: float) -> Triple:
-        # Magnitudes even in the logarithm, random signs.
+        # Log-uniform magnitudes, random signs.
         size = np.exp(self._rng.uniform(math.log(low), math.log(high), 3))
         return triple(size * self._rng.choice((-1.0, 1.0), 3))
 
@@ -70,7 +70,7 @@ class _Specimen:
         misalignment_sd: float = 1e-3,
         **others: Any,
     ) -> UnitModel:
-        """Return the unit, its constants drawn."""
+        """Return the unit with random constants."""
         K = self.axes(32768.0 / (full_scale_g * STANDARD_GRAVITY), spread)
         bx, by, bz = self.normal(bias_ug)
         yx, zx, zy = self.normal(misalignment_sd)
@@ -107,8 +107,8 @@ def _thermostatted(draw: _Specimen) -> UnitModel:
     drift = (
         # The reference current sets the scale of all axes; its curvature is a bandgap's.
         PartEffect('reference', scale=draw.axes(40.0, 0.15), scale_curvature=draw.axes(0.02, 0.5)),
-        # Dielectric absorption and charge injection of each axis' own, potted integrator;
-        # the leakage of its switches, which bends upwards, sits on the board itself.
+        # Dielectric absorption and charge injection of each axis' potted integrator; the leakage
+        # of its switches, with positive curvature, is on the board.
         PartEffect('integrator', scale=draw.normal(3.0), bias=draw.signed(6.0, 14.0)),
         PartEffect('board', bias=draw.normal(1.0), bias_curvature=draw.normal(0.03)),
         PartEffect('head', scale=draw.axes(80.0, 0.1), bias=draw.signed(0.3, 5.0)),
@@ -136,8 +136,8 @@ def _bare_quartz(draw: _Specimen) -> UnitModel:
         PartEffect('magnet', scale=draw.axes(48.0, 0.01), scale_curvature=draw.axes(0.31, 0.02)),
         PartEffect('reference', scale=draw.axes(29.5, 0.01)),
         PartEffect('pendulum', bias=draw.signed(0.3, 5.0), bias_curvature=draw.normal(0.005)),
-        # The shunt that offsets the magnet's own tempco, and the coil on the pendulum, are
-        # not at one temperature in a ramp: parts that balance in still air do not then.
+        # The shunt that compensates the magnet's tempco and the coil on the pendulum have
+        # different temperatures in a ramp: effects that cancel in a soak do not cancel then.
         PartEffect('head', 'pendulum', scale=draw.axes(-115.0, 0.2), bias=draw.normal(15.0)),
         # Stress through the joint to the mounting ring, heavy and slow, bolted to the case.
         PartEffect('mount', 'head', scale=draw.axes(15.0, 0.3), bias=draw.normal(4.0)),
@@ -185,24 +185,24 @@ def _mems(draw: _Specimen) -> UnitModel:
 
 
 def _triad(draw: _Specimen) -> UnitModel:
-    """Draw a triad of bare heads on a board: tempcos that lag with them, its kind's physics."""
+    """Draw a triad of bare heads on a board: tempcos that lag, and the physics of its kind."""
     kind = draw.name
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
     board_tau, taus = draw.between(400.0, 900.0), [draw.between(500.0, 1500.0) for _ in heads]
     if kind == 'demo':
-        # Sample bags are short: their soaks must come to rest.
+        # Sample bags are short: the unit must settle in their soaks.
         board_tau *= 0.25
     capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau}
     links = [*draw.links((AIR, 'case', 4.0)), Link('case', 'board', 0.4)]
     for head, tau in zip(heads, taus, strict=True):
-        # A head takes little heat, so that the board hardly feels it.
+        # A head has a small heat capacity, so that it hardly affects the board.
         to_case = draw.between(0.2, 0.8) if kind in _BETWEEN else 0.0
         capacity[head] = 0.02 * tau
         links.append(Link('board', head, 0.02 * (1.0 - to_case)))
         if to_case:
             links.append(Link('case', head, 0.02 * to_case))
     if kind == 'convection':
-        # A gas in the gap carries what the stand-offs don't.
+        # Convection in the gap carries part of the heat.
         links[1] = Link('case', 'board', 0.15)
         links.append(Link('case', 'board', draw.between(0.15, 0.35), exponent=1.25))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
@@ -215,7 +215,7 @@ def _triad(draw: _Specimen) -> UnitModel:
         tuple(drift) if kind != 'plain' else (),
         full_scale_g=9.975,
         bias_ug=1500.0,
-        # With the converter's rounding at 4 Hz the means over 60 s have 0.65 ug per axis.
+        # With the converter's rounding at 4 Hz, 60 s means have a noise of 0.65 ug per axis.
         noise_density=(3.0, 3.0, 3.0),
         bias_walk=(3.0, 3.0, 3.0) if kind == 'slow-noise' else ZERO,
         load=load,
@@ -238,7 +238,7 @@ def _tempcos(draw: _Specimen, parts: list[str]) -> list[Effect]:
 
 
 def _slips(draw: _Specimen) -> list[Effect]:
-    # Per axis a joint that gives way at once and one that does so bit by bit.
+    # Per axis a joint that slips abruptly and a joint that slips gradually.
     effects: list[Effect] = []
     for i in range(3):
         for is_gradual in (False, True):
@@ -249,8 +249,8 @@ def _slips(draw: _Specimen) -> list[Effect]:
 
 
 def _loads(draw: _Specimen) -> list[Effect]:
-    # The paper: while the ambient changes, other offsets and slopes, and a bend. A heat pump at
-    # the limit of its supply does that.
+    # The paper: other offsets, slopes and curvatures while the ambient changes, as with a heat
+    # pump at the limit of its supply.
     knee, exponent = draw.between(0.4, 0.9), draw.between(1.5, 2.5)
     sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 5.0), (0.03, 0.1, 0.1))
     return [
@@ -263,19 +263,19 @@ def _loads(draw: _Specimen) -> list[Effect]:
 
 
 def _sample(draw: _Specimen) -> list[Effect]:
-    # Loads of the paper, large ones, and a stress that dies away with the lag of the heads.
+    # Large loads of the paper's kind, and a stress that decays with the lag of the heads.
     stress = PartEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
     load = FlowEffect('case', 'board', 2.0, 0.5, True, bias=draw.signed(60.0, 120.0))
     return [*_loads(draw), load, stress]
 
 
-# Three heads with a thermal node each, and heads that hang on the case as well.
+# Kinds with a thermal node for each head, and kinds whose heads are also linked to the case.
 _OWN_HEADS = ('own-lags', 'between', 'switched-load')
 _BETWEEN = ('between', 'switched-load')
-# Without lags but for what a difference of temperatures makes.
+# Kinds whose heads have no lag behind the board.
 _ON_BOARD = ('paper', 'demo')
 _EXTRA: dict[str, Callable[[_Specimen], list[Effect]]] = {
-    # Quartz against metal: the expansion coefficients differ, and the more the warmer it is.
+    # Quartz against metal: the difference of the expansion coefficients grows with temperature.
     'products': lambda draw: [
         PartEffect(
             'board', 'head', bias=draw.signed(3.0, 12.0), bias_curvature=draw.signed(0.1, 0.5),
@@ -306,12 +306,12 @@ UNIT_NAMES = (*_INSTRUMENTS, *TRIAD_NAMES)
 
 def unit_preset(name: str, seed: int = 0) -> UnitModel:
     """
-    Return one specimen of a kind of unit; another one for every seed, which is not negative.
+    Return a specimen of a kind of unit, different for every seed (>= 0).
 
     'thermostatted' (quartz triad in an oven, the converter's board outside: the board's drift
     dominates), 'bare-quartz' (no oven: the magnet's scale tempco dominates), 'mems', 'demo' (the
-    sample unit: paper and lags), or a triad with one kind of physics beside tempcos that lag, as
-    the table in docs/accuracy.md tells them.
+    sample unit: paper and lags), or a triad with one kind of physics in addition to tempcos that
+    lag; see the table in docs/accuracy.md.
     """
     if name not in UNIT_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(UNIT_NAMES)}, got {name!r}')

@@ -24,16 +24,16 @@ from .unit import Stream, SwitchedLoad, UnitModel, first_charge, generator, whit
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 _NS = 1_000_000_000
-_GRID_S = 1.0  # step of the thermal grid; bias and scale are straight between its points
+_GRID_S = 1.0  # step of the thermal grid; bias and scale are linear between its points
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
     """
-    What really happened, on the thermal grid, m points, and at the accelerometer's n cycles.
+    The truth of a run on the thermal grid (m points) and at the accelerometer's n cycles.
 
-    Bias is in counts per cycle, scale is relative, that of a gyroscope in rad/s; `bias_grid` has
-    the walk, too, which no model can know. `cycle_s` are the middles of the cycles.
+    Bias is in counts per cycle (`rate_bias`: rad/s), scale is relative; `bias_grid` includes the
+    random walk, which no model predicts. `cycle_s` are the middles of the cycles.
     """
 
     unit: UnitModel
@@ -58,8 +58,8 @@ class Truth:
         return self.on_cycles(self.scale_grid)
 
     def on_cycles(self, grid: Floats) -> Floats:
-        """Give what is straight between the points of the grid, at each cycle."""
-        # One arithmetic per cycle, whatever the block: np.interp prepares slopes or not.
+        """Interpolate linearly from the grid to each cycle."""
+        # Written out: the rounding of np.interp depends on the number of points.
         place = self.cycle_s / self.grid_s[1]
         left = np.minimum(place.astype(np.int64), len(self.grid_s) - 2)
         share = (place - left)[:, None]
@@ -70,8 +70,8 @@ class Truth:
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
     """
-    What a recorder would have stored, and the truth: ends and counts of the conversion cycles,
-    readings [degC], and of a unit with a gyroscope the mean angular rate of each cycle [rad/s].
+    The data that a recorder would store, and the truth: ends and counts of the conversion cycles,
+    readings [degC], and for a unit with a gyroscope the mean angular rate per cycle [rad/s].
     """
 
     accel_stamp_ns: Ints
@@ -85,14 +85,14 @@ class SimulatedRun:
 
 
 def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: Any) -> SimulatedRun:
-    """Run a unit through a program as one block, as `simulate_blocks` does."""
+    """Run a unit through a program as one block; see `simulate_blocks`."""
     return next(simulate_blocks(unit, cyclogram, up, block_size=sys.maxsize, **options))
 
 
 def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
-    """Run a unit through a test in memory; each position has a seed of its own, stamps from 0."""
+    """Run a unit through a test in memory; each position has another seed, stamps from 0."""
     return [
         simulate(unit, one.program, one.up, rate_hz=rate_hz, seed=1000 * seed + k, start_ns=0)
         for k, one in enumerate(stations)
@@ -112,11 +112,11 @@ def simulate_blocks(
     gravity: float = STANDARD_GRAVITY,
 ) -> Iterator[SimulatedRun]:
     """
-    Run a unit through a program in bounded memory; blocks of any size have the same bits.
+    Run a unit through a program in bounded memory; the result does not depend on the block size.
 
-    A reading is in the block among whose cycles it falls, or in the last. `up` is the direction of
-    the specific force; K in counts per cycle does not depend on `rate_hz`. `seed` is of all that
-    is random in this run.
+    A reading is in the block with the cycles around it, or in the last. `up` is the direction of
+    the specific force; K in counts per cycle does not depend on `rate_hz`. `seed` determines all
+    random numbers of the run.
     """
     readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz
     positive = {'rate_hz': rate_hz, 'temperature_rate_hz': readings_hz, 'gravity': gravity}
@@ -128,7 +128,7 @@ def simulate_blocks(
     if n_cycles < 1:
         raise ValueError(f'the program of {duration} s is shorter than one cycle')
     direction = np.asarray(up, dtype=float)
-    # Only what switches a load is random in it.
+    # Only a switched load makes the heat flow random.
     truth = _heat_flow(unit, cyclogram, seed if unit.load else 0)
     truth = replace(
         truth,
@@ -147,7 +147,7 @@ def simulate_blocks(
         K = np.array(unit.scale_factor)
         to_axes = np.linalg.inv(unit.M)
         s = sum(truth.specific_force[j] * to_axes[:, j] for j in range(3))
-        # A mean over one cycle of white noise: density times the root of the cycle rate.
+        # Mean of white noise over a cycle: density times the root of the cycle rate.
         root = math.sqrt(rate_hz)
         noise_sd = np.array(unit.noise_density) * MICRO_G * K * root
         noise, rate_noise = white(seed, Stream.ACCEL_NOISE), white(seed, Stream.GYRO_NOISE)
@@ -182,7 +182,7 @@ def simulate_blocks(
 
 @lru_cache(maxsize=1)
 def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
-    """Solve what temperature does over a program, once for all attitudes."""
+    """Solve the temperatures and the thermal errors of a program, for all attitudes."""
     knots, air, power = np.array(cyclogram.time_s), np.array(cyclogram.temperature_c), None
     if unit.load is not None:
         knots, is_on = _switched(unit.load, knots, seed)
@@ -198,12 +198,12 @@ def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
     bias = np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g
     none = np.empty(0)
     rate = none if unit.gyro is None else unit.gyro.bias(history)
-    # What one run adds is still to come.
+    # The fields of a single run are filled in later.
     return Truth(unit, response, grid, temperatures, bias, 1.0 + scale, rate, none, none, none)
 
 
 def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Bools]:
-    """Return the knots with the switching of a load among them, and whether it is on between."""
+    """Return the knots including the switching times of a load, and its state between them."""
     n = 2 + int(knots[-1] // load.spell[0])
     flips = np.cumsum(generator(seed, Stream.LOAD).uniform(*load.spell, size=n))
     fine = np.unique(np.concatenate([knots, flips[flips <= knots[-1]]]))
@@ -211,7 +211,7 @@ def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Boo
 
 
 def _walk(unit: UnitModel, grid: Floats, seed: int) -> Floats:
-    """Return what the bias does of itself: a walk, counts/cycle."""
+    """Return the random walk of the bias [counts/cycle]."""
     steps = white(seed, Stream.BIAS_WALK)(len(grid) - 1)
     per_step = np.array(unit.bias_walk) * math.sqrt(grid[1] / 3600.0)
     walk = np.concatenate((np.zeros((1, 3)), per_step * np.cumsum(steps, axis=0)))

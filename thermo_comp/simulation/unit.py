@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the simulated instrument: converter, thermometers, gyroscope, and what is random in it."""
+"""Owns the simulated instrument: converter, thermometers, gyroscope, random streams."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from .drift import ZERO, Effect, PartHistory, Triple, drift_of, triple
 from .network import ThermalNetwork, ThermalResponse
 
 _NS = 1_000_000_000
-_REFERENCE_C = 20.0  # of the board in still air: there K and bias hold
+_REFERENCE_C = 20.0  # board temperature in a soak at which K and bias are stated
 _RANGE = -(1 << 15), (1 << 15) - 1  # of the output, counts
 _FRACTION_BITS = 40
 _ONE = 1 << _FRACTION_BITS
-_ROWS = 1 << 20  # rows summed at once: 2^20 fractions below 2^40 stay far below 2^63
+_ROWS = 1 << 20  # rows summed at a time: 2^20 fractions below 2^40 stay far below 2^63
 
 
 class Stream(IntEnum):
     """
-    What takes random numbers, each from a stream of its own: switching one on or off, or asking
-    for other block sizes, leaves the others as they were. The numbers are part of what a seed
-    means: never changed, nor used again.
+    Sources of random numbers, each with a separate stream: switching a source on or off, or
+    another block size, does not change the others. The values must never change or be reused, as
+    they are part of the meaning of a seed.
     """
 
     ACCEL_NOISE = 0
@@ -49,12 +49,12 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
-    """Return the generator of one source, for an axis or other number, at its stream's start."""
+    """Return the generator of a source, for an axis or other number, at its stream's start."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))
 
 
 def white(seed: int, stream: Stream) -> Callable[[int], Floats]:
-    """Return what gives the next n numbers of each axis, shape (n, 3)."""
+    """Return a function that gives the next n numbers of each axis, shape (n, 3)."""
     axes = [generator(seed, stream, axis) for axis in range(3)]
     return lambda n: np.stack([axis.standard_normal(n) for axis in axes], axis=1)
 
@@ -67,11 +67,11 @@ def first_charge(seed: int) -> Ints:
 
 def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
     """
-    Convert the real-valued counts of consecutive cycles, shape (n, 3), to whole ones of 16 bits.
+    Convert the real-valued counts of consecutive cycles, shape (n, 3), to 16-bit integers.
 
-    What a cycle leaves over, `remainder`, counts in the next one, in fixed point: the sum of the
-    counts follows the integral of the input to within one count for ever, whatever the blocks.
-    Charge beyond the output range is lost, as in an integrator at its rail.
+    The `remainder` of a cycle, in fixed point, is carried to the next: the sum of the counts
+    follows the integral of the input to within one count for ever, whatever the block size.
+    Charge beyond the output range is lost, as in a saturated integrator.
     """
     counts = np.empty(charge.shape, dtype=np.int32)
     for first in range(0, len(charge), _ROWS):
@@ -88,15 +88,15 @@ def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
 
 
 def rounded(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
-    """Convert every cycle by itself, as a sampling converter does."""
+    """Round every cycle independently, as a sampling converter does."""
     return np.clip(np.rint(charge), *_RANGE).astype(np.int32), remainder
 
 
 @dataclass(frozen=True)
 class ThermometerModel:
     """
-    One thermometer on one part: ``reading = quantum * round((T + noise) / quantum)``, all in K, a
-    quantum of 0 continuous; `phase`, 0..1, is when in its period it reads first.
+    A thermometer on a part: ``reading = quantum * round((T + noise) / quantum)``, all in K; a
+    quantum of 0 means no rounding; `phase`, 0..1, is that of its first reading.
     """
 
     node: str
@@ -123,8 +123,8 @@ class ThermometerModel:
 @dataclass(frozen=True)
 class GyroModel:
     """
-    The gyroscope of a unit at rest, of scale 1, in mdeg/s where the accelerometer has ug; from
-    run to run its bias differs by `turn_on`, a standard deviation.
+    The gyroscope of a unit at rest, with scale 1, in mdeg/s instead of ug; `turn_on` is the
+    standard deviation of the bias from run to run.
     """
 
     drift: tuple[Effect, ...]
@@ -138,7 +138,7 @@ class GyroModel:
         return np.asarray((drift + np.array(self.bias_at_reference)) * MILLIDEGREE)
 
     def constant(self, seed: int) -> Floats:
-        """Return a run's Earth rate, in an attitude of its own, and turn-on; rad/s, (3,)."""
+        """Return the Earth rate in a random attitude plus the turn-on bias [rad/s], (3,)."""
         rng = generator(seed, Stream.GYRO_OFFSET)
         north = rng.standard_normal(3)
         turn_on = self.turn_on * MILLIDEGREE * rng.standard_normal(3)
@@ -147,7 +147,7 @@ class GyroModel:
 
 @dataclass(frozen=True)
 class SwitchedLoad:
-    """Electronics that heat a part with `power` [W] for random spells [s], off at first."""
+    """Electronics that heat a part with `power` [W] in random intervals [s], initially off."""
 
     part: str
     power: float
@@ -157,7 +157,7 @@ class SwitchedLoad:
 @dataclass(frozen=True)
 class UnitModel:
     """
-    One physical unit with all its constants: the truth that a calibration looks for.
+    A physical unit with all its constants: the truth that a calibration estimates.
 
     Per axis, ``counts = K * scale(T) * s + bias(T) + noise`` summed into whole counts, where ``s =
     inverse(M) @ f`` is the specific force along the sensitivity axes. K [counts/cycle per m/s^2]
@@ -181,7 +181,7 @@ class UnitModel:
 
     @property
     def counts_per_micro_g(self) -> Floats:
-        """What a micro-g is per axis, shape (3,), counts/cycle."""
+        """Counts per cycle of one micro-g, by axis, shape (3,)."""
         return np.array(self.scale_factor) * MICRO_G
 
     @property
@@ -191,7 +191,7 @@ class UnitModel:
 
     @property
     def origin(self) -> Floats:
-        """Temperatures [degC] of the parts in the reference's still state, shape (n_parts,)."""
+        """Temperatures [degC] of the parts in the reference's steady state, shape (n_parts,)."""
         air = self.network.air_for(self.board.node, _REFERENCE_C)
         return self.network.equilibrium(air)
 
@@ -202,7 +202,7 @@ class UnitModel:
 
     def sibling(self, seed: int, spread: float = 0.15) -> UnitModel:
         """
-        Return another unit of the same type: constants and misalignment are its own, each
+        Return another unit of the same type, with other constants and misalignment; each
         coefficient, width and heat capacity differs by a share of up to `spread`.
         """
         rng = generator(seed, Stream.SIBLING)

@@ -6,12 +6,11 @@ Owns the detection of a change: has the rate of one sensor left the baseline of 
 Two linear filters of temperature and rate, of different memory, integrate the second derivative.
 A rate counts as departed when it is beyond the baseline by more than the soak is known to swing,
 and by more than the filter's noise reaches at the allowed rate of false alarms (Rice's formula,
-see docs/regime.md). The swing is what the ripple of the surroundings makes through the lag, or
-what has been seen, if that is more.
+see docs/regime.md). The swing is the larger of two rates: the declared ripple of the surroundings
+seen through the sensor's lag, and the swing observed.
 
-Where the cells of a sensor are so wide that noise cannot cross one, the time between two edges
-crossed in the same direction gives the mean rate between them, sharply, and takes the filters'
-place.
+If a sensor's quantum is so wide that noise cannot cross a cell, the filters are not used: two
+edges crossed in the same direction give the mean rate between them.
 
 References
 ----------
@@ -30,21 +29,21 @@ from .thermometer import Thermometer
 
 BEND_SHARES = (1.0, 10.0)  # accelerations the two filters are tuned to / the smallest onset
 TUNING: Final = 1.45  # best memory of a filter in units of (noise / acceleration)^0.4, at 1 Hz
-CELL_NOISE_SHARE: Final = 0.4  # noise in a filter's variance when cells make it come in bunches
-SETTLING: Final = 5.0  # memories until a filter's noise is the formula's
-LONGEST_HALF_SWING_S: Final = 600.0  # a ripple turns faster
-LARGEST_BASELINE: Final = 0.25  # of the smallest ramp: as far as a baseline follows a rate
-SWING_MARGIN: Final = 1.25  # on a swing of the rate about its trend ...
-SWING_SIGMAS: Final = 3.0  # ... beyond what the noise makes of it
-SWING_MEMORY_LAGS: Final = 10.0  # and how slowly it is forgotten
+CELL_NOISE_SHARE: Final = 0.4  # noise / filter variance of a sensor whose noise is mostly quanta
+SETTLING: Final = 5.0  # age at which a filter's noise is stationary, in filter memories
+LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a ripple [s]
+LARGEST_BASELINE: Final = 0.25  # largest baseline rate / rate of the smallest ramp
+SWING_MARGIN: Final = 1.25  # swing assumed / swing observed about the trend of the rate
+SWING_SIGMAS: Final = 3.0  # noise subtracted from an observed swing, in standard deviations
+SWING_MEMORY_LAGS: Final = 10.0  # time constant of forgetting a swing, in sensor lags
 
 
 class ChangeDetector:
     """
     Baseline, swing and departure of the rate of one sensor.
 
-    `rate` [K/s] is that of the filter with the longer memory, `swing` [K/s] how far the rate of a
-    soak is known to go from its baseline.
+    `rate` [K/s] is the output of the filter with the longer memory. `swing` [K/s] is the largest
+    distance from the baseline that the rate is known to reach in a soak.
     """
 
     def __init__(
@@ -56,8 +55,8 @@ class ChangeDetector:
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
         self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
-        # The memory (1 / tracking frequency) that sees an acceleration soonest at 1 Hz, and from
-        # it the power of the acceleration that the filter expects, whatever the readings' rate.
+        # Each memory (1 / tracking frequency) detects its acceleration soonest at 1 Hz; the
+        # spectral density of the filter's acceleration follows from it, for any reading rate.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
         onset = smallest_rate / sensor.lag_s
         memories = [
@@ -82,7 +81,7 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        self._doubt = self.swing  # of the baseline, which may begin at a crest
+        self._doubt = self.swing  # of the baseline, which may begin at a crest of the ripple
         self._trend = 0.0
         self._is_above = False
         self._turned_s = 0.0
@@ -93,13 +92,13 @@ class ChangeDetector:
         self._reading = nan
 
     def settle(self, sensor: Thermometer, least_doubt: float = 0.0) -> None:
-        """Begin a soak: its baseline is the rate, give or take `least_doubt` at the least."""
+        """Begin a soak with the rate as its baseline, uncertain by at least `least_doubt`."""
         self._baseline = self.rate
         self._doubt = max(self.swing, least_doubt, 2.0 * sqrt(sensor.var_rate))
-        self._edge = nan  # edges that were crossed before the soak tell of the ramp
+        self._edge = nan  # edges crossed before the soak measure the rate of the ramp
 
     def is_following(self, stamp_ns: int) -> bool:
-        """Tell whether `rate` is that of the reading with this stamp."""
+        """Tell whether `rate` includes the reading with this stamp."""
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
@@ -108,8 +107,8 @@ class ChangeDetector:
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
         """
-        Take the sensor's last used reading; the baseline follows at `pace`, 1 in a soak, 0 in a
-        ramp. Returns the sign of the departure from the baseline, 0 = none.
+        Take the sensor's last used reading. The baseline follows the rate at a relative speed
+        `pace`: 1 in a soak, 0 in a ramp. Returns the sign of the departure from it, 0 = none.
         """
         stamp = self._stamp_ns
         dt = 0.0 if stamp is None else (stamp_ns - stamp) * 1e-9
@@ -127,7 +126,7 @@ class ChangeDetector:
         self._age_s += dt
         if not 0.95 * self._dt < dt < 1.05 * self._dt:
             self._tune(dt)
-        # Back towards rest is no departure: the band reaches from the baseline to zero.
+        # A rate that returns towards 0 is no departure: the band spans the baseline and 0.
         baseline, swing = self._baseline, self.swing + self._doubt
         high = baseline + swing if baseline > 0.0 else swing
         low = baseline - swing if baseline < 0.0 else -swing
@@ -206,7 +205,7 @@ class ChangeDetector:
         reading, before = sensor.reading, self._reading
         apart = (stamp_ns - self._edge_ns) * 1e-9
         if reading == before:
-            # nothing crossed since: no rate above one quantum in that time
+            # No edge crossed since: the rate is at most one quantum in the time passed.
             bound = self._quantum / apart
             if bound < self._doubt + abs(self._baseline):
                 self._doubt = max(min(self._doubt, bound), self.swing)
@@ -225,7 +224,7 @@ class ChangeDetector:
         return departure
 
     def _follow(self, rate: float, dt: float) -> None:
-        """Let the baseline follow the rate of a while, at most a swing per memory."""
+        """Let the baseline follow a rate seen for `dt`, by at most one swing per memory."""
         baseline, doubt = self._baseline, self._doubt
         limit = self.swing + doubt
         share = dt / (dt + self._baseline_s)
@@ -233,7 +232,7 @@ class ChangeDetector:
         if not -limit <= step <= limit:
             step = limit if step > 0.0 else -limit
         moved = baseline + share * step
-        # A ramp that matters must not become the baseline, however slowly it shows.
+        # A slow onset must not raise the baseline to the rate of a ramp.
         farthest = self._largest_baseline
         if not -farthest <= moved <= farthest:
             farthest = max(farthest, abs(baseline))
@@ -252,7 +251,7 @@ class ChangeDetector:
             self._peak = max(self._peak, abs(apart))
             return
         if self._age_s - self._turned_s < LONGEST_HALF_SWING_S:
-            # the lesser of the two: an onset or an end is large to one side only
+            # The smaller of two half swings: the onset or end of a ramp is large on one side only.
             noise = SWING_SIGMAS * sqrt(self._noise_share * self._filters[0][4])
             swing = SWING_MARGIN * min(self._peak, self._peak_before) - noise
             self.swing = max(self.swing, min(swing, self._largest_swing))

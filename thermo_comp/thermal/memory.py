@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the thermal memory: lags of the board, lags of the neighbours' gradients, play operators.
+Owns the thermal memory: lags of the board, lags of the gradients, play operators.
 
-A lag L of an input u obeys ``dL/dt = (u - L) / tau``. Kept is ``m = u - L``; with u linear between
-two readings (first-order hold) its exact step over dt is
+A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The state stored is ``m = u - L``; with u
+linear between two readings (first-order hold) its exact step over dt is
 ``m' = m e + (u' - u) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
 """
 
@@ -20,26 +20,29 @@ import numpy as np
 
 from ..typing import Floats
 
-#: The input of a lag or play that is the board's own temperature.
+#: Name of the board temperature as the input of a lag or play.
 BOARD_INPUT: Final = 'board'
-#: Neighbouring lags are almost one number: to this part of a variance they are not.
-START_APART: Final = 3e-4
-#: What nobody knows at the start: sd of lags of `START_TAU_S`, the board's and a gradient's [K].
+#: Relative jitter on the diagonal of the start covariance: lags of similar time constants are
+#: almost collinear, and their covariance would not be invertible.
+START_JITTER: Final = 3e-4
+#: Prior sd of a lag of time constant `START_TAU_S` [s] at the start: of the board temperature and
+#: of a gradient [K].
 START_TAU_S: Final = 3600.0
 BOARD_START_SD: Final = 3.0
-NEIGHBOUR_START_SD: Final = 1.0
-#: Readings farther apart than this part of a time constant leave the way between them open.
+GRADIENT_START_SD: Final = 1.0
+#: Interval between readings / time constant beyond which the input between them counts as unseen.
 SPARSE_SHARE: Final = 0.1
-#: A lag that keeps less than this has forgotten.
+#: Weight of an old input below which `_recursion` drops it: beneath double precision.
 _FADED: Final = 1e-18
 
 
 @dataclass(frozen=True)
 class MemorySpec:
     """
-    What a tracker remembers: thermometers by name, the first of which leads the detector; lags as
-    (``'board'`` or a sensor, whose gradient it is; time constant [s]), in the order of `inputs`;
-    plays as (time constant of the board's lag that it follows, 0 for the board; half-width [K]).
+    What a tracker remembers. `sensors`: thermometers by name, the first leads the detector.
+    `lags`: (input, time constant [s]), the input being ``'board'`` or the sensor of a gradient, in
+    the order of `inputs`. `plays`: (time constant of the board lag that the play follows, 0 for
+    the board itself; half-width [K]).
     """
 
     sensors: tuple[str, ...] = ('case',)
@@ -58,27 +61,27 @@ class MemorySpec:
 
 def start_covariance(lags: Sequence[tuple[str, float]]) -> Floats:
     """
-    Say what is not known of lags whose input nobody has seen before: covariance (n, n) [K^2].
+    Return the covariance of lags at their start, before any input was seen, (n, n) [K^2].
 
-    The input is taken for a random walk around what is seen first, so that ``P_kl = D tau_k tau_l
-    / (tau_k + tau_l)`` between the lags of one input and 0 between those of two. From then on it
-    decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
+    The unseen input is modelled as a random walk that ends at the first reading, so that ``P_kl =
+    D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0 for lags of different
+    inputs. From then on it decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
     """
     tau = np.array([tau for _, tau in lags])
     names = np.array([name for name, _ in lags])
-    sd = np.where(names == BOARD_INPUT, BOARD_START_SD, NEIGHBOUR_START_SD)
+    sd = np.where(names == BOARD_INPUT, BOARD_START_SD, GRADIENT_START_SD)
     with np.errstate(invalid='ignore'):
         shape = tau[:, np.newaxis] * tau / (tau[:, np.newaxis] + tau)
     is_same = names[:, np.newaxis] == names
-    shape[np.diag_indices_from(shape)] *= 1.0 + START_APART
+    shape[np.diag_indices_from(shape)] *= 1.0 + START_JITTER
     result: Floats = np.where(is_same, 2.0 / START_TAU_S * sd * sd * shape, 0.0)
     return result
 
 
 class LagBank:
     """
-    The lags of one input; `start_ns` is the first stamp since they were last forgotten,
-    `has_extra` tells whether anything but the start is unknown of them.
+    The lags of one input. `start_ns` is the first stamp since the last `forget`; `has_extra` tells
+    whether the lags have a variance (`extra`) besides that of their start.
     """
 
     def __init__(self, taus: tuple[float, ...]) -> None:
@@ -88,7 +91,7 @@ class LagBank:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the input: what comes next is the first."""
+        """Forget the input: the next value starts the lags anew."""
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
@@ -97,7 +100,7 @@ class LagBank:
         self.has_extra = False
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
-        """Take the input's next value [K], reached in a straight line, wrong by `sd` meanwhile."""
+        """Take the input's next value [K]: linear since the last one, with an error `sd` [K]."""
         seen_ns = self.stamp_ns
         if seen_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
@@ -122,22 +125,22 @@ class LagBank:
         for variance, e, tau in zip(self.extra, decays, self.taus, strict=True):
             grown = variance
             if dt > SPARSE_SHARE * tau:
-                # Nobody saw the way between two readings this far apart.
+                # The input may have changed at any time between readings this far apart.
                 grown += (change * (1.0 - e)) ** 2
             if sd:
-                # Wrong by the same for long: it adds up.
+                # The error is the same from step to step: deviations add, not variances.
                 grown = (math.sqrt(grown) + sd * (1.0 - e)) ** 2
             result.append(grown)
         self.extra = result
 
     def note_jump(self, change: float) -> None:
-        """Doubt the lags by a change of the input that was none."""
+        """Add to the variances a change of the input that was a sensor's error."""
         if self.taus:
             self.has_extra = True
             self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Give ``u - L`` [K] of each lag at a stamp with the input `value`, and its variance."""
+        """Return ``u - L`` [K] and the extra variance of each lag at a stamp, with u = `value`."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -151,7 +154,7 @@ class LagBank:
         return lagging, [v * e * e for v, e in zip(self.extra, decays, strict=True)]
 
     def start_shares(self, stamp_ns: int) -> list[float]:
-        """Say what is left at a stamp of each lag's start, 1 to 0."""
+        """Return the remaining share of each lag's start value at a stamp, 1 to 0."""
         start_ns = self.start_ns
         age = 0.0 if start_ns is None else max(stamp_ns - start_ns, 0) * 1e-9
         return [math.exp(-age / tau) for tau in self.taus]
@@ -159,7 +162,7 @@ class LagBank:
 
 @lru_cache(maxsize=1024)
 def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], list[float]]:
-    """Give what a step keeps of each lag, and what it takes of the input's change."""
+    """Return, per lag, the decay over a step and the gain on the input's change."""
     dt = dt_ns * 1e-9
     lost = [-math.expm1(-dt / tau) for tau in taus]
     return [1.0 - part for part in lost], [
@@ -169,19 +172,19 @@ def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], lis
 
 class ThermalMemory:
     """
-    All that a tracker remembers: lags of the board and of each gradient, plays.
+    The memory of a tracker: lags of the board and of each gradient, plays.
 
-    A play is a part of rate-independent hysteresis, of a half-width r [K] on an input v, which it
-    follows only where this pushes it: ``P = min(max(P, v - r), v + r)``.
+    A play (Prandtl-Ishlinskii operator of rate-independent hysteresis) of half-width r [K] follows
+    its input v only when v is farther than r away: ``P = min(max(P, v - r), v + r)``.
     """
 
     def __init__(self, spec: MemorySpec) -> None:
         self.spec = spec
-        #: The lags of each input, by its name.
+        #: The lags of each input, by the input's name.
         self.banks = {name: LagBank(spec.taus(name)) for name in spec.inputs}
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: Of each play the lag that it follows, -1 for the board itself, and its half-width.
+        #: For each play: index of the board lag that it follows, -1 for the board; half-width [K].
         self._inputs = [self.board.taus.index(tau) if tau else -1 for tau, _ in spec.plays]
         self._widths = [width for _, width in spec.plays]
         self._held: list[float] = []
@@ -203,12 +206,12 @@ class ThermalMemory:
         ]
 
     def note_jump(self, change: float) -> None:
-        """Doubt everything by a change of the board temperature that was none."""
+        """Add to all variances a change of the board temperature that was a sensor's error."""
         for bank in self.banks.values():
             bank.note_jump(change)
 
     def at(self, stamp_ns: int, board: float, gradients: list[float]) -> list[float]:
-        """Give (lag [K], extra variance [K^2]) per lag, then each play less its input [K]."""
+        """Return (lag [K], extra variance [K^2]) per lag, then each play less its input [K]."""
         lagging, variances = self.board.at(stamp_ns, board)
         values, extra = lagging, variances
         for name, gradient in zip(self.spec.sensors, gradients, strict=True):
@@ -227,7 +230,7 @@ class ThermalMemory:
         return result
 
     def start_shares(self, stamp_ns: int) -> list[float]:
-        """Say what is left at a stamp of each lag's start, 1 to 0, in the order of the spec."""
+        """Return the remaining share of each lag's start value at a stamp, in the spec's order."""
         banks = self.banks.values()
         return [share for bank in banks for share in bank.start_shares(stamp_ns)]
 
@@ -236,7 +239,7 @@ def memory_on_grid(
     spec: MemorySpec, step_s: float, board: Floats, gradients: Sequence[Floats]
 ) -> Floats:
     """
-    Remember whole columns at once: what `ThermalMemory` gives on a uniform grid, but for rounding.
+    Compute `ThermalMemory` for whole series on a uniform grid; equal to it except for rounding.
 
     Returns (n, 2 * n_lags + n_plays): (lag [K], 0) per lag, then each play less its input [K].
     """
@@ -257,7 +260,7 @@ def memory_on_grid(
 
 
 def _recursion(decay: float, driven: Floats) -> Floats:
-    """``m[k] = decay m[k - 1] + driven[k]``, by doubling: stretches of 2^j steps at a time."""
+    """Compute ``m[k] = decay m[k - 1] + driven[k]`` in log2(n) passes: pass j spans 2^j steps."""
     result: Floats = driven.copy()
     shift, factor = 1, decay
     while shift < len(result) and factor > _FADED:

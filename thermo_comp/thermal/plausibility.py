@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what physics says about a temperature reading before any estimator believes it.
+Owns the plausibility checks of temperature readings, applied before they reach an estimator.
 
 A board has a heat capacity, so its temperature takes no step. A thermometer has noise, so its
 readings do not stand still, least of all while the other thermometer moves. The case is nearer to
-the surroundings than the board, so it leads in a ramp. A sensor that breaks such a rule is
-doubted: its readings are left out, or the variance grows by what may be wrong with them.
+the surroundings than the board, so it leads in a ramp. If a sensor breaks such a rule, its
+readings are left out, or their variance grows by the error that they may have.
 """
 
 from __future__ import annotations
@@ -18,35 +18,36 @@ from typing import Final
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
-#: No part changes by more than this at once [K] or in the long run [K/s]; quanta come on top.
+#: Largest possible change of a temperature: at once [K] and per second [K/s], quanta apart.
 LARGEST_STEP: Final = 3.0
 LARGEST_RATE: Final = 0.2
-#: The rule of steps holds from so many readings on: what a sensor says first may be wrong.
+#: Number of used readings after which steps are checked: a sensor's first readings may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: Readings stand still when so many of them, over so long [s], are the same to the bit, or as
-#: many as the declared noise makes this unlikely; a few of them are enough to doubt.
+#: A sensor stands still after this number of equal readings (more if the declared noise makes so
+#: long a run more probable than `STILL_PROBABILITY`) over at least this time [s].
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
+#: Number of equal readings from which the variance grows.
 DOUBTFUL_READINGS: Final = 4
-#: How far [K] the other sensor must have moved meanwhile to call a sensor frozen that has noise
-#: of its own, and one whose quantum hides it.
+#: Movement of the other sensor [K] that makes a still sensor a frozen one: if noise exceeds the
+#: sensor's quantum, and if the quantum hides the noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
-#: A frozen sensor may be off by any temperature it was made for, at most by this [K].
+#: Largest assumed error of a frozen sensor [K].
 LARGEST_DOUBT: Final = 60.0
 
-#: A lead must be this large [K] and this part of the movement to be one ...
+#: Smallest temperature difference that counts as a lead: in K, and as a share of the movement ...
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
-#: ... in so many readings running, while the slower of both moves at least at this part of the
-#: rate of the faster; for a doubt a smaller part is enough.
+#: ... in this number of consecutive readings, with at least this ratio of the slower rate to the
+#: faster; from the smaller ratio on a lead of the board adds to the variance.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
 _SIGMAS: Final = 6.0
-#: Rates begin at 0: what is switched on and heats itself is not calm until so long after [ns].
+#: Rates start at 0, so a unit that heats itself after switch-on seems calm for this time [ns].
 _CALM_NS: Final = 120 * 10**9
 
 
@@ -54,25 +55,25 @@ class Fault(Enum):
     """What is wrong with a sensor; values are the words of the diagnostics."""
 
     NONE = 'none'
-    #: Its readings are the same to the bit for too long: they count, with a growing variance.
+    #: The readings have been equal for too long: they are used, with a growing variance.
     STILL = 'stands still'
-    #: The same while the other sensor moves: its readings do not count.
+    #: The readings stay equal while the other sensor moves: they are not used.
     FROZEN = 'frozen'
-    #: A change that no part can make: its readings do not count.
+    #: The reading changed faster than any part can: it is not used.
     STEP = 'jumped'
 
 
 class SensorCheck:
     """
-    Judges one sensor's readings by its past and by the other sensor, which it follows by `lag_s`;
-    0 for the one that leads. `is_revived`: the reading just admitted ends a standstill.
+    Judges one sensor's readings by its past and by the other sensor, which it follows with a lag
+    of `lag_s` (0 for the leading sensor). `is_revived`: the reading just admitted ends a fault.
     """
 
-    def __init__(self, own: Thermometer, other: Thermometer, lag_s: float) -> None:
-        self.own = own
+    def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
+        self.sensor = sensor
         self._other = other
         self.lag_s = lag_s
-        settings = own.settings
+        settings = sensor.settings
         self._quantum = settings.quantum_c
         self._has_cells = settings.has_cells
         self._n_still = still_readings(settings)
@@ -98,33 +99,33 @@ class SensorCheck:
 
     def admits(self, stamp_ns: int, celsius: float) -> bool:
         """Judge a reading [degC] before it is used: whether the estimator may have it."""
-        own = self.own
-        own_ns, fault = own.stamp_ns, self.fault
+        sensor = self.sensor
+        last_ns, fault = sensor.stamp_ns, self.fault
         self.is_revived = False
-        if own_ns is None or stamp_ns <= own_ns or not isfinite(celsius):
-            return True  # the first one, or one that the estimator itself rejects
-        if celsius == own.reading:
+        if last_ns is None or stamp_ns <= last_ns or not isfinite(celsius):
+            return True  # the first reading, or a reading that the estimator itself rejects
+        if celsius == sensor.reading:
             self._n_same += 1
             self.fault = self._judge_still(stamp_ns)
             return self.fault != Fault.FROZEN
         if self._n_same >= self._n_doubtful and not self._has_cells:
-            change = celsius - own.reading
+            change = celsius - sensor.reading
             if abs(change) > self._largest_noise:
-                # Those equal readings were wrong, and the estimate has followed them.
+                # The equal readings before were wrong, and the estimate has followed them.
                 self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
-        age = (stamp_ns - own_ns) * 1e-9
-        # A reading that is near anything the estimate may have come to is no step: the usual case.
+        age = (stamp_ns - last_ns) * 1e-9
+        # The usual case, decided cheaply: the reading is within a step of the estimate.
         if (
             fault is Fault.NONE
-            and abs(celsius - own.temperature) + abs(own.rate) * age < LARGEST_STEP
+            and abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP
         ):
             self._n_used += 1
             return True
         self.is_revived = fault is Fault.STILL or fault is Fault.FROZEN
         if self._n_used >= SETTLED_READINGS and not self.is_revived:
-            expected, _, variance = own.at(stamp_ns)
+            expected, _, variance = sensor.at(stamp_ns)
             step = celsius - expected
             possible = LARGEST_STEP + 2.0 * self._quantum + LARGEST_RATE * age
             if abs(step) > possible + _SIGMAS * sqrt(variance):
@@ -132,19 +133,18 @@ class SensorCheck:
                 self.step = step
                 return False
             if fault is Fault.STEP:
-                # Possible after so long, but not where it was expected.
+                # Enough time has passed for the change, but the reading is not the expected one.
                 self.is_revived = abs(step) > self._largest_noise + _SIGMAS * sqrt(variance)
         self.fault = Fault.NONE
         self._n_used += 1
         return True
 
     def watch_other(self) -> None:
-        """Note how the other sensor has moved since this one changed; after its readings."""
+        """Note the other sensor's movement since this reading changed; call after its readings."""
         other = self._other
         now_ns = other.stamp_ns
         moved = other.temperature - self._other_then
         if now_ns is None or not isfinite(moved):
-            # The first time since this sensor's reading changed.
             self._other_then = other.temperature
             self._expected = self._moved = 0.0
             self._seen_ns = now_ns
@@ -152,31 +152,31 @@ class SensorCheck:
         if self.lag_s > 0.0:
             dt = (now_ns - (self._seen_ns or now_ns)) * 1e-9
             if dt > 0.0:
-                # First-order lag: what this sensor should have moved by now.
+                # Expected movement of this sensor so far: a first-order lag behind the other.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # The follower may come all the way to where this sensor stands, but not past it.
-            ahead = self.own.temperature - self._other_then
+            # The follower may reach this sensor's temperature, but not pass it.
+            ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns
         self._moved = max(self._moved, abs(moved))
 
     def _judge_still(self, stamp_ns: int) -> Fault:
-        own, other = self.own, self._other
-        if own.changed_ns is None:
+        sensor, other = self.sensor, self._other
+        if sensor.changed_ns is None:
             return Fault.NONE
         margin = _SIGMAS * sqrt(other.var_temperature) + 2.0 * other.settings.quantum_c
         if self._has_cells:
             hidden = 2.0 * self._quantum + OTHER_MOVED_BEYOND_CELL + margin
             is_frozen = self.fault == Fault.FROZEN or abs(self._expected) > hidden
             return Fault.FROZEN if is_frozen else Fault.NONE
-        still_s = (stamp_ns - own.changed_ns) * 1e-9
+        still_s = (stamp_ns - sensor.changed_ns) * 1e-9
         if self._n_same < self._n_still or still_s < STILL_S:
             return Fault.NONE
         return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
 
     def note_jump(self, stamp_ns: int, change: float) -> None:
-        """Note that the sensor began anew elsewhere: was it wrong, or is it wrong now?"""
+        """Note a jump of the sensor [K]: the readings before it or those after it are wrong."""
         self._jumped = self._jump_at(stamp_ns) + change * change
         self._jumped_ns = stamp_ns
 
@@ -186,9 +186,9 @@ class SensorCheck:
         return self._jumped * exp(-max(stamp_ns - self._jumped_ns, 0) * self._decay)
 
     def doubt(self, stamp_ns: int) -> float:
-        """Return the variance that comes to the temperature's: standstills and jumps [K^2]."""
+        """Return the variance to add to the temperature's for standstills and jumps [K^2]."""
         doubt = self._jump_at(stamp_ns)
-        changed_ns = self.own.changed_ns
+        changed_ns = self.sensor.changed_ns
         if changed_ns is None or self._n_same < self._n_doubtful:
             return doubt
         if self._has_cells and self.fault != Fault.FROZEN:
@@ -198,7 +198,7 @@ class SensorCheck:
 
 
 def still_readings(settings: ThermometerSettings) -> int:
-    """How many equal readings in a row are more than chance, of a sensor without cells."""
+    """Return the number of consecutive equal readings that noise does not explain."""
     same = erf(settings.quantum_c / (2.0 * sqrt(2.0) * settings.noise_sd_c))
     if not 0.0 < same < 1.0:
         return STILL_READINGS
@@ -210,9 +210,9 @@ class LeadCheck:
     Finds out which of two sensors leads in a ramp.
 
     The movements since the last calm are compared while both sensors move in one direction. Heat
-    that comes from outside moves the case first; where the board leads, the two topics are
-    swapped, or the heat comes from inside, and in both cases the gradient terms do not hold.
-    `doubt` is the square of the lead that the board may have had in this ramp [K^2].
+    from outside moves the case first. If the board leads, the two topics are swapped or the heat
+    comes from inside; in both cases the gradient terms are wrong. `doubt` is the square of the
+    board's possible lead in this ramp [K^2].
     """
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:

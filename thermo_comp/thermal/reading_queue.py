@@ -10,23 +10,23 @@ from typing import Final
 
 from .memory import BOARD_INPUT
 
-#: (stamp [ns], whether it is not the board's, thermometer, order of arrival, degC).
+#: (stamp [ns], whether the thermometer is not the board's, its name, order of arrival, degC).
 Entry = tuple[int, bool, str, int, float]
 
-#: More readings than this that wait mean that their clock is not the samples'.
+#: Largest number of waiting readings; more mean that readings and samples use different clocks.
 PENDING_LIMIT: Final = 4096
-#: A reading that comes after another of its sensor is stamped earlier by no more than this [ns],
-#: or the other one was not of this clock.
+#: Largest backward step between consecutive stamps of one sensor [ns]; after a larger step the
+#: earlier readings are taken to be from another clock.
 DISORDER_NS: Final = 5_000_000_000
-#: Later than any stamp.
+#: A stamp later than any real stamp [ns].
 NEVER_NS: Final = 1 << 62
 
 
 class ReadingQueue:
     """
-    Readings by stamp; of equal stamps the board first, then by name and arrival.
+    Readings by stamp; at equal stamps the board first, then by name and arrival.
 
-    So the detector, which the case reading wakes, decides with the newest of both.
+    The case reading triggers the detector, which so has the newest readings of both sensors.
     """
 
     def __init__(self) -> None:
@@ -37,13 +37,13 @@ class ReadingQueue:
 
     @property
     def next_ns(self) -> int:
-        """Stamp of the first reading; later than any where none waits."""
+        """Stamp of the earliest waiting reading; `NEVER_NS` if none waits."""
         return self._entries[0][0] if self._entries else NEVER_NS
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> int:
         """
-        Add a reading; return how many were refused: this one where too many wait, or those that
-        wait with stamps which this one shows to be of another clock.
+        Add a reading; return the number of readings refused: this reading if too many wait, or the
+        waiting readings that its stamp shows to be from another clock.
         """
         n_before = len(self._entries)
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
@@ -59,21 +59,21 @@ class ReadingQueue:
         return n_refused
 
     def keep(self, is_kept: Callable[[Entry], bool]) -> None:
-        """Drop all readings but some."""
+        """Drop the readings for which `is_kept` is False."""
         self._entries = [entry for entry in self._entries if is_kept(entry)]
         heapq.heapify(self._entries)
 
     def due(self, stamp_ns: int) -> Iterator[Entry]:
-        """Take the readings up to a stamp, one by one."""
+        """Take out the readings up to a stamp, in order."""
         while self._entries and self._entries[0][0] <= stamp_ns:
             yield heapq.heappop(self._entries)
 
     def ahead(self, stamp_ns: int) -> float:
-        """Say how far the farthest reading lies beyond a stamp [s]; 0 if none waits."""
+        """Return the time from a stamp to the latest waiting reading [s]; 0 if none waits."""
         if not self._entries:
             return 0.0
         return (max(entry[0] for entry in self._entries) - stamp_ns) * 1e-9
 
     def __len__(self) -> int:
-        """Count the readings that wait."""
+        """Return the number of waiting readings."""
         return len(self._entries)

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the causal static/dynamic decision with its memory; it has no clock of its own.
+Owns the causal static/dynamic decision with its memory; its only clock is the stamps.
 
 The dynamic state *opens* when the rate of the leading sensor has left the baseline of the soak
-(`change_detector`: the integral of the second derivative against ripple and noise), or when any
-rate is obviously that of a ramp. It is *held* as long as any sensor's rate, now or half a lag
-ahead, may exceed the relaxed rate: through the ramp, where the second derivative is nil, and after
-it, until the lag of the board has died; or, where `closes` is 'case' (the paper's), until the
-change of the case has ended, the board being asked only while the case is lost. The derivation is
-in docs/regime.md.
+(`change_detector`: the integral of the second derivative against ripple and noise), or when the
+rate of any sensor is clearly that of a ramp. It is *held* while any sensor's rate, now or half a
+lag ahead, may exceed the relaxed rate: through the ramp, where the second derivative is 0, and
+after it until the board has relaxed. With `closes` = 'case' (the paper's rule) it ends with the
+change of the case, and the board counts only while the case is lost. The derivation is in
+docs/regime.md.
 
 References
 ----------
@@ -28,14 +28,15 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # the shortest dynamic state, in lags of the leading sensor
-# "The rate is below": the variance in a calm is mostly that of what may begin, so half a sd.
+# Margin for "the rate is below", in sd. Only half a sd: in a soak most of the rate's variance
+# allows for an onset that may begin.
 SURE_SIGMAS: Final = 0.5
-OBVIOUS_SIGMAS: Final = 5.0  # confidence of "the rate is above"
-FIRST_READINGS: Final = 20  # until a noise declared too small is known
+OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above", in sd
+FIRST_READINGS: Final = 20  # readings after which a noise declared too small has been corrected
 
 
 class Regime(IntEnum):
-    """What the surroundings do to the unit; values are those of the paper's S."""
+    """Thermal regime of the unit; STATIC and DYNAMIC have the values of the paper's S."""
 
     UNKNOWN = -1
     STATIC = 0
@@ -46,7 +47,7 @@ class RegimeDetector:
     """
     State machine over the estimates of the case and the board.
 
-    `direction` in the dynamic state: -1 cooling, +1 heating, 0 not yet sure; otherwise 0.
+    `direction` in the dynamic state: -1 cooling, +1 heating, 0 undecided; otherwise 0.
     """
 
     def __init__(self, settings: DetectorSettings) -> None:
@@ -54,7 +55,7 @@ class RegimeDetector:
         self._relaxed_rate = settings.relaxed_rate_k_min / 60.0
         self._dwell_ns = round(settings.dwell_s * 1e9)
         self._turn_ns = self._dwell_ns // 2
-        self._asks_board = settings.closes == 'board'
+        self._needs_calm_board = settings.closes == 'board'
         self._case = _Watch(settings, settings.case)
         self._board = _Watch(settings, settings.board)
         self.regime = Regime.UNKNOWN
@@ -65,10 +66,10 @@ class RegimeDetector:
         self._is_grown = False
 
     def update(self, stamp_ns: int, case: Thermometer | None, board: Thermometer | None) -> Regime:
-        """Decide after a used reading of the leading sensor, the case if it is not None."""
+        """Decide after a used reading of the leading sensor: the case, or without it the board."""
         if case is not None:
             lead, change = case, self._case.change
-            if not self._asks_board:
+            if not self._needs_calm_board:
                 board = None
         elif board is not None:
             lead, change = board, self._board.change
@@ -85,7 +86,8 @@ class RegimeDetector:
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
-            # An onset is seen before the rate is large: until then only its own end ends it.
+            # The detector sees an onset before the rate is large. Until it is large, the state
+            # ends only if the rate returns to the baseline.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -95,7 +97,7 @@ class RegimeDetector:
 
         if not is_dynamic:
             speed = OBVIOUS_SHARE * self._relaxed_rate
-            # Two wide cells crossed in a row are a ramp even where no soak has been seen.
+            # Two wide cells crossed in a row are a ramp, even if no soak has been seen.
             is_static = regime is Regime.STATIC
             if departure and (
                 is_static or (lead.settings.has_wide_cells and departure * lead.rate > speed)
@@ -116,7 +118,7 @@ class RegimeDetector:
             >= self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
             and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
         ):
-            # a soak that nobody saw begin may swing as nobody has learnt yet
+            # In the first soak the swing has not been learnt yet.
             is_first = self.regime == Regime.UNKNOWN
             change.settle(lead, 0.5 * self._relaxed_rate if is_first else 0.0)
             self.regime = Regime.STATIC
@@ -124,7 +126,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Follow the direction once it has lasted: a held reading makes the rate a staircase."""
+        """Follow a direction that lasts; a held reading makes the rate a staircase."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -140,17 +142,17 @@ class RegimeDetector:
         self.direction = direction
         self._turning_ns = None
         self._is_grown = False
-        # An onset is seen long before the rate has grown: give the ramp time to show.
+        # The onset is detected long before the rate has grown: give the ramp time to develop.
         hold_ns = max(self._dwell_ns, round(HOLD_LAGS * 1e9 * lead.settings.lag_s))
         self._held_until_ns = stamp_ns + hold_ns
 
 
 class _Watch:
     """
-    What is seen of one sensor: a change, and whether it is calm: is its rate surely below the
-    relaxed rate, now and half a lag ahead?
+    Change detection of one sensor, and its calm: the rate is surely below the relaxed rate, now
+    and half a lag ahead.
 
-    Ahead: a rate that moves away from its mean over the last quarter of a lag will go on to do so.
+    The prediction continues the movement of the rate from its mean over the last quarter lag.
     """
 
     def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
@@ -163,8 +165,8 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # A reading that stands still for longer than a relaxed rate takes through its cell, and
-        # than a reversal at the smallest ramp's acceleration stays in it, is calm in itself.
+        # A reading unchanged for longer than the relaxed rate takes to cross a cell, and than a
+        # reversal with the smallest ramp's acceleration stays in a cell, proves calm.
         quantum = sensor.quantum_c
         bend = settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         self._still_ns = round(
@@ -174,7 +176,7 @@ class _Watch:
         self._mean = 0.0
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
-        """Follow the rate of the sensor; a lost or stale one has no say."""
+        """Follow the rate of the sensor; a lost or stale sensor counts as calm."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True
@@ -182,14 +184,14 @@ class _Watch:
             self._stamp_ns = None
             return False
         change = self.change
-        # The detector's filters do not overshoot a ripple; the third-order thermometer does.
+        # Unlike the third-order thermometer, the detector's filters do not overshoot a ripple.
         rate = change.rate if change.is_following(stamp_ns) else sensor.rate
         doubt = sqrt(sensor.var_rate)
         relaxed = self._relaxed
         stamp = self._stamp_ns
         self._stamp_ns = stamp_ns
         if stamp is None or doubt > relaxed:
-            self._mean = rate  # not known well enough to have a past
+            self._mean = rate  # the rate is too uncertain for a mean
         else:
             dt = (stamp_ns - stamp) * 1e-9
             self._mean += dt / (dt + self._memory_s) * (rate - self._mean)

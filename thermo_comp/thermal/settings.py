@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the settings of thermometers, detector and tracker: what is known of a unit beforehand.
+Owns the settings of thermometers, detector and tracker: what is known before any reading.
 
-They travel in calibrations and to a fleet's workers.
+Calibrations hold them, and a fleet's workers receive them.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import Annotated, Final, Literal, get_args
 
 from ..quantities import QUANTITIES, refuse_impossible
 
-CELL_SIGMAS: Final = 2.5  # a quantum above this many noise sds has cells ...
-WIDE_CELL_SIGMAS: Final = 8.5  # ... that noise never crosses: six sds of a difference
-OBVIOUS_SHARE: Final = 1.5  # the hysteresis: opens above this many relaxed rates, closes below one
-#: What a thermal test of a unit should span, all bags together, as the board says [K].
+CELL_SIGMAS: Final = 2.5  # quantum / noise sd above which a reading is treated as a cell
+WIDE_CELL_SIGMAS: Final = 8.5  # the same for cells that noise never crosses: 6 sd of a difference
+OBVIOUS_SHARE: Final = 1.5  # hysteresis: rate that opens / relaxed rate, below which it closes
+#: Advised span of the board temperature over all bags of a unit's thermal test [K].
 ADVISED_SPAN_K: Final = 25.0
-#: A slower change of the board is a soak's slow drift and no ramp [K/min].
+#: Board temperature rate from which a change counts as a ramp [K/min]; below it is a soak's drift.
 RAMP_K_MIN: Final = 0.1
 
 
@@ -36,7 +36,7 @@ def refuse_outside(
 
 @dataclass(frozen=True, slots=True)
 class ThermometerSettings:
-    """What is known of a temperature sensor, physically; its keys are the file's keys."""
+    """Physical properties of a temperature sensor; the keys are those of the calibration file."""
 
     noise_sd_c: Annotated[
         float,
@@ -47,13 +47,13 @@ class ThermometerSettings:
         float, QUANTITIES['quantum'], 'Step of the readings, K; 0 for a continuous sensor.'
     ] = 0.0
     fastest_ramp_k_min: Annotated[
-        float, QUANTITIES['ramp'], 'Rate of the fastest ramps it will see, K/min.'
+        float, QUANTITIES['ramp'], 'Rate of the fastest ramps that the sensor will see, K/min.'
     ] = 3.0
     lag_s: Annotated[
         float,
         QUANTITIES['time constant'],
-        'Thermal lag between the surroundings and the sensor, s. Together with the ramp it says '
-        'how sharply the temperature bends: an onset is an acceleration of ``ramp / lag``.',
+        'Thermal lag between the surroundings and the sensor, s. The onset of a ramp is a second '
+        'derivative of ``ramp / lag``.',
     ] = 600.0
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class ThermometerSettings:
 
     @property
     def has_cells(self) -> bool:
-        """Whether the quantum exceeds the noise so far that a reading is a cell, not a value."""
+        """Whether the quantum far exceeds the noise, so that a reading is a cell, not a value."""
         return self.quantum_c > CELL_SIGMAS * self.noise_sd_c
 
     @property
@@ -82,7 +82,7 @@ Closes = Literal['board', 'case']
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
     """
-    What must be seen and what must not; its keys are the calibration file's `detector` section.
+    What the detector must see and what it must ignore; keys of the file's `detector` section.
     """
 
     smallest_ramp_k_min: Annotated[
@@ -102,12 +102,12 @@ class DetectorSettings:
     relaxed_rate_k_min: Annotated[
         float,
         QUANTITIES['ramp'],
-        "The lag has died when every sensor's rate is surely below this, K/min.",
+        "The unit has relaxed when every sensor's rate is surely below this, K/min.",
     ] = 0.05
     dwell_s: Annotated[
         float,
         QUANTITIES['dwell'],
-        'How long it must have been below, and the shortest dynamic state, s.',
+        'Time for which every rate must have been below it, and the shortest dynamic state, s.',
     ] = 60.0
     closes: Annotated[
         Closes,
@@ -140,13 +140,13 @@ class DetectorSettings:
 
 @dataclass(frozen=True)
 class ThermalConfig:
-    """What the user sets of thermometers and sets; ValueError if a value is out of its range."""
+    """Time limits that the user sets; ValueError if a value is out of its range."""
 
-    #: Time over which the sets cross over after a switch [s], stretched where they differ much
+    #: Time over which the sets are blended after a switch [s], longer if they differ much
     #: (`Correction.gentle_transition`); 0 = the paper's hard switch.
     transition_time_s: float = 30.0
-    #: Age of the board temperature at which nothing is published any more [s], and only after
-    #: which a sensor that has taken an impossible step starts anew.
+    #: Age of the board temperature after which nothing is published [s]; a sensor that took an
+    #: impossible step starts anew only after the same time.
     temperature_timeout_s: float = 60.0
     #: Age of the case temperature at which the board decides the regime [s].
     case_timeout_s: float = 30.0

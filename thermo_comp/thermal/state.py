@@ -8,7 +8,7 @@ from typing import Final
 
 from .memory import MemorySpec
 
-#: A memory is called settled when its start-up uncertainty is below this [K].
+#: Sd of every lag below which the memory counts as settled [K].
 MEMORY_SETTLED_SD: Final = 0.05
 
 #: Layout of `ThermalTracker.sample`: from `GRADIENT` on (gradient, variance) per sensor, then
@@ -18,8 +18,8 @@ MEMORY_SETTLED_SD: Final = 0.05
 
 class Layout:
     """
-    Where in a sample what stands: by name each gradient, lag and play; a variance comes behind
-    each gradient and lag. `width` is the length of a sample.
+    Index of each gradient, lag and play in a sample, by name; the variance of a gradient or lag
+    follows it. `width` is the length of a sample.
     """
 
     def __init__(self, spec: MemorySpec) -> None:

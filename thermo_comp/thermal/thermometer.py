@@ -7,8 +7,8 @@ Two Kalman filters of (temperature, rate, acceleration) interact [1]_: *quiet*, 
 acceleration hardly moves (a soak, the middle of a ramp), and *bending*, in which it moves as ramps
 through a thermal lag make it move [2]_ (an onset, an end). The estimate is their mixture,
 and its variance contains their disagreement. A sensor whose quantum exceeds its noise is read
-through its cells: a change of the reading measures the edge between two cells sharply, an
-unchanged one only says that the temperature has not left its cell.
+through its cells: a changed reading measures the edge between two cells sharply, an unchanged
+reading only bounds the temperature by its cell.
 
 References
 ----------
@@ -27,22 +27,21 @@ from typing import Final
 
 from .settings import ThermometerSettings
 
-OUTLIER_SIGMAS: Final = 6.0  # innovations beyond this limit count less ...
-OUTLIER_LIMITS: Final = 5.0  # ... and beyond this many limits not at all ...
-RESTART_READINGS: Final = 4  # ... unless that many in a row lie on one side
+OUTLIER_SIGMAS: Final = 6.0  # innovation limit in sd, beyond which a reading is down-weighted
+OUTLIER_LIMITS: Final = 5.0  # innovation / that limit, beyond which a reading is rejected ...
+RESTART_READINGS: Final = 4  # ... unless this number of outliers in a row lie on one side
 SOAK_S: Final = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
-QUIET_SHARE: Final = 5e-3  # acceleration, quiet / bending, of a sensor without cells
-CELL_SHARE: Final = 0.2  # the same where wide cells hide slow changes
-# Of the normal distribution: 1 / sqrt(2), and 1 / sqrt(2 pi).
-_ROOT_HALF: Final = 0.7071067811865476
-_DENSITY_AT_0: Final = 0.3989422804014327
-#: What is outside, from absolute zero on, is no temperature of an instrument [degC]; nor is NaN.
+QUIET_SHARE: Final = 5e-3  # acceleration, quiet / bending, of a sensor without wide cells
+CELL_SHARE: Final = 0.2  # the same of a sensor whose wide cells hide slow changes
+_ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
+_DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
+#: Range of readings accepted as temperatures [degC]: from absolute zero.
 COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
-HORIZON_INTERVALS: Final = 5.0  # extrapolation is linear up to here, then held
-NOISE_MEMORY: Final = 200.0  # surprises over which the declared noise is judged
+HORIZON_INTERVALS: Final = 5.0  # reading intervals of linear extrapolation; held beyond
+NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor is averaged
 
-# The filters of the two modes are plain floats, written out: a matrix library costs more per call.
+# The filters of the two modes are written out in floats: a matrix library costs more per call.
 State = tuple[float, float, float, float, float, float, float, float, float]
 """Temperature, rate, acceleration; then P00, P01, P02, P11, P12, P22 of their covariance."""
 
@@ -53,12 +52,12 @@ class Thermometer:
     """
     Causal estimate of one sensor's temperature [degC], its rate [K/s] and acceleration [K/s^2].
 
-    They hold at `stamp_ns`, the last used reading's; NaN, with infinite variances, before the
-    first. `changed_ns` is when the reading last changed, `interval_s` the typical interval,
-    `n_in_row` the readings since the last start, `n_restarts` the fresh starts after a gap or a
-    step. `is_ready`: there are two readings, so there is a rate. `measured` and its variance are
-    what the last reading said of the temperature: itself, or its equivalent for a sensor with
-    cells; infinite variance: nothing. `bending` is the probability of that mode.
+    The estimates hold at `stamp_ns`, the stamp of the last used reading; before the first they
+    are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
+    `interval_s`: typical interval; `n_in_row`: readings since the last start; `n_restarts`: starts
+    after a gap or a step; `is_ready`: two readings exist, so a rate does. `measured` and its
+    variance: the last reading, or for a sensor with cells the equivalent Gaussian measurement
+    (infinite variance: no information). `bending`: probability of that mode.
     """
 
     def __init__(self, settings: ThermometerSettings) -> None:
@@ -67,8 +66,8 @@ class Thermometer:
         noise, quantum = settings.noise_sd_c, settings.quantum_c
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
-        self._noise_scale = 1.0  # the square of the noise factor
-        self._n_turns = 8.0  # surprises it rests on
+        self._noise_scale = 1.0  # actual noise variance / declared
+        self._n_turns = 8.0  # number of innovations in it, the prior counting as 8
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s
@@ -80,7 +79,7 @@ class Thermometer:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the readings, as after time has jumped back; what was counted or learnt stays."""
+        """Forget the readings; keep the restart counter and the noise factor."""
         self.stamp_ns: int | None = None
         self.changed_ns: int | None = None
         self.reading = nan
@@ -99,7 +98,7 @@ class Thermometer:
         self._n_strange = 0
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
-        """Take a reading [degC]; False if not used: no temperature, not newer, an outlier."""
+        """Take a reading [degC]; False if not used: not a temperature, not newer, an outlier."""
         if not COLDEST <= reading_c <= HOTTEST:
             return False
         if self.stamp_ns is None:
@@ -114,7 +113,7 @@ class Thermometer:
             self._start(stamp_ns, reading_c)
             return True
 
-        # the modes interact: each starts from its share of both
+        # Interaction: each mode starts from a mixture of both.
         to_bending = dt / (dt + SOAK_S)
         to_quiet = dt / (dt + lag)
         bending = self.bending
@@ -129,7 +128,6 @@ class Thermometer:
         quiet = predict(quiet, dt, lag, self._quiet_power)
         bent = predict(bent, dt, lag, self._bending_power)
 
-        # what the reading says
         apart = bent[0] - quiet[0]
         expected = quiet[0] + prior_bending * apart
         variance = prior_quiet * quiet[3] + prior_bending * (bent[3] + prior_quiet * apart * apart)
@@ -140,12 +138,12 @@ class Thermometer:
         is_turning = surprise * self._surprise < 0.0
         self._surprise = surprise
         if is_turning and not self._has_cells:
-            # Only surprises that change sign are noise; a bend makes a row of one sign.
+            # Only innovations that change sign are noise; a bend makes a run of one sign.
             excess = min(surprise * surprise / spread - 1.0, 8.0)
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
             self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
-        # The usual case first: what is inside the sigmas is inside the limit, which has more.
+        # The cheap test first: the limit is never below OUTLIER_SIGMAS.
         if surprise * surprise > OUTLIER_SIGMAS**2 * spread and abs(surprise) > (
             limit := OUTLIER_SIGMAS * sqrt(spread)
             + 5.0 * self._bend * dt * dt
@@ -168,7 +166,7 @@ class Thermometer:
                 reading_c, expected, variance, rate * dt, bent[6] * dt * dt
             )
 
-        # each mode learns, and is judged by its innovation
+        # Update each mode, and the probability of the bending mode by both innovations.
         if noise < inf:
             quiet, innovation, s = correct(quiet, measured, noise)
             bent, bent_innovation, bent_s = correct(bent, measured, noise)
@@ -185,7 +183,7 @@ class Thermometer:
         self._quiet = quiet
         self._bent = bent
         self.bending = bending
-        # their mixture, but for the acceleration, which is asked for rarely
+        # The mixture; its acceleration is computed only when read.
         t, v, _, p00, p01, _, p11, _, _ = quiet
         apart, dv = bent[0] - t, bent[1] - v
         both = bending * (1.0 - bending)
@@ -222,7 +220,7 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # The rate is not known to hold, and a ramp may begin that nobody sees.
+            # Beyond the horizon the rate may not hold, and an unseen ramp may begin.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
@@ -231,7 +229,7 @@ class Thermometer:
         return self.temperature + dt * rate, rate, variance + unknown
 
     def beyond(self, stamp_ns: int) -> float:
-        """Say how far a stamp lies beyond what is extrapolated to [s]; 0 within."""
+        """Return the time from the extrapolation horizon to a stamp [s]; 0 within the horizon."""
         if self.stamp_ns is None or not self.is_ready:
             return 0.0
         ahead = (stamp_ns - self.stamp_ns) * 1e-9
@@ -261,12 +259,12 @@ class Thermometer:
     def _cell(
         self, reading: float, expected: float, variance: float, move: float, var_move: float
     ) -> tuple[float, float]:
-        """Turn a quantized reading into the Gaussian measurement that it amounts to."""
+        """Turn a quantized reading into an equivalent Gaussian measurement and its variance."""
         half = 0.5 * self._quantum
         noise = self._noise
         if variance < 4.0 * noise:
-            # The prior is narrower than the noise: matching the moments of the prior cut to the
-            # cell is accurate, and readings that flicker about an edge locate it.
+            # The prior is narrower than the noise: match the moments of the prior truncated to the
+            # cell, so that readings that flicker about an edge locate it.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
@@ -287,8 +285,8 @@ class Thermometer:
         if jump > half:
             edge = 0.5 * (reading + self.reading) + 0.5 * move
             return edge, min(noise + (move * move + 4.0 * var_move) / 12.0, self._flat)
-        # Unchanged. Saying so twice tells nothing new: the cell bounds the variance, and its
-        # edges hold back an estimate that would leave it, once per time it takes to move a sd.
+        # A repeated reading holds no new information: the cell only bounds the variance, and its
+        # edges hold back an estimate that leaves it, once per time in which it moves by one sd.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))
@@ -366,8 +364,8 @@ def predict(state: State, dt: float, lag: float, power: float) -> State:
 
 def correct(state: State, measured: float, variance: float) -> tuple[State, float, float]:
     """
-    Let a state learn from a temperature [degC] of known variance [K^2]; give it, the innovation
-    [K] and the variance of this.
+    Update a state with a temperature [degC] of known variance [K^2]; return the new state, the
+    innovation [K] and its variance.
     """
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     spread = p00 + variance

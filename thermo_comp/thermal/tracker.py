@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the thermal state of a unit at any stamp: its thermometers, regime, memory, cross-over.
+Owns the thermal state of a unit at any stamp: its thermometers, regime, memory, set weight.
 
-The compensator, the fit and the report all run this one class, so a regressor means the same
-when it is fitted as when it is applied. It is causal and has no clock: readings go in by stamp,
-a state comes out for a stamp. What it remembers is `memory`'s.
+The compensator, the fit and the report all run this class, so a regressor means the same when it
+is fitted and when it is applied. It is causal and has no clock: readings enter with a stamp, a
+state is returned for a stamp.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from .settings import DetectorSettings, ThermalConfig
 from .state import GRADIENT, MEMORY_SETTLED_SD, VAR_BOARD, VAR_GRADIENT, Layout
 from .thermometer import Thermometer
 
-#: While a sensor is lost its gradient is guessed from the board's rate, this well.
+#: Relative sd of the gradient estimated from the board's rate while a sensor is lost.
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
-#: A regime that no sensor has watched for this part of a thermal lag is not known any more.
+#: Time without a reading / thermal lag, after which the regime is unknown.
 UNWATCHED_SHARE: Final = 0.25
 
 
@@ -43,12 +43,11 @@ class ThermalTracker:
         self.board = Thermometer(detector.board)
         beside = {name: Thermometer(detector.case) for name in self.spec.sensors}
         self.thermometers = {BOARD_INPUT: self.board, **beside}
-        #: The first of those beside the board: it leads.
+        #: The leading sensor: the first one beside the board.
         self.case = beside[self.spec.sensors[0]]
-        #: What is wrong with each thermometer.
         self.checks = {
             BOARD_INPUT: SensorCheck(self.board, self.case, board_lag_s),
-            **{name: SensorCheck(one, self.board, 0.0) for name, one in beside.items()},
+            **{name: SensorCheck(sensor, self.board, 0.0) for name, sensor in beside.items()},
         }
         self.memory = ThermalMemory(self.spec)
         #: Stamp of the newest reading that was used, None before the first.
@@ -65,10 +64,10 @@ class ThermalTracker:
 
     def _configure(self, config: ThermalConfig, board_lag_s: float) -> None:
         self.config = config
-        #: The board's time constant behind the case [s], for the gradient while this is lost.
+        #: Lag of the board behind the case [s], for the gradient while the case is lost.
         self._board_lag_s = board_lag_s
         self._case_timeout_s = config.case_timeout_s
-        #: How long nobody may have watched before the regime is not known any more [s].
+        #: Time without a decision after which the regime is unknown [s].
         lag_s, longest_s = (
             self.settings.case.lag_s,
             max(self.settings.case.lag_s, self.settings.board.lag_s),
@@ -76,25 +75,24 @@ class ThermalTracker:
         self._unwatched_s = min(max(UNWATCHED_SHARE * lag_s, config.case_timeout_s), longest_s)
 
     def reconfigure(self, config: ThermalConfig, board_lag_s: float, stamp_ns: int | None) -> None:
-        """Take over another configuration from a stamp on, without a step in the weight."""
+        """Use another configuration from a stamp on, without a step in the weight."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
         self._configure(config, board_lag_s)
-        # A check that another tracker has, too, stays as it is.
+        # Copy: another tracker may share this check.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
     def is_live(self, stamp_ns: int, sensor: Thermometer) -> bool:
-        """Whether a sensor is there and fresh enough at a stamp."""
+        """Whether a sensor has a reading that is fresh enough at a stamp."""
         seen_ns = sensor.stamp_ns
         return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self._case_timeout_s
 
     def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
         """
-        Take one reading [degC] of ``'board'`` or of a sensor, the leading one of which decides the
-        regime; False for one that is not finite, not newer than the last, an outlier, or not
-        plausible.
+        Take a reading [degC] of ``'board'`` or of a sensor; the leading sensor's readings decide
+        the regime. False if it was not used: not finite, not newer, an outlier, not plausible.
         """
         sensor, check = self.thermometers[name], self.checks[name]
         if not self._use(name, sensor, check, stamp_ns, celsius):
@@ -108,7 +106,7 @@ class ThermalTracker:
         if sensor is self.case:
             self.checks[BOARD_INPUT].watch_other()
             if check.fault is not Fault.STILL or self.detector.regime is not Regime.DYNAMIC:
-                # One that stands still does not tell that a ramp has ended.
+                # A sensor that stands still does not prove that a ramp has ended.
                 self._decide(stamp_ns, sensor)
             self.lead.update(self.detector.regime is Regime.STATIC)
         return True
@@ -122,7 +120,7 @@ class ThermalTracker:
                 if sensor is board or not bank.taus or bank.stamp_ns is None:
                     continue
                 if not self.is_live(stamp_ns, sensor):
-                    # The lags of a gradient go on while its sensor is lost.
+                    # The lags of a gradient continue while its sensor is lost.
                     gradient, variance = self._lost_gradient(stamp_ns, board.rate)
                     bank.step(stamp_ns, gradient, sqrt(variance))
         for name in self.spec.sensors:
@@ -133,11 +131,11 @@ class ThermalTracker:
     def _use(
         self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
-        """Let a thermometer have a reading; the memory doubts a jump, and forgets over a gap."""
+        """Update a thermometer; a jump adds to the memory's variance, a gap resets it."""
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
-            # One that has stayed for long where it cannot have come to begins again.
+            # A sensor that stays long enough after an impossible step starts again.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             is_board = sensor is self.board
             patience_s = self.config.temperature_timeout_s if is_board else self._case_timeout_s
@@ -167,7 +165,7 @@ class ThermalTracker:
         board = self.board if self.board.stamp_ns is not None else None
         decided_ns, self._decided_ns = self._decided_ns, stamp_ns
         if decided_ns is not None and (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s:
-            # Nobody has seen whether a ramp began or ended meanwhile.
+            # A ramp may have begun or ended unseen.
             self._begin_watch()
         regime = self.detector.update(stamp_ns, case, board)
         target = 1.0 if regime is Regime.DYNAMIC else 0.0
@@ -177,7 +175,7 @@ class ThermalTracker:
             self._target = target
 
     def weight_at(self, stamp_ns: int) -> float:
-        """Weight of the dynamic set at a stamp, moving linearly over the transition time."""
+        """Weight of the dynamic set at a stamp; it changes linearly over the transition time."""
         if self._weight == self._target:
             return self._target
         duration = self.config.transition_time_s
@@ -191,7 +189,7 @@ class ThermalTracker:
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
         """
         Thermal state at a stamp as a flat tuple, in the order of `state.Layout`; the board must
-        have been read at least once.
+        have at least one reading.
 
         Board temperature [degC], its variance [K^2], its rate [K/s], weight, 1.0 while the regime
         is unknown; (gradient [K], variance from the sensor's side [K^2]) per sensor; (lag [K],
@@ -227,16 +225,16 @@ class ThermalTracker:
         for place, name in enumerate(self.spec.sensors):
             state[VAR_GRADIENT + 2 * place] += self.checks[name].doubt(stamp_ns)
         if self.lead.is_reversed:
-            # What is called the case may be the board.
+            # The topics of case and board may be swapped.
             state[VAR_BOARD] += state[GRADIENT] * state[GRADIENT]
         else:
             state[VAR_BOARD] += self.lead.doubt
 
     def _lost_gradient(self, stamp_ns: int, rate: float) -> tuple[float, float]:
-        """Guess a gradient from the board's rate, while its sensor is lost."""
+        """Estimate a gradient from the board's rate, while its sensor is lost."""
         lag = self._board_lag_s
         gradient = lag * rate
-        # Nor has anybody seen what the case did since the board was last read.
+        # Movement of the case since the last board reading, which no sensor has seen.
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (
             (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2
@@ -246,7 +244,7 @@ class ThermalTracker:
         return gradient, variance
 
     def is_settled(self, stamp_ns: int) -> bool:
-        """Whether the memory has forgotten that its start was not seen."""
+        """Whether the start, which was not seen, no longer matters to the memory."""
         layout = Layout(self.spec)
         extra = self.sample(stamp_ns)[layout.first_lag + 1 : layout.first_play : 2]
         start = start_covariance(self.spec.lags).diagonal().tolist()

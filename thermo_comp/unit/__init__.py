@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what is known of one unit: its calibration, the file of it, and the correction it gives."""
+"""Owns one unit's calibration: the value, its file, and the correction computed from it."""

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the Calibration value: everything that is known about one unit, validated as a whole.
+Owns the Calibration value of one unit, validated as a whole.
 
-The dataclasses mirror the calibration file key by key. One object is one unit; it is immutable,
-so a running node swaps it by one reference.
+The dataclasses mirror the calibration file key by key. The object is immutable, so a running node
+replaces it by one assignment.
 
 Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
-(0..1), and phi_j the columns of the response (`columns`), common to both sets (Eq. (6) to
-(9), and beyond the paper the response)::
+(0..1), and phi_j the columns of the thermal response (`columns`), common to both sets (Eq. (6) to
+(9) of the paper; the response is an addition to it)::
 
     bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
     scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
@@ -41,10 +41,10 @@ if TYPE_CHECKING:
 
     from .. import Corrected, Temperature
 
-#: The version of the file's layout that this code writes.
+#: Version of the file's layout that this code reads and writes.
 FORMAT_VERSION = 2
 AXES = ('x', 'y', 'z')
-#: The model of a calibration that stands for a type of unit: a prior.
+#: `provenance.model` of a calibration that describes a type of unit and serves as a prior.
 POPULATION = 'population'
 
 Celsius = Annotated[float, QUANTITIES['temperature']]
@@ -61,7 +61,7 @@ Input = Literal['counts', 'm/s^2']
 
 @dataclass(frozen=True)
 class Unit:
-    """What is calibrated, and in which unit it speaks."""
+    """The calibrated unit and its raw samples."""
 
     serial: Annotated[Serial, 'Serial number of the unit, one printable line.']
     input: Annotated[Input, 'Unit of the raw samples: counts per conversion cycle, or m/s^2.']
@@ -113,7 +113,7 @@ class AxisSet:
     scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
     delta: Annotated[float, 'Bias of this regime relative to axes.bias, input units.'] = 0.0
     residual_sd_m_s2: Annotated[
-        float, QUANTITIES['deviation'], 'What it leaves unexplained, as a slow error.'
+        float, QUANTITIES['deviation'], 'Standard deviation of the residual, a slow error.'
     ] = 0.0
 
     def __post_init__(self) -> None:
@@ -123,7 +123,7 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """What a set misses near one board temperature, as a slow error beside all that is claimed."""
+    """Lack of fit of a set at a board temperature, a slow error in addition to the posterior's."""
 
     temperature_c: Annotated[Celsius, 'Board temperature [degC].']
     sd_m_s2: Annotated[tuple[_Error, _Error, _Error], 'Standard deviation of each axis.']
@@ -143,8 +143,8 @@ class RegimeSet:
     z: AxisSet
     lack_of_fit: Annotated[
         tuple[LackOfFit, ...],
-        'What left-out data show beyond the claim: linear in variance between the temperatures, '
-        'held outside.',
+        'Error of left-out data in excess of the posterior: variance linear between the '
+        'temperatures, held outside.',
     ] = ()
 
     def __post_init__(self) -> None:
@@ -153,11 +153,11 @@ class RegimeSet:
             temperature_range_c=QUANTITIES['temperature span'],
             rate_range_k_min=QUANTITIES['rate span'],
         )
-        at = [one.temperature_c for one in self.lack_of_fit]
+        at = [point.temperature_c for point in self.lack_of_fit]
         for k, (before, after) in enumerate(pairwise(at)):
             if not before < after:
                 raise ValueError(
-                    f'`lack_of_fit[{k + 1}].temperature_c` must be above the one before '
+                    f'`lack_of_fit[{k + 1}].temperature_c` must be above the previous entry '
                     f'({before:g}), got {after:g}'
                 )
 
@@ -176,18 +176,18 @@ class ResponseTerm(Column):
 
 @dataclass(frozen=True)
 class GroupEvidence:
-    """What one group of columns is worth to the data it was fitted on."""
+    """Contribution of one group of columns to the fit."""
 
     group: Annotated[str, 'The group, as in `response`.']
-    part: Annotated[Literal['bias', 'scale'], 'Which of the two it corrects.']
-    explains_m_s2: Annotated[_Error, 'RMS of what it explains.']
+    part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
+    explains_m_s2: Annotated[_Error, "RMS of the group's correction."]
     effective_parameters: Annotated[
-        float, QUANTITIES['number'], 'How many of its weights the data determine.'
+        float, QUANTITIES['number'], 'Effective number of weights determined by the data.'
     ]
     log_evidence_change: Annotated[
-        float, QUANTITIES['log evidence'], 'By how much the log evidence falls without it.'
+        float, QUANTITIES['log evidence'], 'Loss of log evidence without the group.'
     ]
-    prior_sd: Annotated[tuple[_WeightSd, ...], 'Sd of its weights before the data were seen.']
+    prior_sd: Annotated[tuple[_WeightSd, ...], "Prior sd of the group's weights."]
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class Source:
 
 @dataclass(frozen=True)
 class ResidualSummary:
-    """|g| error of one section of the fitted data, before and after."""
+    """|g| error over one section of the fitted data, before and after correction."""
 
     section: str
     n_windows: _Number
@@ -209,7 +209,7 @@ class ResidualSummary:
     rms_m_s2: _Error
     max_m_s2: _Error
     left_out_rms_m_s2: Annotated[
-        _Error | None, 'On each position by what the others say of the unit; null if unknown.'
+        _Error | None, 'On each position by a fit to the others (leave one out); null if unknown.'
     ] = None
 
 
@@ -227,13 +227,15 @@ class Provenance:
     @property
     def left_out_rms(self) -> float:
         """RMS of ``|f| - g`` on positions left out of the fit [m/s^2]; NaN where unknown."""
-        found = [one.left_out_rms_m_s2 for one in self.residuals if one.section == 'all']
-        return math.nan if not found or found[0] is None else found[0]
+        values = [
+            summary.left_out_rms_m_s2 for summary in self.residuals if summary.section == 'all'
+        ]
+        return math.nan if not values or values[0] is None else values[0]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """One unit's calibration; parts that contradict each other are a ValueError."""
+    """One unit's calibration; ValueError if parts contradict each other."""
 
     format_version: Annotated[int, f'Version of this layout: {FORMAT_VERSION}.']
     unit: Unit
@@ -244,18 +246,18 @@ class Calibration:
     dynamic: Annotated[RegimeSet, 'The set of the dynamic regime, S = 1.']
     noise_density_m_s2_sqrt_hz: Annotated[
         tuple[_Density, _Density, _Density],
-        'White noise of each axis; of a sample density^2 / cycle, and rounding.',
+        'White noise of each axis; variance of a sample = density^2 / cycle, plus rounding.',
     ]
     slow_noise_m_s2_sqrt_h: Annotated[
         tuple[_Slow, _Slow, _Slow], 'Random walk of the bias of each axis, per root hour.'
     ] = (0.0, 0.0, 0.0)
     misalignment: Annotated[
         tuple[Vector, Vector, Vector],
-        'M: lower triangular, unit diagonal; sensitivity axes to frame.',
+        'M, from sensitivity axes to the frame: lower triangular, unit diagonal.',
     ] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     misalignment_sd: Annotated[
         tuple[_Tilt, _Tilt, _Tilt],
-        'Deviations of M[1][0], M[2][0], M[2][1], where there is no `posterior`.',
+        'Standard deviations of M[1][0], M[2][0], M[2][1], used if `posterior` is null.',
     ] = (0.0, 0.0, 0.0)
     sensors: Annotated[
         tuple[str, ...], 'Thermometers beside the board; the first one leads in a ramp.'
@@ -266,18 +268,18 @@ class Calibration:
     board_lag_s: Annotated[
         float,
         QUANTITIES['time constant'],
-        'Lag of T_board behind T_case; times the rate it is the gradient of a lost case.',
+        'Lag of T_board behind T_case; while the case is lost, gradient = lag * dT_board/dt.',
     ] = 900.0
     detector: Annotated[DetectorSettings, 'The thermometers and the regime detector.'] = field(
         default_factory=DetectorSettings
     )
     provenance: Provenance = Provenance()
-    evidence: Annotated[tuple[GroupEvidence, ...], 'What each group of columns is worth.'] = ()
+    evidence: Annotated[tuple[GroupEvidence, ...], 'Contribution of each group of columns.'] = ()
     posterior: Annotated[
         Posterior | None, 'Covariance of all parameters; null where it is unknown.'
     ] = None
     gyroscope: Annotated[
-        Gyroscope | None, 'Bias of the angular rate that comes with the samples; null: unknown.'
+        Gyroscope | None, "Bias of the unit's gyroscope; null: the angular rate is not corrected."
     ] = None
 
     def __post_init__(self) -> None:
@@ -289,7 +291,7 @@ class Calibration:
         self._check_reach()
 
     def _check_axes(self) -> None:
-        # Words with an offset have it in the bias, at half their range.
+        # Samples in an offset code have a bias of half their range.
         farthest = FULL_SCALES * self.unit.full_scale
         force = QUANTITIES['full-scale force']
         for name, axis in zip(AXES, self.axes, strict=True):
@@ -332,12 +334,14 @@ class Calibration:
                     )
 
     def _check_reach(self) -> None:
-        """Check what hangs on full scale and temperatures: curves, columns, the posterior."""
-        own, full_scale = self.gyroscope, self.unit.full_scale
-        terms = [Term(one, one.bias, one.scale) for one in self.response]
-        of_rate = [Term(one, one.bias, (0.0,) * 3) for one in own.response] if own else []
+        """Check curves, columns and posterior against full scale and temperature ranges."""
+        gyroscope, full_scale = self.gyroscope, self.unit.full_scale
+        terms = [Term(term, term.bias, term.scale) for term in self.response]
+        of_rate = (
+            [Term(term, term.bias, (0.0,) * 3) for term in gyroscope.response] if gyroscope else []
+        )
         reference = self.reference_temperature_c
-        all_edges = [edge for one in self.regime_sets() for edge in one.temperature_range_c]
+        all_edges = [edge for part in self.regime_sets() for edge in part.temperature_range_c]
         for regime, part in zip(('static', 'dynamic'), self.regime_sets(), strict=True):
             edges = part.temperature_range_c
             reach = Reach(edges, all_edges, reference, FULL_SCALES * full_scale)
@@ -348,10 +352,12 @@ class Calibration:
                 level = at.bias + axis.delta
                 reach.check_bias(f'{regime}.{name}', level, axis.bias_function)
             reach.check_terms('response', terms)
-            if own:
+            if gyroscope:
                 reach = Reach(edges, all_edges, reference, FULL_SCALES * LARGEST_RATE)
-                curves = own.static if regime == 'static' else own.dynamic
-                for name, at_rest, curve in zip(AXES, own.bias_rad_s, curves.axes(), strict=True):
+                curves = gyroscope.static if regime == 'static' else gyroscope.dynamic
+                for name, at_rest, curve in zip(
+                    AXES, gyroscope.bias_rad_s, curves.axes(), strict=True
+                ):
                     key = f'gyroscope.{regime}.{name}'
                     reach.check_bias(key, at_rest + curve.delta, curve.bias_function)
                 reach.check_terms('gyroscope.response', of_rate)
@@ -360,7 +366,7 @@ class Calibration:
     def _check_posteriors(self, terms: list[Term], of_rate: list[Term]) -> None:
         reference = self.reference_temperature_c
         static, dynamic = (
-            [edge - reference for edge in one.temperature_range_c] for one in self.regime_sets()
+            [edge - reference for edge in part.temperature_range_c] for part in self.regime_sets()
         )
         if self.posterior is not None:
             layout = parameter_layout(self)
@@ -373,19 +379,19 @@ class Calibration:
                 most = LARGEST_RELATIVE_SCALE
                 blocks.append((scale, (a.scale_function, b.scale_function), most))
             check_posterior('posterior.factor', self.posterior, blocks, (static, dynamic), terms)
-        own = self.gyroscope
-        if own is not None and own.posterior is not None:
-            axes_of_rate = zip(own.static.axes(), own.dynamic.axes(), strict=True)
+        gyroscope = self.gyroscope
+        if gyroscope is not None and gyroscope.posterior is not None:
+            axes_of_rate = zip(gyroscope.static.axes(), gyroscope.dynamic.axes(), strict=True)
             pairs = [(a.bias_function, b.bias_function) for a, b in axes_of_rate]
-            laid_out = zip(lay_out(pairs, len(own.response)), pairs, strict=True)
+            laid_out = zip(lay_out(pairs, len(gyroscope.response)), pairs, strict=True)
             of_bias = [(block, pair, FULL_SCALES * LARGEST_RATE) for block, pair in laid_out]
             key = 'gyroscope.posterior.factor'
-            check_posterior(key, own.posterior, of_bias, (static, dynamic), of_rate)
+            check_posterior(key, gyroscope.posterior, of_bias, (static, dynamic), of_rate)
 
     def correct(
         self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any
     ) -> Corrected:
-        """Correct arrays of samples: `thermo_comp.correct` says what it takes, and gives."""
+        """Correct arrays of samples; arguments and result are those of `thermo_comp.correct`."""
         from .. import correct
 
         return correct(self, time_s, counts, board=board, **others)
@@ -396,29 +402,29 @@ class Calibration:
 
     @property
     def needs_temperature(self) -> bool:
-        """Whether temperature changes what it says; else it is constants, of the reference."""
+        """Whether the correction depends on temperature; if not, it is constant."""
         weights: list[float] = []
-        for axis in (one for part in self.regime_sets() for one in part.axes()):
+        for axis in (axis for part in self.regime_sets() for axis in part.axes()):
             weights += (axis.delta, *axis.bias_function.free_coefficients)
             weights += axis.scale_function.free_coefficients
-        own = self.gyroscope
-        for rate in (*own.static.axes(), *own.dynamic.axes()) if own else ():
+        gyroscope = self.gyroscope
+        for rate in (*gyroscope.static.axes(), *gyroscope.dynamic.axes()) if gyroscope else ():
             weights += (rate.delta, *rate.bias_function.free_coefficients)
-        return any(weights) or bool(self.response or (own and own.response))
+        return any(weights) or bool(self.response or (gyroscope and gyroscope.response))
 
     @property
     def needs_case(self) -> bool:
-        """Whether it was fitted with a case thermometer, or has columns made of its readings."""
-        own = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
+        """Whether it was fitted with a case thermometer, or has columns computed from it."""
+        columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
         return self.detector.case != ThermometerSettings() or any(
-            one.kind in {'now', 'neighbour', 'size', 'even'}
-            or (one.kind == 'square' and not one.tau_s)
-            for one in own
+            column.kind in {'now', 'neighbour', 'size', 'even'}
+            or (column.kind == 'square' and not column.tau_s)
+            for column in columns
         )
 
     @property
     def has_uncertainty(self) -> bool:
-        """Whether it says anything of how well it is known; else it claims nothing."""
+        """Whether it holds any uncertainty; without it no uncertainty can be stated."""
         return (
             self.posterior is not None
             or any(self.misalignment_sd)
@@ -428,7 +434,7 @@ class Calibration:
 
 
 def parameter_layout(calibration: Calibration) -> ParameterLayout:
-    """Say where each parameter of a calibration stands in its posterior."""
+    """Return the index of each parameter of a calibration in its posterior."""
     axes = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     pairs: list[tuple[TemperatureFunction, TemperatureFunction]] = []
     for static, dynamic in axes:

@@ -3,8 +3,8 @@
 """
 Owns the calibration file: YAML to a validated Calibration and back.
 
-Any bytes at all give a Calibration or a CalibrationError that names file and key: size, nesting
-and YAML features are bounded before anything is built (no aliases, tags or duplicate keys).
+Any bytes give a Calibration or a CalibrationError that names file and key: size, nesting and YAML
+features are limited before anything is built (no aliases, tags or duplicate keys).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from ..plain_yaml import PlainYamlError, is_plain_text, load_plain_yaml
 from .calibration import FORMAT_VERSION, Calibration
 from .schema import SchemaError, build, fields_of, plain
 
-#: With the whole bank of columns and one thermometer beside the board a calibration takes some
-#: 900 kB, nearly all of it the posterior; this is enough for two of them.
+#: Largest calibration file [bytes]. A calibration with all columns of the bank takes about 900 kB
+#: with one thermometer beside the board, nearly all of it the posterior; with two it fits, too.
 SIZE_LIMIT = 1 << 23
 
 
@@ -53,7 +53,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
     missing = [key for key in fields_of(Calibration)[1] if key not in data]
     rule = f'not a calibration: the key `{missing[0]}` is missing' if missing else None
     version = data.get('format_version')
-    # Before the keys are looked at: those of another version would be called unknown.
+    # Checked before the keys: keys of another version would be reported as unknown.
     if type(version) is int and version != FORMAT_VERSION:
         advice = 'a newer release wrote it; update thermo_comp'
         if version < FORMAT_VERSION:
@@ -67,7 +67,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
 
 
 def dump_calibration(calibration: Calibration) -> str:
-    """Write a Calibration as YAML text; CalibrationError if that would not be read as the same."""
+    """Write a Calibration as YAML text; CalibrationError if reading it gives another value."""
     text: str = yaml.dump(
         plain(calibration),
         Dumper=_Dumper,
@@ -93,7 +93,7 @@ def save_calibration(
     Write a calibration file atomically.
 
     Raises CalibrationError if the value is not valid. Raises OutputError if the file may not or
-    cannot be written; an old one is then untouched.
+    cannot be written; an existing file then stays as it was.
     """
     text = dump_calibration(calibration)
     write_atomically(path, text.encode(), CALIBRATION, overwrite=overwrite)
@@ -103,14 +103,14 @@ _BASE: type[yaml.SafeDumper] = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
 class _Dumper(_BASE):  # type: ignore[valid-type, misc]
-    """Writes every number so that this reader and any YAML 1.1 reader see the same float."""
+    """Writes numbers so that this reader and any YAML 1.1 reader see the same float."""
 
     def ignore_aliases(self, _data: Any) -> bool:
         return True
 
 
 def _represent_str(dumper: yaml.SafeDumper, value: str) -> yaml.ScalarNode:
-    # A text that one of the two YAML versions would take for a number is quoted: '1e5', 'no'.
+    # Quote text that YAML 1.1 or 1.2 reads as another type: '1e5', 'no'.
     style = None if is_plain_text(value) else "'"
     return dumper.represent_scalar('tag:yaml.org,2002:str', value, style=style)
 

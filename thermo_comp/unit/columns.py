@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the columns of the thermal response: what there is to regress bias and scale on.
+Owns the columns of the thermal response: the regressors of bias and scale.
 
 With ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s, ``L_tau(u)`` the first-order
 lag of u, ``P_r(v)`` the play of half-width r on v, and w the weight of the dynamic regime:
@@ -22,8 +22,9 @@ play       P_r(v) - v, v = t or        rate-independent hysteresis
            v = L_tau(t)
 =========  ==========================  ====================================================
 
-Even is what does not ask for the direction of a change, so ``q_s = g_s - rest``: less what g_s is
-at rest, where the board's own heat makes it warmer than the case, in *change*, and g_s in *even*.
+Kinds *even* and *size* have the same value for heating and cooling. They are computed from ``q_s =
+g_s - rest``: rest is 0 in the group *even*, and in the group *change* the gradient at rest, where
+the board's own heat makes it warmer than the case.
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u held at the edges of the column's range
 and t at those of the calibrated temperatures. Curves go on along their tangent beyond them, the
@@ -33,8 +34,8 @@ tells how a coefficient that changes with temperature goes on.
 The groups of the bank are its kinds; *product* and *mixed* are board, and now and neighbour, of a
 power: coefficients that change with temperature.
 
-This is the one table of columns: tracker, fit, correction, covariance and file take theirs from
-here, so that another regressor is an entry of `bank` and, if it is of a new kind, of `_FORMS`.
+Tracker, fit, correction, covariance and file use this table. A new regressor is an entry of `bank`
+and, if its kind is new, of `_FORMS`.
 """
 
 from __future__ import annotations
@@ -53,14 +54,14 @@ from ..typing import Floats
 from .functions import by_element, hold
 from .schema import check_ranges
 
-#: A range that holds nothing back, of any value.
+#: A column range that limits no value.
 UNBOUNDED: Final = (-1e9, 1e9)
-#: Lag of a board behind its case where bags do not tell it [s]: some 15 min, typical of a housing
-#: of some hundred grams in a chamber.
+#: Lag of a board behind its case if the bags do not determine it [s]: 15 min, typical of a housing
+#: of a few hundred grams in a chamber.
 USUAL_BOARD_LAG_S: Final = 900.0
-#: Time constants of the bank: from a few readings to the longest memory that bags can show [s].
-#: Lags themselves are fine enough for one of 100 ug/K between two of them; their products are not
-#: so large, and take every other.
+#: Time constants of the bank [s], in ratios of sqrt(2), from a few readings to the longest memory
+#: that bags show. Linear lags use all of them, so that a part of 100 ug/K with a time constant
+#: between two of them is matched; products and powers, which are smaller, use every other.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
 #: Widths of the even columns [K], half-widths of the plays [K], and the lags that they follow [s].
@@ -89,7 +90,7 @@ class Column:
             'change',
             'play',
         ],
-        'What evidence judges together.',
+        'Group of columns that the fit keeps or drops together.',
     ]
     kind: Annotated[
         Literal['now', 'rate', 'board', 'neighbour', 'square', 'cube', 'size', 'even', 'play'],
@@ -97,7 +98,7 @@ class Column:
         'lag; (T - lagged T)^3; abs(q_s); tanh((q_s / width)^2); play of t minus t, where '
         'g_s = T_s - T_board and q_s = g_s - rest_k.',
     ]
-    sensor: Annotated[str, 'Which further thermometer g_s is of.'] = 'case'
+    sensor: Annotated[str, 'The thermometer s of g_s.'] = 'case'
     tau_s: Annotated[
         float,
         QUANTITIES['lag'],
@@ -105,14 +106,12 @@ class Column:
     ] = 0.0
     width_k: Annotated[float, QUANTITIES['width'], 'Width of even, half-width of play.'] = 0.0
     rest_k: Annotated[
-        float,
-        QUANTITIES['gradient'],
-        'What g_s is at rest, for even, size and square without lag.',
+        float, QUANTITIES['gradient'], 'g_s at rest, for even, size and square without lag.'
     ] = 0.0
     power: Annotated[int, QUANTITIES['power'], 'The value is multiplied by t to this power.'] = 0
     during: Annotated[
         Literal['always', 'static', 'dynamic'],
-        'always, or multiplied by 1 - w (static) or by w (dynamic), w = weight of the regime.',
+        'always, or multiplied by 1 - w (static) or w (dynamic), w = weight of the dynamic set.',
     ] = 'always'
     range: Annotated[
         tuple[_Value, _Value],
@@ -129,26 +128,26 @@ class Column:
 
     @property
     def is_of_sensor(self) -> bool:
-        """Whether the value is made of `sensor`, now or before."""
+        """Whether the value is computed from readings of `sensor`."""
         is_loss = self.kind == 'square' and not self.tau_s
         return is_loss or self.kind in ('now', 'neighbour', 'even', 'size')
 
     @property
     def lag(self) -> tuple[str, float] | None:
-        """Which lag of the memory the value is, or follows: input and time constant [s]."""
+        """The lag that the value is computed from: input and time constant [s]; None if none."""
         if self.kind == 'neighbour':
             return self.sensor, self.tau_s
         return (BOARD_INPUT, self.tau_s) if self.tau_s and self.kind != 'even' else None
 
     @property
     def order(self) -> int:
-        """Which power of the temperatures the value grows with, before t multiplies it."""
+        """Power of temperature in the value, not counting the factor t^power."""
         return {'square': 2, 'cube': 3}.get(self.kind, 1)
 
     def steepest(self, raw: Floats, flow_k: float) -> float:
         """
-        Return the steepest slope [1/K] that values before powers of t had by the temperature
-        difference they are made of; one without unit by the RMS of the gradient, `flow_k` [K].
+        Return the largest slope [1/K] of values `raw` (without t^power) with respect to their
+        temperature difference; for a dimensionless value by the RMS of the gradient, `flow_k` [K].
         """
         if self.kind == 'even':
             return 1.0 / flow_k
@@ -162,8 +161,8 @@ def bank(
     sensors: Sequence[str] = ('case',), at_rest: Mapping[str, float] | None = None
 ) -> tuple[Column, ...]:
     """
-    Return all columns that a response may have, none held to a range yet; `at_rest` is what the
-    gradient of each sensor is there [K].
+    Return all columns that a response may have, without limits of range; `at_rest` is the gradient
+    of each sensor at rest [K].
     """
     now = [Column('now', 'now', sensor, range=UNBOUNDED) for sensor in sensors]
     board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in FINE_TAUS]
@@ -174,13 +173,15 @@ def bank(
     ]
     coarse = [column for column in board if column.tau_s in BANK_TAUS]
     flow = [*now, *(column for column in neighbour if column.tau_s in BANK_TAUS)]
-    product = [replace(one, group='product', power=power) for power in (1, 2) for one in coarse]
+    product = [
+        replace(column, group='product', power=power) for power in (1, 2) for column in coarse
+    ]
     mixed = [replace(column, group='mixed', power=1) for column in flow]
-    # A part's own curve bends over its own temperature t - m: (t - m)^2 = t^2 - 2 t m + m^2, and
-    # (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
-    square = [replace(one, group='square', kind='square') for one in coarse]
-    square += [replace(one, power=1) for one in square]
-    square += [replace(one, group='square', kind='cube') for one in coarse]
+    # The bias of a part that lags the board by m is a polynomial in its temperature t - m:
+    # (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
+    square = [replace(column, group='square', kind='square') for column in coarse]
+    square += [replace(column, power=1) for column in square]
+    square += [replace(column, group='square', kind='cube') for column in coarse]
     even = [
         Column('even', 'even', sensor, width_k=width, power=power, range=(0.0, 1.0))
         for sensor in sensors
@@ -193,12 +194,12 @@ def bank(
         for kind in ('size', 'square')
         for power in (0, 1, 2)
     ]
-    # A heat pump's load is even in the flow of heat, what a change does is even about rest.
+    # A heat pump's load is even in the heat flow; the effect of a change is even about rest.
     rest = at_rest or {}
     even += [
-        replace(one, group='change', rest_k=rest[one.sensor])
-        for one in even
-        if rest.get(one.sensor)
+        replace(column, group='change', rest_k=rest[column.sensor])
+        for column in even
+        if rest.get(column.sensor)
     ]
     play = [
         Column('play', 'play', tau_s=tau, width_k=width, range=UNBOUNDED)
@@ -209,7 +210,7 @@ def bank(
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
-    """Find what a tracker must remember for some columns, ValueError if a sensor is missing."""
+    """Return the memory that columns need of a tracker; ValueError if a sensor is missing."""
     lags: set[tuple[str, float]] = set()
     plays: set[tuple[float, float]] = set()
     for column in columns:
@@ -227,7 +228,7 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
     )
 
 
-#: What a value is made of: its form and slope, of x = number of the state / width.
+#: Form of a value and its derivative, as functions of x = number of the state / width.
 _FORMS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
     'line': (lambda x: x, np.ones_like),
     'square': (lambda x: x * x, lambda x: 2.0 * x),
@@ -243,9 +244,9 @@ _DURING: Final = ('always', 'static', 'dynamic')
 
 class ColumnTable:
     """
-    Columns, ready to be evaluated over states, shape (width, n); a result has (n_columns, n).
+    Columns, ready to be evaluated over states, shape (width, n); results have (n_columns, n).
 
-    Each state is evaluated alone, number by number, so that one has the bits of many.
+    States are evaluated element by element, so a single state gives the bits of a batch.
     """
 
     def __init__(
@@ -260,45 +261,48 @@ class ColumnTable:
         self._reference = reference_temperature
         lower, upper = temperature_range_c
         self._t_range = lower - reference_temperature, upper - reference_temperature
-        self._range = np.array([one.range for one in columns]).reshape(-1, 2).T[:, :, np.newaxis]
-        self._power = np.array([one.power for one in columns], np.int64)
+        self._range = (
+            np.array([column.range for column in columns]).reshape(-1, 2).T[:, :, np.newaxis]
+        )
+        self._power = np.array([column.power for column in columns], np.int64)
         self._lowered = np.maximum(self._power - 1, 0)
-        self._during = np.array([_DURING.index(one.during) for one in columns], np.int64)
+        self._during = np.array([_DURING.index(column.during) for column in columns], np.int64)
         #: Whether any column belongs to one regime alone.
         self.differs = bool(self._during.any())
-        # What differs only in power, range or regime is evaluated once.
-        of = [_source(one, layout) for one in columns]
+        # Columns that differ only in power, range or regime share one evaluation.
+        of = [_source(column, layout) for column in columns]
         sources = list(dict.fromkeys(of))
-        self._source = np.array([sources.index(one) for one in of], np.int64)
-        self._places = np.array([one[0] for one in sources], np.int64)
-        self._widths = np.array([one[2] for one in sources])[:, np.newaxis]
-        self._rests = np.array([one[3] for one in sources])[:, np.newaxis]
-        rows = {form: [k for k, one in enumerate(sources) if one[1] == form] for form in _FORMS}
-        # A line is what it is made of.
+        self._source = np.array([sources.index(source) for source in of], np.int64)
+        self._places = np.array([source[0] for source in sources], np.int64)
+        self._widths = np.array([source[2] for source in sources])[:, np.newaxis]
+        self._rests = np.array([source[3] for source in sources])[:, np.newaxis]
+        rows = {
+            form: [k for k, source in enumerate(sources) if source[1] == form] for form in _FORMS
+        }
         self._forms = [
             (rows[form], *both) for form, both in _FORMS.items() if rows[form] and form != 'line'
         ]
-        #: Which number of a state each column is made of.
+        #: Index in a state of the number that each column is computed from.
         self.places = self._places[self._source]
 
     def raw(self, states: Floats) -> Floats:
-        """Evaluate u of each column, not held."""
+        """Evaluate u of each column, without the limits of its range."""
         u = (states[self._places] - self._rests) / self._widths
         for rows, value, _ in self._forms:
             u[rows] = value(u[rows])
         return np.asarray(u[self._source])
 
     def held(self, raw: Floats) -> Floats:
-        """Hold what `raw` gives at the edges of the columns' ranges."""
+        """Limit the result of `raw` to the columns' ranges."""
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Say how far each column lies outside its range, in half ranges."""
+        """Return the distance of each column outside its range, in half ranges."""
         lower, upper = self._range
         return np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
 
     def factors(self, board: Floats, weight: Floats) -> tuple[Floats, Floats]:
-        """Give by what u held is multiplied to make phi: power of t and share; and its slope."""
+        """Return the factor phi / u (power of t times regime weight) and its slope by t."""
         t = hold(board - self._reference, *self._t_range)
         n_powers = int(self._power.max(initial=0))
         powers = np.multiply.accumulate([np.ones_like(t), *[t] * n_powers])
@@ -312,7 +316,7 @@ class ColumnTable:
         return np.asarray(self.held(self.raw(states)) * factors)
 
     def slopes(self, states: Floats) -> Floats:
-        """Differentiate u by the number that it is made of, ranges aside."""
+        """Differentiate u by the number that it is computed from, without limits of range."""
         slopes = np.ones((len(self._places), states.shape[1]))
         for rows, _, slope in self._forms:
             slopes[rows] = slope(
@@ -322,7 +326,7 @@ class ColumnTable:
 
 
 def _source(column: Column, layout: Layout) -> tuple[int, str, float, float]:
-    """Find which number of a state a column is made of, in which form, of which width and rest."""
+    """Return the index in a state that a column is computed from, its form, width and rest."""
     form = column.kind if column.kind in _FORMS else 'line'
     if column.kind == 'rate':
         place = RATE

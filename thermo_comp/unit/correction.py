@@ -4,9 +4,9 @@
 Owns the arithmetic of the correction: thermal states in, bias, scale and error variances out.
 
 States are columns, shape (width, n), of the numbers that `thermal.state` lays out; one state is
-n = 1. Sums run in one order and no state knows of another, so a stream and a batch get the same
-bits. What is said of three axes stands in rows: the bias of x, y, z, then their scale. Notation
-as in `calibration`; x is an axis' specific force before the misalignment, its error variance is
+n = 1. Sums run in a fixed order and each state is evaluated alone, so a stream and a batch get the
+same bits. Results for three axes stand in rows: the bias of x, y, z, then their scale. Notation as
+in `calibration`; x is an axis' specific force before the misalignment, its error variance is
 ``v(x) = a + b x + c x^2`` [m^2/s^4].
 """
 
@@ -27,41 +27,42 @@ from .curves import Curves
 from .functions import hold
 from .gravity import MICRO_G
 
-#: While the sets cross over, the output moves no faster than this [m/s^3] (1 ug per second) ...
+#: Largest rate of change of the output while the sets are blended [m/s^3]: 1 ug per second ...
 GENTLE_RATE = MICRO_G
-#: ... unless that took more than this many transition times.
+#: ... unless blending would then take more than this number of transition times.
 LONGEST_TRANSITION = 10.0
+#: Number of temperatures at which the difference of the sets is evaluated for it.
 _GAP_TEMPERATURES = 33
-#: Rounding to whole counts, twice 1/12 where the converter carries the remainder on [counts^2].
+#: Variance of rounding [counts^2]: twice 1/12, as the converter carries the remainder on.
 ROUNDING_VARIANCE = 1.0 / 6.0
-#: The noise of a message is at least this part of the largest variance that any axis can have, so
-#: that rounding leaves a covariance positive definite; below any instrument's.
+#: Smallest noise variance of a message / largest variance of any axis: keeps the covariance
+#: positive definite in spite of rounding; far below the noise of any instrument.
 _LEAST_SHARE = 1e-13
-#: What is larger than this is no number of a correction: of what is smaller, samples are finite.
+#: Largest number accepted in a line: corrected samples of smaller numbers do not overflow.
 _LARGEST = 1e140
-#: Of so many states a call for each column costs less than a table of all sums.
+#: Number of states from which one call per column costs less than a table of all sums.
 _FEW = 64
-#: So many states at once bound the memory that a line takes.
+#: Largest number of states evaluated at once, to bound the memory.
 _CHUNK = 2048
 
 
 class Excess(NamedTuple):
     """How far a thermal state lies outside the calibrated ranges; 0 inside."""
 
-    temperature: float  # of the set of the regime, signed [K]
+    temperature: float  # beyond the range of the regime's set, signed [K]
     rate: float  # the same [K/s]
-    gradient: float  # the one that is farthest outside, signed [K]
-    relative: float  # all sizes in half ranges, added
+    gradient: float  # of the sensor farthest outside, signed [K]
+    relative: float  # sum of all distances, each in half ranges
 
 
 class Correction:
     """
     Both sets of a calibration, blended by the weight of the thermal state, and its response.
 
-    memory: what the tracker must remember, for the angular rate, too; or what it does remember
-    noise: variance of the noise of one message per axis, rounding included [m^2/s^4]
-    noise_trace: their sum
-    misalignment: yx, zx, zy of the misalignment and their variances
+    memory: memory that the tracker needs for force and angular rate, or the memory it has
+    noise: noise variance of one message per axis, rounding included [m^2/s^4]
+    noise_trace: the sum of `noise`
+    misalignment: yx, zx, zy of M and their variances
     """
 
     def __init__(self, calibration: Calibration, memory: MemorySpec | None = None) -> None:
@@ -101,16 +102,16 @@ class Correction:
         self.misalignment = (M[1][0], M[2][0], M[2][1], *variances)
 
     def _find_felt(self) -> None:
-        """Find which columns are made of each gradient and each lag, the numbers felt if wrong."""
-        # Gradients and lags stand in pairs with their variances. Plays are taken to follow their
-        # input, so they feel nothing.
+        """Find the columns that depend on each gradient and lag, to propagate its variance."""
+        # In a state each gradient and lag is followed by its variance. A play has none: it is
+        # taken to follow its input.
         pair = (self.table.places - GRADIENT) // 2
         n_pairs = len(self.memory.sensors) + len(self.memory.lags)
         self._felt_variances = slice(VAR_GRADIENT, GRADIENT + 2 * n_pairs, 2)
         columns = np.argsort(pair, kind='stable')
         self._felt_columns = columns[(pair[columns] >= 0) & (pair[columns] < n_pairs)]
         self._felt, self._felt_starts = np.unique(pair[self._felt_columns], return_index=True)
-        # ``T - L`` rises with T, ``g = T_s - T`` falls; the lag of a gradient does neither.
+        # Derivatives by T: +1 of ``T - L``, -1 of ``g = T_s - T``, 0 of the lag of a gradient.
         signs = [-1.0 for _ in self.memory.sensors]
         signs += [float(name == BOARD_INPUT) for name, _ in self.memory.lags]
         lags = Layout(self.memory).lags
@@ -124,14 +125,14 @@ class Correction:
 
     def _blended(self, sets: Floats, weight: Floats, phi: Floats) -> Floats:
         result = self._weigh(phi, (1.0 - weight) * sets[0] + weight * sets[1])
-        # Eq. (8): K at this temperature.
+        # Eq. (8): scale factor at this temperature.
         result[3:] *= self.K
         return result
 
     def _weigh(self, columns: Floats, start: Floats) -> Floats:
         """Add ``W @ columns`` to a start, shape (6, n), column by column."""
         if columns.shape[1] > _FEW:
-            # The same sums, without a table of what comes in between.
+            # The same sums without a table of intermediate values.
             total: Floats = start.copy()
             for weights, column in zip(self._W.swapaxes(0, 1), columns, strict=True):
                 total += weights * column
@@ -139,7 +140,7 @@ class Correction:
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
-        """Stretch the time [s] in which the sets cross over to what an INS would overlook."""
+        """Lengthen a transition time [s] to keep the output slower than GENTLE_RATE."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
         static, dynamic = self.curves.values(board)
         gap = dynamic - static
@@ -150,7 +151,7 @@ class Correction:
         return min(max(given_s, largest / GENTLE_RATE), LONGEST_TRANSITION * given_s)
 
     def excess(self, state: Sequence[float], *, is_dynamic: bool) -> Excess:
-        """Say how far a state lies outside the calibrated ranges."""
+        """Return the distance of a state outside the calibrated ranges."""
         states = np.array(state)[:, np.newaxis]
         over, too_fast, relative = (one[:, 0].tolist() for one in self.curves.excess(states))
         weight = state[WEIGHT]
@@ -181,17 +182,17 @@ class Correction:
         noise_excess: npt.ArrayLike,
     ) -> Floats:
         """
-        Lay a line from the states at the beginning of segments to those at their ends.
+        Evaluate the correction of segments as linear in time between states at both ends.
 
-        `slow` is of the error variance a, b, c by axis, shape (9, n). Returns by axis bias, its
-        change, scale, its change, then a, b, c, with a message's grown noise: (21,) or (21, n).
+        `slow` is the slow part of a, b, c by axis, shape (9, n). Returns by axis bias, its change,
+        scale, its change, then by axis a, b, c with a message's noise: (21,) or (21, n).
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
         if n > _CHUNK:
             columns = (*ends, np.asarray(slow), np.asarray(noise_excess))
             cuts = range(_CHUNK, n, _CHUNK)
-            parts = zip(*(np.split(one, cuts, axis=-1) for one in columns), strict=True)
+            parts = zip(*(np.split(column, cuts, axis=-1) for column in columns), strict=True)
             return np.hstack([self.line(*part) for part in parts])
         states = np.concatenate(ends.reshape(2, -1, n), axis=1)
         board = states[BOARD]
@@ -200,18 +201,18 @@ class Correction:
         factors = self.table.factors(board, states[WEIGHT])
         held = self.table.held(raw)
         phi = held * factors[0]
-        found = self._blended(sets, states[WEIGHT], phi).reshape(2, 3, 2, n)
-        found[:, :, 1] -= found[:, :, 0]
+        both = self._blended(sets, states[WEIGHT], phi).reshape(2, 3, 2, n)
+        both[:, :, 1] -= both[:, :, 0]
         factors_at_end = factors[0][:, n:], factors[1][:, n:]
         gap = (sets[1] - sets[0])[:, n:]
         unchanging = np.reshape(slow, (3, 3, n))
         v = self._variance(states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, unchanging)
-        # What the axes can tell at most [m/s^2], and what that makes of their variances.
-        most = (self._full_scale + np.abs(found[0, :, 0])) / np.abs(found[1, :, 0])
+        # The largest force that each axis can measure [m/s^2], and the variance there.
+        most = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
         whole = v[:, 0] + most * (np.abs(v[:, 1]) + most * (v[:, 2] + max(self.misalignment[3:])))
         least = _LEAST_SHARE * whole.max(axis=0)
         v[:, 0] += np.maximum(self._noise * (1.0 + np.asarray(noise_excess)), least)
-        line = np.concatenate((found.swapaxes(0, 1).reshape(12, n), v.reshape(9, n)))
+        line = np.concatenate((both.swapaxes(0, 1).reshape(12, n), v.reshape(9, n)))
         return line.reshape(21, *ends.shape[2:])
 
     def _variance(
@@ -226,8 +227,8 @@ class Correction:
         """
         Evaluate a, b, c of each axis, shape (3, 3, n), without the noise of a message.
 
-        What the sets disagree by (`gap`) counts while they cross over, as far as the state lies
-        outside, and while the regime is unknown: then both variances count.
+        The difference of the sets (`gap`) is added while they are blended, outside the ranges, and
+        while the regime is unknown; in the last case the variances of both sets are added.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         rest, over = 1.0 - weight, raw - held
@@ -236,26 +237,29 @@ class Correction:
         shares = np.array([rest + unknown * weight, weight + unknown * rest])
         variances = (shares * states[VAR_BOARD], states[self._felt_variances])
         felt = self.felt(states, factors[0])
-        # The response hangs on the board's temperature through the powers of t and what is felt.
+        # The response depends on the board temperature by t^power and by gradients and lags.
         on_board = self._weigh(raw * factors[1], in_order(self._signs * felt, 0))
         slopes = self.curves.slopes(board)
         v = self._spread(np.concatenate(variances), np.concatenate((slopes + on_board, felt)))
         v[:, 0] += (shares[:, np.newaxis] * self.curves.unexplained(board)).sum(axis=0)
         v += slow
         is_beyond = bool(over.any())
-        # A part that lags the board may be outside when the board is back.
+        # A part that lags the board may still be outside when the board is back inside.
         parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
         parts_out = np.abs(parts - hold(parts, *self._span)).max(axis=0)
         if is_beyond or outside.any() or parts_out.any():
-            # Far outside, the residual of the fit says nothing any more: it grows with the excess.
-            own = np.where(self._is_present, self.table.excess(raw), 0.0).max(axis=1, initial=0.0)
-            # The lags were there, too, or will be: what is cut off follows the curves alone. Of
-            # parts outside, and where bias and scale cancel in the slope, its changes remain.
+            columns_out = np.where(self._is_present, self.table.excess(raw), 0.0).max(
+                axis=1, initial=0.0
+            )
+            # Outside the range only the curves are extrapolated (the lags will follow). Add the
+            # change of slope as a separate error: for parts still outside, and where the bias and
+            # scale slopes cancel.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
             v += self._spread(np.concatenate((bent, bent)), bends)
-            v *= (1.0 + (outside + own) ** 2)[:, np.newaxis]
+            # The residual of the fit does not hold far outside: it grows with the distance.
+            v *= (1.0 + (outside + columns_out) ** 2)[:, np.newaxis]
         doubt = unknown + weight * rest + outside * outside
         if not (is_beyond or doubt.any()):
             return v
@@ -270,8 +274,8 @@ class Correction:
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """
-        Say what independent errors, shape (p, n), make of each axis' a, b, c, shape (3, 3, n), if
-        each moves bias and relative scale by `moved` per unit, shape (p, 6, n).
+        Propagate independent errors of variances (p, n) to a, b, c of each axis, shape (3, 3, n);
+        `moved` is the change of bias and relative scale per unit of each error, shape (p, 6, n).
         """
         variance, bias, scale = variances[:, np.newaxis], moved[:, :3] / self.K, moved[:, 3:]
         parts = np.empty((*bias.shape[:2], 3, bias.shape[2]))
@@ -282,14 +286,14 @@ class Correction:
 
 
 def is_sound(line: Floats) -> npt.NDArray[np.bool_]:
-    """Say of what `Correction.line` gives whether all that is made of it is finite."""
+    """Whether every sample corrected by a result of `Correction.line` is finite."""
     scale = line[2:12:4]
     is_finite = (np.abs(line) < _LARGEST).all(axis=0)
     return np.asarray(is_finite & (scale * (scale + line[3:12:4]) > 0.0).all(axis=0))
 
 
 def in_order(values: Floats, axis: int) -> Floats:
-    """Sum along an axis, one after the other, however many there are along the others."""
+    """Sum along an axis in a fixed order, whatever the size of the other axes."""
     if not values.shape[axis]:
         return np.asarray(values.sum(axis=axis))
     total: Floats = np.add.accumulate(values, axis=axis).take(-1, axis)

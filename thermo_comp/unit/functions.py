@@ -3,9 +3,10 @@
 """
 Owns a function of temperature: polynomial, cubic spline or exponential, normalised at t = 0.
 
-Of ``t = T_board - T_ref`` [K] one gets the bits of many: only ``+ - * /`` in a fixed order, and
-`math.exp` number by number. Each is linear in its free coefficients, so `basis` gives the fit's
-regressors and what carries the parameter covariance (Eq. (9) and (10) of the paper).
+A single ``t = T_board - T_ref`` [K] gives the bits of a batch: the code uses only ``+ - * /`` in a
+fixed order, and `math.exp` number by number. Each function is linear in its free coefficients, so
+`basis` gives the regressors of the fit and of the parameter covariance (Eq. (9) and (10) of the
+paper).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy.typing as npt
 from ..quantities import QUANTITIES
 from ..typing import Floats
 
-#: A temperature, or many.
+#: One temperature difference or an array of them [K].
 Kelvins: TypeAlias = float | Floats
 
 #: How far curves go on along their tangent beyond their range, in spans of that range. There
@@ -32,23 +33,24 @@ Kelvins: TypeAlias = float | Floats
 TANGENT_SPANS = 0.25
 #: How exactly a function must meet its value at the reference.
 NORMALISATION_TOLERANCE = 1e-9
-#: Knots of any use [K]; what is closer or farther away overflows.
+#: Smallest distance of knots, and largest distance of a knot from the reference [K]; the spline
+#: would overflow beyond them.
 _KNOT_STEP = 1e-3
 _FARTHEST_KNOT = 2000.0
 
 
 def hold(value: Floats, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Floats:
-    """Hold values at the edges of a range, given in their unit."""
+    """Limit values to a range, given in their unit."""
     return np.asarray(np.minimum(np.maximum(value, lower), upper))
 
 
 def by_element(function: Callable[[float], float], x: Kelvins) -> Floats:
-    """Map every number; numpy's own functions may round differently by how many there are."""
+    """Map number by number: numpy's rounding may depend on the length of the array."""
     return np.array([function(v) for v in np.ravel(x).tolist()]).reshape(np.shape(x))
 
 
 class _Family(ABC):
-    """What the families have in common."""
+    """The interface of all families."""
 
     @property
     @abstractmethod
@@ -85,7 +87,7 @@ class Polynomial(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """All but the value at the reference."""
+        """All coefficients except the value at the reference."""
         return self.coefficients[1:]
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Polynomial:
@@ -133,7 +135,7 @@ class CubicSpline(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """The values at all knots but the reference, less the value there."""
+        """The values at all knots except the reference, less the value at the reference."""
         at = self.knots_k.index(0.0)
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
@@ -219,39 +221,39 @@ TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
 class Functions:
-    """Rows of functions, each row at temperatures of its own; all polynomials in one go."""
+    """Rows of functions, each row at its own temperatures; polynomials are evaluated together."""
 
     def __init__(self, rows: Sequence[Sequence[TemperatureFunction]]) -> None:
         self.rows = rows
-        places = [(i, j, one) for i, row in enumerate(rows) for j, one in enumerate(row)]
+        places = [(i, j, function) for i, row in enumerate(rows) for j, function in enumerate(row)]
         self._others = [place for place in places if not isinstance(place[2], Polynomial)]
-        flat = [one if isinstance(one, Polynomial) else Polynomial((0.0,)) for *_, one in places]
+        flat = [f if isinstance(f, Polynomial) else Polynomial((0.0,)) for *_, f in places]
         shape = -1, len(rows), len(rows[0]), 1
         self._tables = {
             name: np.array(list(zip_longest(*many, fillvalue=0.0))).reshape(shape)
             for name, many in (
-                ('value', [one.coefficients for one in flat]),
-                ('slope', [one.slopes for one in flat]),
+                ('value', [function.coefficients for function in flat]),
+                ('slope', [function.slopes for function in flat]),
             )
         }
 
     def evaluate(self, t: Floats, name: str = 'value') -> Floats:
         """Evaluate at `t`, shape (n_rows, n) [K], values or slopes, (n_rows, n_functions, n)."""
         result = _horner(self._tables[name], t[:, np.newaxis])
-        for row, place, one in self._others:
-            result[row, place] = getattr(one, name)(t[row])
+        for row, place, function in self._others:
+            result[row, place] = getattr(function, name)(t[row])
         return result
 
 
 def _horner(coefficients: Floats | tuple[float, ...], t: Floats) -> Floats:
     result = t * 0.0 + coefficients[-1]
-    for one in coefficients[-2::-1]:
-        result = result * t + one
+    for coefficient in coefficients[-2::-1]:
+        result = result * t + coefficient
     return np.asarray(result)
 
 
 def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:
-    """Raise ValueError, with the name of the key, if a function misses its value at 0 K."""
+    """Raise ValueError, with the key's name, if a function has another value at the reference."""
     with np.errstate(all='ignore'):
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:
@@ -269,7 +271,7 @@ def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
     Give ``a + b h + c h^2 + d h^3`` on each interval, h from its left knot, shape (4, n - 1).
 
     The second derivatives at the knots solve the usual tridiagonal system with zeros at both
-    ends. numpy serves: the node must not load an optimiser, which scipy's interpolation does.
+    ends. Written in numpy: the node must not import scipy.
     """
     y, h = np.asarray(values), np.diff(np.asarray(knots))
     slopes = np.diff(y) / h

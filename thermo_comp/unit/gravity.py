@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns standard gravity, which defines g, and how accelerations are said and read in it."""
+"""Owns standard gravity, the unit g, and the formatting and parsing of accelerations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _UNITS = {
 
 
 def spoken(acceleration: float) -> str:
-    """Say an error in ug, or from 1 mg on in mg, with two or three digits."""
+    """Format an error in ug, or from 1 mg on in mg, with two or three digits."""
     value, unit = acceleration / MICRO_G, 'ug'
     if abs(value) >= 999.5:
         value, unit = value / 1e3, 'mg'
@@ -33,7 +33,7 @@ def spoken(acceleration: float) -> str:
 
 
 def parse_acceleration(text: str) -> float:
-    """Read a positive acceleration with its unit, like ``100ug``, ``0.5 mg`` or ``1e-3 m/s^2``."""
+    """Parse a positive acceleration with unit, like ``100ug``, ``0.5 mg`` or ``1e-3 m/s^2``."""
     found = re.fullmatch(r'\s*(\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)\s*(\S+)\s*', text)
     value = float(found[1]) * _UNITS.get(found[2].replace('\u03bc', 'µ'), 0.0) if found else 0.0
     if not 0.0 < value < math.inf:

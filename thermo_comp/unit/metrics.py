@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns residual statistics: of corrected - true, and of ``|f| - g``, which needs no attitude."""
+"""Owns statistics of residuals: corrected - true, and ``|f| - g``, which needs no attitude."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..typing import Bools, Floats
 
 @dataclass(frozen=True)
 class ResidualStatistics:
-    """What is said of residuals that are finite: NaN when there are none."""
+    """Statistics of the finite residuals; NaN if there are none."""
 
     n: int
     mean: float
@@ -31,7 +31,7 @@ def residual_statistics(residual: Floats) -> ResidualStatistics:
 
 
 def norm_residual(specific_force: Floats, gravity: float) -> Floats:
-    """Form ``|f| - g`` of forces, shape (..., 3): the residual that needs no attitude."""
+    """Return ``|f| - g`` of forces, shape (..., 3): the residual that needs no attitude."""
     square = np.einsum('...i,...i->...', specific_force, specific_force)
     return np.asarray(np.sqrt(square) - gravity)
 

@@ -17,9 +17,9 @@ from ..quantities import QUANTITIES
 from ..typing import Floats
 from .functions import TemperatureFunction
 
-#: What single precision cannot tell from nothing, relative to a variance.
+#: Share of a variance that single precision does not resolve.
 _NEGLIGIBLE = 1e-7
-#: An eigenvalue of a correlation matrix below this is no rounding.
+#: Smallest eigenvalue of a correlation matrix that rounding explains.
 _MOST_NEGATIVE = -1e-6
 _FLOAT32 = np.dtype('<f4')
 
@@ -33,7 +33,7 @@ class Posterior:
         str, 'base64 of little-endian float32: one row of `rank` numbers per parameter.'
     ]
     rest: Annotated[
-        str, 'base64 of little-endian float32: one variance per parameter, beside the factor.'
+        str, "base64 of little-endian float32: one variance per parameter, added to the factor's."
     ]
 
     def __post_init__(self) -> None:
@@ -47,7 +47,7 @@ class Posterior:
 
     @classmethod
     def of(cls, matrix: npt.NDArray[np.floating[Any]], variances: Floats) -> Posterior:
-        """Encode a factor, shape (n_parameters, rank), and the variances beside it."""
+        """Encode a factor, shape (n_parameters, rank), and the variances added to it."""
         return cls(matrix.shape[1], _encoded(matrix), _encoded(variances))
 
     @property
@@ -62,7 +62,7 @@ class Posterior:
 
     @cached_property
     def variances(self) -> Floats:
-        """The variances that stand on the diagonal beside the factor, shape (n_parameters,)."""
+        """The variances added on the diagonal, shape (n_parameters,)."""
         return _decoded('rest', self.rest)
 
     def covariance(self) -> Floats:
@@ -71,7 +71,7 @@ class Posterior:
         return result
 
     def check_size(self, expected: int) -> None:
-        """Raise ValueError, with the name of the key, if it is not of so many parameters."""
+        """Raise ValueError, with the key's name, if the number of parameters differs."""
         if self.n_parameters != expected:
             raise ValueError(
                 f'`posterior.rest` must have one number per parameter ({expected}), '
@@ -81,8 +81,8 @@ class Posterior:
 
 class Block(NamedTuple):
     """
-    Where the parameters of the bias, or of the scale, of an axis stand: the levels of both sets,
-    each before its function's, and from `response` to before `end` the weights of the response.
+    Indices of the parameters of an axis' bias or scale. `static`, `dynamic`: level of the set,
+    followed by its function's coefficients; `response` to `end` (exclusive): weights.
     """
 
     static: int
@@ -94,7 +94,7 @@ class Block(NamedTuple):
 def lay_out(
     pairs: Iterable[tuple[TemperatureFunction, TemperatureFunction]], n_columns: int
 ) -> list[Block]:
-    """List the blocks of pairs of a static and a dynamic function, one behind the other."""
+    """List the consecutive blocks of pairs of a static and a dynamic function."""
     blocks = [Block(0, 0, 0, 0)]
     for static, dynamic in pairs:
         begin = blocks[-1].end
@@ -117,15 +117,15 @@ class ParameterLayout(NamedTuple):
 
 
 def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
-    """Find the smallest factor that holds a covariance matrix; ValueError if it is none."""
+    """Find the smallest factor of a covariance matrix; ValueError if it is not a covariance."""
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')
-    # Scaled to correlations first: entries in counts^2 and in relative^2 differ by 10 decades.
+    # Scale to correlations: entries in counts^2 and relative^2 differ by 10 decades.
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     with np.errstate(over='ignore'):
         correlation = (covariance + covariance.T) / 2.0 / scale / scale[:, np.newaxis]
-    # Eigenvalues exist of what is finite; beyond 1 there is no correlation anyway.
+    # `eigh` needs finite numbers; a matrix with entries above 1 is no correlation anyway.
     is_bounded = np.abs(correlation).max(initial=0.0) < 2.0
     eigenvalues, vectors = np.linalg.eigh(correlation if is_bounded else -np.eye(1))
     if not eigenvalues[0] > _MOST_NEGATIVE:
@@ -145,7 +145,7 @@ def _encoded(numbers: npt.NDArray[np.floating[Any]]) -> str:
 
 
 def _single(numbers: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
-    # What overflows is refused as not finite.
+    # An overflow becomes inf, which the reader refuses.
     with np.errstate(over='ignore'):
         return numbers.astype(_FLOAT32)
 

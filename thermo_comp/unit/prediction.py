@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what a calibration says of a thermal state: the part of the error variance that changes slowly
-(parameters, and lags that started unseen), and states thought up: a soak, a ramp, a step.
+Owns predictions for a thermal state: the slow part of the error variance (parameters, and lags
+whose start was not seen), and hypothetical states: a soak, a ramp, a step.
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
-of time constant tau stands ``tau q (1 - exp(-s / tau))`` behind the board, and a play has been
-pushed to its end; in a soak (q = 0) all of them are 0. The static set holds in a soak, the
-dynamic one in a ramp. Noise, and what the thermometers do not know, are left out.
+of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
+stop; in a soak (q = 0) all of them are 0. The static set holds in a soak, the dynamic set in a
+ramp. Noise and the uncertainty of the thermometers are left out.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .correction import Correction
 
 
 class SlowUncertainty:
-    """What posterior and starts of lags leave uncertain, state by state: a batch has its bits."""
+    """Error variance by the posterior and the unseen starts of lags, with the bits of a batch."""
 
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
         self._correction = correction
@@ -72,8 +72,8 @@ class SlowUncertainty:
         self, states: Floats, mean_of: Callable[[Floats], Floats]
     ) -> tuple[Floats, Floats]:
         """
-        Say what the parameters leave uncertain of the bias at states (n, w): its variance, and
-        that of its distance from `mean_of` rows, shapes (n, 3) [m^2/s^4].
+        Return the variance of the bias by the parameters at states (n, w), and the variance of its
+        difference from `mean_of` rows, shapes (n, 3) [m^2/s^4].
         """
         columns = states.T
         phi = self._correction.table.values(columns)
@@ -81,20 +81,20 @@ class SlowUncertainty:
         whole, away = np.zeros((2, len(states), 3))
         for axis, (rows, variances, _, _) in enumerate(self._blocks):
             felt = regressors[axis].T / self._K[axis]
-            for result, one in ((whole, felt), (away, felt - mean_of(felt))):
-                result[:, axis] = ((one @ rows) ** 2).sum(axis=1) + one**2 @ variances
+            for result, design in ((whole, felt), (away, felt - mean_of(felt))):
+                result[:, axis] = ((design @ rows) ** 2).sum(axis=1) + design**2 @ variances
         return whole, away
 
 
 def _products(bias: Floats, scale: Floats) -> Floats:
-    # Sums along the rows above, and of products here: the same bits wherever the arrays lie.
+    # Explicit products and sums: BLAS results depend on the arrays' alignment.
     return np.array([(bias * bias).sum(), 2.0 * (bias * scale).sum(), (scale * scale).sum()])
 
 
 def in_a_soak(
     calibration: Calibration, temperature: float | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Give bias [m/s^2] and its sd, scale [units per m/s^2] and its relative sd, shapes (3,)."""
+    """Return bias [m/s^2], its sd, scale [units per m/s^2], its relative sd, shapes (3,)."""
     at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
     states = ramp_states(calibration, at)
     bias, scale = bias_and_scale(calibration, states)
@@ -129,9 +129,9 @@ def ramp_states(
     lasted_s: Floats | float = 0.0,
 ) -> Floats:
     """
-    Think up the states of a ramp, or of a soak, at board temperatures, shape (n,).
+    Build the states of a ramp or a soak at board temperatures, shape (n,).
 
-    `rate` is the board's [K/s]; `lasted_s` for how long it has lasted, inf for ever, shape (n,).
+    `rate` is the board's [K/s], `lasted_s` the age of the ramp (inf: steady state), shape (n,).
     """
     layout = Layout(Correction(calibration).memory)
     states = np.zeros((len(temperature), layout.width))
@@ -147,7 +147,7 @@ def ramp_states(
 
 
 def step_states(calibration: Calibration, temperature: float, since_s: Floats) -> Floats:
-    """Think up the states at times [s] after board and case jumped by 1 K, out of a soak."""
+    """Build the states at times [s] after board and case jumped by 1 K out of a soak."""
     states = ramp_states(calibration, np.full(len(since_s), temperature))
     for (name, tau), place in Layout(Correction(calibration).memory).lags.items():
         if name == BOARD_INPUT:

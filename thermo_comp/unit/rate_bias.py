@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the gyroscope of a unit: the bias of its rate over the same columns; its scale is 1."""
+"""Owns the gyroscope of a unit: its bias, with the columns of the accelerometer; scale 1."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .schema import Vector
 #: A unit of angular rates [rad/s].
 MILLIDEGREE = math.radians(1e-3)
 NIL = (0.0, 0.0, 0.0)
-#: The largest angular rate that a gyroscope tells, and the largest bias [rad/s].
+#: The largest angular rate of a gyroscope, and its largest bias [rad/s].
 LARGEST_RATE = QUANTITIES['angular rate'].at_most or 0.0
 
 _Rate = Annotated[float, QUANTITIES['angular rate']]
@@ -62,13 +62,13 @@ class RateTerm(Column):
 @dataclass(frozen=True)
 class Gyroscope:
     """
-    What temperature does to the angular rate: ``w = measured - bias``, as in `calibration`.
+    Bias of the angular rate over temperature: ``w = measured - bias``, as in `calibration`.
 
-    Parameters of the posterior: by axis level and coefficients of both sets, then the weights.
+    Order of the posterior: by axis the level and coefficients of both sets, then the weights.
     """
 
     bias_rad_s: Annotated[
-        tuple[_Rate, _Rate, _Rate], 'At the reference temperature, in the mean over positions.'
+        tuple[_Rate, _Rate, _Rate], 'At the reference temperature, averaged over positions.'
     ]
     static: RateSet
     dynamic: RateSet
@@ -79,7 +79,8 @@ class Gyroscope:
         tuple[_Slow, _Slow, _Slow], 'Random walk, per root hour.'
     ] = NIL
     residual_sd_rad_s: Annotated[
-        tuple[_Deviation, _Deviation, _Deviation], 'What is left, as a slow error: a turn-on.'
+        tuple[_Deviation, _Deviation, _Deviation],
+        'Sd of the residual, a slow error: turn-on bias.',
     ] = NIL
     response: Annotated[
         tuple[RateTerm, ...], QUANTITIES['columns'], 'The thermal response, common to both sets.'

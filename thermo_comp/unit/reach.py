@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns how far the parts of a calibration reach over its own temperatures and its own full scale.
+Owns the limits of a calibration's bias and scale over its temperatures, relative to full scale.
 
-A bias is a part of what the converter can tell, so level and curve stay within twice the full
-scale; a column at its very worst, and what is uncertain of it, within a million times that, which
-no instrument comes near and floating point still carries.
+A bias is within the converter's range, so level and curve stay within twice the full scale. The
+largest value of a column, and the uncertainty, stay within a million times that: far beyond any
+instrument, and without overflow.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from .columns import Column
 from .functions import TANGENT_SPANS, TemperatureFunction
 from .posterior import Block, Posterior
 
-#: A scale function, with every term at its worst, stays within these parts of the reference.
+#: Limits of a relative scale function, with every term at its largest.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
-#: A bias stays within so many full scales: words with an offset have it at half their range.
+#: Largest bias / full scale: samples in an offset code have a bias of half their range.
 FULL_SCALES = 2.0
-#: What a column makes of a bias, or a parameter leaves open, stays within so many of those.
+#: Largest effect of a column or of a parameter's uncertainty / largest bias.
 WORST = 1e6
-#: At so many temperatures of its range a function is looked at.
+#: Number of temperatures at which a function is checked.
 _GRID = 513
 #: How far beyond its range a function is looked at.
 _AROUND = f'and along its tangents, {TANGENT_SPANS:g} of the range on each side'
@@ -45,7 +45,7 @@ class Term:
     scale: Sequence[float]
 
     def largest(self, farthest_k: float) -> float:
-        """Give the largest value that the column can have, so far from the reference [K]."""
+        """Return the largest value of the column within `farthest_k` [K] of the reference."""
         column = self.column
         physical = {'even': 1.0, 'rate': _RATE_K_S}.get(
             column.kind, (_DIFFERENCE_K + abs(column.rest_k)) ** column.order
@@ -54,7 +54,7 @@ class Term:
 
 
 class Reach:
-    """The temperatures of a set, seen from the reference, and the largest bias there is."""
+    """The temperature range of a set relative to the reference, and the largest bias allowed."""
 
     def __init__(
         self, range_c: tuple[float, float], edges_c: Sequence[float], reference: float, most: float
@@ -65,7 +65,7 @@ class Reach:
         self._most = most
 
     def check_bias(self, key: str, level: float, function: TemperatureFunction) -> None:
-        """Raise ValueError where level and curve leave what a bias can be."""
+        """Raise ValueError if level and curve exceed the largest bias."""
         if abs(level) > self._most:
             raise ValueError(
                 f'`{key}.delta` must leave a bias within {self._most:g}, got {level:g}'
@@ -81,7 +81,7 @@ class Reach:
             )
 
     def check_scale(self, key: str, function: TemperatureFunction, lost: float) -> None:
-        """Raise ValueError where a relative scale, with so much more at its worst, is none."""
+        """Raise ValueError if a relative scale, less or plus `lost`, leaves its limits."""
         least, largest = self._extremes(function)
         if not least - lost > SMALLEST_RELATIVE_SCALE:
             raise ValueError(
@@ -95,7 +95,7 @@ class Reach:
             )
 
     def check_terms(self, key: str, terms: Sequence[Term]) -> None:
-        """Raise ValueError where a column at its worst is more than any bias."""
+        """Raise ValueError if the largest effect of a column exceeds its limit."""
         for k, term in enumerate(terms):
             largest = term.largest(self._farthest_k) * max(map(abs, term.bias))
             if not largest <= WORST * self._most:
@@ -105,12 +105,12 @@ class Reach:
                 )
 
     def losses(self, terms: Sequence[Term], regime: str) -> list[float]:
-        """Give what the columns of a regime may take off each axis' relative scale."""
-        own = [one for one in terms if one.column.during in ('always', regime)]
+        """Return the largest change of each axis' relative scale by the columns of a regime."""
+        active = [term for term in terms if term.column.during in ('always', regime)]
         with np.errstate(over='ignore'):
-            lost = [np.abs(one.scale) * one.largest(self._farthest_k) for one in own]
-            found: list[float] = np.sum([np.zeros(3), *lost], axis=0).tolist()
-        return found
+            lost = [np.abs(term.scale) * term.largest(self._farthest_k) for term in active]
+            total: list[float] = np.sum([np.zeros(3), *lost], axis=0).tolist()
+        return total
 
     def _extremes(self, function: TemperatureFunction) -> tuple[float, float]:
         try:
@@ -135,21 +135,21 @@ def check_posterior(
     terms: Sequence[Term],
 ) -> None:
     """
-    Raise ValueError where a parameter alone leaves more open than anybody can mean.
+    Raise ValueError if the effect of a parameter's sd exceeds `WORST` times its bound.
 
-    Each block comes with its functions and with what bounds it; `edges` are the static and the
-    dynamic set's, less the reference [K].
+    Each block comes with its functions and bound; `edges` are those of the static and the dynamic
+    set, relative to the reference [K].
     """
     variances = (posterior.matrix**2).sum(axis=1) + posterior.variances
-    farthest_k = max(abs(edge) for one in edges for edge in one)
+    farthest_k = max(abs(edge) for pair in edges for edge in pair)
     largest = [term.largest(farthest_k) for term in terms]
     for block, functions, most in blocks:
         felt = np.array([*_regressors(functions, edges), *largest])
         sd = np.sqrt(variances[block.static : block.end]) * felt
         if not (sd <= WORST * most).all():
             raise ValueError(
-                f'`{key}` must leave no parameter more open than {WORST * most:g} at its worst, '
-                f'leaves {sd.max():g}'
+                f'`{key}` must keep the effect of every standard deviation below '
+                f'{WORST * most:g}, got {sd.max():g}'
             )
 
 
@@ -157,7 +157,7 @@ def _regressors(
     functions: tuple[TemperatureFunction, TemperatureFunction],
     edges: tuple[Sequence[float], Sequence[float]],
 ) -> Iterator[float]:
-    for function, own in zip(functions, edges, strict=True):
+    for function, set_edges in zip(functions, edges, strict=True):
         yield 1.0
-        basis: list[Floats] = function.basis(np.array(own))
+        basis: list[Floats] = function.basis(np.array(set_edges))
         yield from (float(np.abs(values).max()) for values in basis)

@@ -4,9 +4,9 @@
 Owns the step from plain values to dataclasses and back: type hints are the schema of a file.
 
 Hints are float, int, bool, str, Literal, tuple, dataclass, any of them or None, and
-``Annotated[hint, Bounds(...), 'what it means']``. Nothing is converted but an integer to a float
-and a list to a tuple. What several keys have to do with each other is the dataclass' own matter:
-it raises a ValueError that starts with the key in backticks.
+``Annotated[hint, Bounds(...), 'what it means']``. The only conversions are integer to float and
+list to tuple. Rules between keys belong to the dataclass: it raises a ValueError that starts with
+the key in backticks.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from ..quantities import Bounds
 
-#: Longer than any key that there is.
+#: Length at which a name or value is cut in messages; no key is longer.
 _LONGEST_NAME = 60
 _NAMED_FIRST = re.compile(r'`(?P<key>[\w.\[\]]+)` (?P<rest>.*)', re.DOTALL)
 _WORDS: dict[Any, str] = {str: 'text', int: 'integer', float: 'number', bool: 'true or false'}
@@ -31,7 +31,7 @@ Value = TypeVar('Value')
 
 
 class SchemaError(ValueError):
-    """A value that does not fit: the key's path, and what was expected there."""
+    """A value that breaks the schema: the key's path and the expected value."""
 
     def __init__(self, key: str, message: str) -> None:
         self.key = key
@@ -41,12 +41,12 @@ class SchemaError(ValueError):
 
 Positive = Annotated[float, Bounds(above=0.0)]
 NotNegative = Annotated[float, Bounds(at_least=0.0)]
-#: Of three axes.
+#: Three numbers, for x, y, z.
 Vector = tuple[float, float, float]
 
 
 def build(hint: type[Value], data: Any, key: str = '') -> Value:
-    """Build what a type hint says from plain values, or raise SchemaError of the key."""
+    """Build a value of a type hint from plain values; SchemaError with the key if they differ."""
     result: Value = _build(hint, data, key)
     return result
 
@@ -66,7 +66,7 @@ def naming(key: str) -> Iterator[None]:
 
 
 def check_ranges(value: object, **spans: Bounds) -> None:
-    """Raise ValueError, with the name of the key, if a range of a dataclass spans too little."""
+    """Raise ValueError, with the key's name, if a range of a dataclass spans too little."""
     for key, span in spans.items():
         lower, upper = getattr(value, key)
         if not lower < upper:
@@ -83,7 +83,7 @@ def plain(value: Any) -> Any:
     """Turn dataclasses and tuples into mappings and lists: the reverse of `build`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         items = {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        # `kind` decides how the rest is read, so it stands first.
+        # `kind` selects the schema of the other keys, so it stands first.
         return {'kind': items.pop('kind'), **items} if 'kind' in items else items
     return [plain(item) for item in value] if isinstance(value, tuple) else value
 
@@ -103,7 +103,7 @@ def _build(hint: Any, data: Any, key: str) -> Any:
         return value
     if origin is Literal:
         if not isinstance(data, str) or data not in arguments:
-            _refuse(key, f'must be {_choice([repr(one) for one in arguments])}', data)
+            _refuse(key, f'must be {_choice([repr(option) for option in arguments])}', data)
         return data
     if origin is tuple:
         return _sequence(arguments, data, key)
@@ -136,7 +136,7 @@ def _object(cls: type, data: Any, key: str) -> Any:
     if not isinstance(data, dict):
         _refuse(key, 'must be a mapping of keys', data)
     hints, required = fields_of(cls)
-    # A misspelt key is unknown and missing at once, and the spelling is the one to be told about.
+    # A misspelt key is both unknown and missing; report the unknown name.
     for name in data:
         if name not in hints:
             raise SchemaError(_joined(key, _shown_name(name)), 'unknown key')
@@ -180,7 +180,9 @@ def _either(arguments: tuple[Any, ...], data: Any, key: str) -> Any:
         raise SchemaError(_joined(key, 'kind'), 'this key is missing')
     kind = data['kind']
     if not isinstance(kind, str) or kind not in kinds:
-        _refuse(_joined(key, 'kind'), f'must be {_choice([repr(one) for one in kinds])}', kind)
+        _refuse(
+            _joined(key, 'kind'), f'must be {_choice([repr(option) for option in kinds])}', kind
+        )
     return _object(kinds[kind], data, key)
 
 
@@ -195,7 +197,7 @@ def _joined(key: str, name: str) -> str:
 
 
 def _shown_name(name: str) -> str:
-    # What is no name can be anything: lines, or pages of text.
+    # An invalid name may be any text, even pages of it.
     shown = name if name.isprintable() and len(name) < _LONGEST_NAME else repr(name)
     return shown[:_LONGEST_NAME]
 
