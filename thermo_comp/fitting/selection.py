@@ -46,8 +46,6 @@ _NOISE_STEP, _NOISE_ROUNDS = 3.0, 2
 _LEAST_GAIN = 1.0
 # Logarithms of mean squares that differ by less than this are equal: 5 % of an RMS.
 _EQUAL = 0.1
-# A gain of the drift below this is worth no group: 1 % of an RMS.
-_LEAST_DRIFT = 0.02
 # Norms of left-out positions alone decide for a group if they gain so many standard errors.
 _SURE_ERRORS = 2.0
 
@@ -342,7 +340,7 @@ def _gain(before: Score, after: Score) -> float:
     if norms and norms[0] < -norms[1]:
         return 0.0
     total = sum(gain for gain, _ in drift)
-    if total > _LEAST_DRIFT and all(gain > error for gain, error in drift):
+    if total > _EQUAL and all(gain > error for gain, error in drift):
         return total
     is_sure = norms is not None and norms[0] > _SURE_ERRORS * norms[1]
     if is_sure and norms and all(abs(gain) < _EQUAL for gain, _ in drift):
