@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import GRAVITY, SECOND_NS, calibration, rich_calibration, thermal_calibration
-from readme_helpers import FENCES
+from readme_helpers import FENCE, README
 from test_layers import loaded_after
 
 import thermo_comp as tc
@@ -225,7 +225,7 @@ def test_a_fit_of_arrays_is_the_fit_of_their_bags(
 def test_the_lines_of_the_readme_run(
     root: Path, tmp_path: Path, fitted: tc.Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (snippet,) = (body for kind, body in FENCES if kind == 'python')
+    (snippet,) = (body for kind, body in FENCE.findall(README) if kind == 'python')
     (tmp_path / 'bags').symlink_to(root / 'bags')
     tc.save(fitted, tmp_path / 'unit.yaml')
     monkeypatch.chdir(tmp_path)

@@ -105,7 +105,7 @@ def test_the_node_finds_the_type_while_it_runs(peer: Peer, unit: Path, is_file: 
 @pytest.mark.parametrize(
     ('topics', 'text'),
     [
-        ('bord=/t', 'parameter `topics`: `bord` is no input'),
+        ('bord=/t', 'parameter `topics`: `bord` is not an input'),
         ('board=/t,case', 'parameter `topics`: expected INPUT=TOPIC, got case'),
         ('/none/drivers.yaml', '/none/drivers.yaml: cannot be read'),
         ('board=/t,case=/t', '/t: one topic for both board and case'),

@@ -273,7 +273,7 @@ class _Future:
     [
         (
             _Future('error', distributed.KilledWorker('task', None, 3)),
-            'its worker died 4 times at it: too little memory?',
+            'its worker died 4 times: too little memory?',
         ),
         (_Future('error', MemoryError('no\n room')), 'MemoryError: no room'),
         (_Future('lost'), 'the scheduler was lost'),
@@ -331,7 +331,7 @@ def test_a_unit_without_a_calibration_leaves_exit_code_1(
     assert '0 of 1 test calibrated; 0 tests done in this run, 1 in an earlier one' in said.out
     assert said.err == ''
     assert command(*arguments, '--with-prior') == 1
-    said = '- fitted without a prior: 0 units whose own bags tell all of them, need 3'
+    said = '- fitted without a prior: 0 units with complete data, 3 are needed'
     assert said in capsys.readouterr().out
     assert command(*arguments, '--json') == 1
     data = json.loads(capsys.readouterr().out)
@@ -383,7 +383,4 @@ def test_a_prior_needs_units_that_hold(client: Any, tmp_path: Path) -> None:
     result = fit_fleet(
         str(tmp_path / 'bags'), tmp_path / 'out', OPTIONS, client=client, with_prior=True
     )
-    assert (result.prior, result.no_prior) == (
-        None,
-        '0 units whose own bags tell all of them, need 3',
-    )
+    assert (result.prior, result.no_prior) == (None, '0 units with complete data, 3 are needed')

@@ -61,7 +61,7 @@ def contested(
     peer: Peer, heard: list[DiagnosticArray], topic: str, send: Callable[[], None]
 ) -> DiagnosticStatus:
     """Let both send, however slowly, until the node says that two do."""
-    text = f'2 publishers on {topic}, it is not used until one of them sends alone'
+    text = f'2 publishers on {topic}, the topic is not used until only one of them sends'
     found: list[DiagnosticStatus] = []
 
     def look() -> bool:

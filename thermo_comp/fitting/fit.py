@@ -103,17 +103,9 @@ def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
     """Fit a calibration to bags that have been reduced; FitError if they contradict themselves."""
-    try:
-        # Thousands of small products: threads would wait for each other.
-        with threadpool_limits(1, 'blas'):
-            return _fit_about_offset(bags, options, progress)
-    except ValueError as error:
-        if 'misalignment' not in str(error):
-            raise
-        raise FitError(
-            'its axes stand at less than 60 degrees to each other, which no accelerometer has: is '
-            'it the right topic, and did the axes stay the same in all positions?'
-        ) from error
+    # Thousands of small products: threads would wait for each other.
+    with threadpool_limits(1, 'blas'):
+        return _fit_about_offset(bags, options, progress)
 
 
 def _fit_about_offset(
@@ -245,6 +237,12 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         )
         calibration, rates = add_gyroscope(calibration, windows, bags, options)
     except ValueError as error:
+        if 'misalignment' in str(error):
+            raise FitError(
+                'its axes stand at less than 60 degrees to each other, which no accelerometer '
+                'has: is it the right topic, did the axes stay the same in all positions, and '
+                'do at least 9 positions show them?'
+            ) from error
         raise FitError(f'these data give no calibration that can be used: {error}') from error
     least = least_known(calibration, selected.posterior.state.up)
     unseen = list(data_checks.judge_coverage(least))
