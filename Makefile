@@ -13,7 +13,7 @@
 
 PYTHON ?= python3
 VENV ?= .venv
-JOBS ?= 2
+JOBS ?= 3
 FUZZ_SECONDS ?= 60
 PYTEST_ARGS ?=
 
