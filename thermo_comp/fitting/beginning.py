@@ -138,6 +138,10 @@ def _candidates(
     parts = np.stack((may, may & data.in_scale))
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
+    if data.n_positions >= POSITIONS_NEEDED:
+        # Rests at one temperature each drift from one to the other.
+        force = (position_means(data) - start.bias) / start.scale
+        drift = max(drift, float(np.std(np.linalg.norm(force, axis=1))))
     moved = float(np.std(windows.temperature)) or 1.0
     slope = float(np.clip(drift / moved, _FLATTEST, STEEPEST[0] / 3.0))
     slopes = np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])

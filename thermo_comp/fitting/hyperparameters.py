@@ -34,6 +34,8 @@ _LOG_SD = float(np.log(10.0))
 STUDENT_NU = 4.0
 # A support tilts by no more than some of this [rad/K]: aluminium of 23 ppm/K, heated unevenly.
 _TILT_PER_K = 1.5e-5
+# No mounting or turn-on repeats worse than this [m/s^2]: 5 mg, as of the cheapest consumer MEMS.
+_LARGEST_OFFSET_SD = 0.05
 # A round that moves no logarithm of a width by more than this is the last.
 _SETTLED = 0.05
 # The largest change of a logarithm in one round.
@@ -159,7 +161,8 @@ def _offset_sd(posterior: Posterior, prior: Prior) -> tuple[float, float]:
         bend + 0.1,
     )
     # No mounting repeats to a thousandth of the prior's scale.
-    new = max(float(prior.offset_sd * np.exp(step)), 1e-3 * prior.offset_scale)
+    bounds = 1e-3 * prior.offset_scale, _LARGEST_OFFSET_SD
+    new = float(np.clip(prior.offset_sd * np.exp(step), *bounds))
     return new, float(np.abs(np.log(new / prior.offset_sd))) if effective > 1.0 else 0.0
 
 

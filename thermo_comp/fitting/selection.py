@@ -117,19 +117,21 @@ def select(
     forced = tuple(dict.fromkeys(names[candidates.forced & may].tolist()))
     asked = [name for name in dict.fromkeys(names[may].tolist()) if name not in forced]
     grow = _Growth(regression, candidates, names)
-    # Without curves drift looks like mountings, or like noise: the likelier of two beginnings.
+    # Drift looks like mountings, or like noise, as long as there is no curve: two beginnings.
     begun = [prior]
     if prior.offset_scale > 0.0:
         begun.append(replace(prior, offset_sd=float(prior.sigma.mean())))
     fits = [grow.fit(forced, state, one, candidates.typical) for one in begun]
-    constants = chosen = max(fits, key=lambda fit: fit.posterior.log_evidence)
+    constants = chosen = _likeliest(fits)
     trials, round_number = [constants], 0
     if CURVE in asked:
         # All else is relative to a curve, which may help only together with it.
-        chosen = grow.fit((*forced, CURVE), chosen.posterior.state, chosen.prior, chosen.typical)
-        downweigh(regression, chosen.posterior, chosen.prior)
-        state, prior = chosen.posterior.state, chosen.prior
-        chosen = grow.fit(chosen.groups, state, prior, chosen.typical)
+        groups = *forced, CURVE
+        curve = _likeliest(
+            [grow.fit(groups, fit.posterior.state, fit.prior, fit.typical) for fit in fits]
+        )
+        downweigh(regression, curve.posterior, curve.prior)
+        chosen = grow.fit(groups, curve.posterior.state, curve.prior, curve.typical)
         trials.append(chosen)
     while True:
         found = grow.trials(chosen, [name for name in asked if name not in chosen.groups])
@@ -317,6 +319,10 @@ class _Growth:
         return np.where(np.isin(self._names, names), own, chosen.typical)
 
 
+def _likeliest(fits: Sequence[Trial]) -> Trial:
+    return max(fits, key=lambda fit: fit.posterior.log_evidence)
+
+
 def _simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
     """Take the largest gain, or of smaller models the first that is as good within the error."""
     best = max(better, key=lambda one: _gain(before.score, one.score))
@@ -342,7 +348,7 @@ def _gain(before: Score, after: Score) -> float:
     total = sum(gain for gain, _ in drift)
     if total > _EQUAL and all(gain > error for gain, error in drift):
         return total
-    is_sure = norms is not None and norms[0] > _SURE_ERRORS * norms[1]
+    is_sure = norms is not None and norms[0] > max(_SURE_ERRORS * norms[1], _EQUAL)
     if is_sure and norms and all(abs(gain) < _EQUAL for gain, _ in drift):
         return norms[0]
     return 0.0
