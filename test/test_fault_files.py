@@ -57,6 +57,26 @@ def test_a_full_disk(small_disk: Path, folder: Path, cli: Cli, name: str) -> Non
 
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
+def test_a_conversion_on_a_full_disk_leaves_no_draft(
+    small_disk: Path, tmp_path: Path, cli: Cli
+) -> None:
+    table = tmp_path / 'log.csv'
+    samples = np.random.default_rng(3).normal((0.0, 0.0, 9.8), 0.1, (9000, 3))
+    rows = [f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(samples)]
+    table.write_text('\n'.join(['time_s,x,y,z,board', *rows]))
+    columns = tmp_path / 'columns.yaml'
+    columns.write_text(
+        'stamp: {rate_hz: 100.0, start_s: 1.0}\n'
+        'accel: {columns: [x, y, z], unit: m/s^2, output: imu}\n'
+        'board: {column: board, unit: degC}\n'
+    )
+    finished = cli('convert', table, '--columns', columns, '-o', small_disk / 'log', code=None)
+    assert finished.returncode == 1, finished.stderr
+    assert 'No space left on device' in finished.stderr
+    assert not list(small_disk.rglob('*.partial*'))
+
+
+@pytest.mark.parametrize('small_disk', [300], indirect=True)
 def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk: Path, cli: Cli) -> None:
     # Some 700 KB of noise, of which no compression makes less than half.
     n = 20000
