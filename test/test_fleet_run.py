@@ -374,6 +374,7 @@ def test_siblings_help_a_unit_that_lacks_data(client: Any, tmp_path: Path) -> No
     )
     after, before_it = (float(np.linalg.norm(one / scale - 1.0)) for one in errors)
     assert after < before_it
+    assert (np.abs(errors[0] / scale - 1.0) < 3e-6 * sds[0]).all()
     assert (sds[0] < 0.5 * sds[1]).all()
     assert fit_fleet(*arguments, client=client, with_prior=True).n_done == 0
 
