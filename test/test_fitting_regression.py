@@ -254,7 +254,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(
 ) -> None:
     used = np.isin(GROUPS, groups)
     truth = Truth(on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used, start_sd=0.3)
-    windows, up = table_of(truth, 12, rng, n_windows=20, step_s=240.0)
+    windows, up = table_of(truth, 12, rng, n_windows=24, step_s=200.0)
     regression, state = begin(windows, up)
     prior = prior_of(truth, groups)
     whole = mode_of(regression, state, prior)
@@ -270,7 +270,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(
         assert score.sections.square[section] == pytest.approx(size**2, rel=2.0 * tolerance)
     assert score.sections.rms == pytest.approx(np.sqrt(score.sections.square.mean()))
     # With one position there is nothing else to leave out: the drift is that of the sections.
-    alone, state = begin(rows_of(windows, np.arange(20)), up[:1])
+    alone, state = begin(rows_of(windows, np.arange(24)), up[:1])
     alone_score = score_of(alone, alone.solve(state, prior), prior)
     assert np.isnan(alone_score.positions.rms)
     assert np.isfinite(alone_score.drift).all()

@@ -97,6 +97,13 @@ def build_calibration(
         )
     static, dynamic = regimes
     seen = [_column_range(model.columns[k], windows.raw[:, k]) for k in used]
+    # A column that only the covariance has says its error by itself, however far it moves.
+    span = temperatures[1] - temperatures[0]
+    n_curves = len(model.sets.levels())
+    for at, k in enumerate(used):
+        if not state.weights[:, :, n_curves + k].any() and model.columns[k].kind != 'even':
+            most = span ** model.columns[k].order
+            seen[at] = union((seen[at], (-most, most)))
     columns = [
         replace(
             model.columns[k], range=one if known is None else union((one, model.columns[k].range))

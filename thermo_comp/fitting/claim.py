@@ -21,11 +21,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..typing import Floats
+from ..typing import Floats, Ints
 from .equations import as_vector
 from .hyperparameters import STUDENT_NU
 from .regression import Posterior, Regression
-from .selection import Selected
+from .selection import LAGS, Selected
 from .unknowns import Layout, Prior
 
 # Standard deviations of the mounting over the scale of their prior: what evidence can tell apart.
@@ -59,19 +59,36 @@ def claim_of(
     Integrate over the mounting's standard deviation, keep open what nobody saw (`candidates`:
     typical widths, shape (2, m)), and add the error of gravity [m/s^2].
     """
-    posterior, prior = selected.posterior, selected.prior
-    if candidates is not None:
-        prior = _with_unseen(regression, posterior, prior, candidates)
-    posterior = regression.solve(posterior.state, prior, n_steps=0)
-    covariance, offset_sd = posterior.covariance, prior.offset_sd
+    prior = selected.prior
+    posterior = regression.solve(selected.posterior.state, prior, n_steps=0)
+    layout, covariance, offset_sd = posterior.layout, posterior.covariance, prior.offset_sd
     if prior.offset_scale > 0.0:
         covariance, offset_sd = _over_mountings(regression, posterior, prior)
+    if candidates is not None:
+        wider = _with_unseen(regression, posterior, prior, candidates)
+        wide = regression.solve(posterior.state, wider, n_steps=0)
+        # What unseen columns add is that beside the mounting of the mode.
+        at = _places(posterior.layout, wide.layout)
+        where = np.ix_(at, at)
+        more = covariance - posterior.covariance
+        layout, covariance = wide.layout, wide.covariance.copy()
+        covariance[where] += more
     if gravity_sd and regression.gravity:
         # Samples in units of a wrong gravity make all scale factors wrong by the same ratio.
         along = np.zeros(len(covariance))
-        along[posterior.layout.kappa] = posterior.state.kappa * gravity_sd / regression.gravity
+        along[layout.kappa] = posterior.state.kappa * gravity_sd / regression.gravity
         covariance = covariance + np.outer(along, along)
-    return Claim(posterior.layout, covariance, offset_sd)
+    return Claim(layout, covariance, offset_sd)
+
+
+def _places(layout: Layout, wider: Layout) -> Ints:
+    """Find the unit's unknowns of a layout in one of more columns, shape (n_unit,)."""
+    places = np.empty(layout.n_unit, dtype=np.int64)
+    is_used = layout.weights >= 0
+    places[layout.axis[:, :2]] = wider.axis[:, :2]
+    places[layout.weights[is_used]] = wider.weights[is_used]
+    places[layout.misalignment] = wider.misalignment
+    return places
 
 
 def _with_unseen(
@@ -82,16 +99,24 @@ def _with_unseen(
 
     A column that is absent was not needed; whether it is 0 the data determine to ``1 / sqrt(S)``,
     S what they say of it beside the columns that stayed. Where that is more than some standard
-    deviations of a window's noise, the covariance has it with that width; its weight stays 0.
+    deviations of a window's noise, once the column moves as far as the temperature did, the
+    covariance has it with that width; its weight stays 0.
     """
-    inactive = regression.inactive(posterior, prior, np.any(typical > 0.0, axis=0))
+    groups = np.array(regression.windows.groups)
+    inactive = regression.inactive(posterior, prior, np.isin(groups, LAGS) & typical.any(axis=0))
     k = len(inactive.columns)
     seen = np.diag(inactive.S).reshape(2, k, 3).mean(axis=2)
     sd = np.zeros_like(typical)
     sd[:, inactive.columns] = 1.0 / np.sqrt(np.maximum(seen, 1e-300))
-    sd = np.minimum(sd, typical)
+    for group in LAGS:
+        # All lags of a group together are as large as one of them may be.
+        own = np.isin(groups, group) & (sd > 0.0)
+        share = np.sqrt(np.maximum(own.sum(axis=1, keepdims=True), 1))
+        sd = np.where(own, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    matters = sd > _OPEN * float(np.mean(prior.sigma)) * units
+    kelvins = regression.windows.kelvins
+    farther = np.maximum(float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
+    matters = (sd > 0.0) & (sd * farther > _OPEN * float(np.mean(prior.sigma)) * units)
     return replace(prior, column_sd=np.where(matters, sd, prior.column_sd))
 
 

@@ -58,12 +58,12 @@ class Products:
         """Products of each position, shape (n_positions, n_base, n_base)."""
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
-    def without(self, section: int) -> Floats:
-        """Products of each position without one section, shape as of `whole`."""
+    def without(self, sections: Ints) -> Floats:
+        """Products of each position without some sections, shape as of `whole`."""
         result: Floats = self.whole.copy()
         position = np.cumsum(np.isin(np.arange(len(self.cells)), self.first)) - 1
-        gone = np.flatnonzero(self.section == section)
-        result[position[gone]] -= self.cells[gone]
+        gone = np.isin(self.section, sections)
+        np.subtract.at(result, position[gone], self.cells[gone])
         return result
 
 

@@ -263,7 +263,8 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
 
 def _may_have_sets(selected: Selected) -> bool:
     """Whether sets are chosen, or would explain much more although left-out data are not sure."""
-    least = _SETS_EXPLAIN * selected.prior.sigma
+    chosen = next(one for one in selected.trials if one.is_chosen)
+    least = _SETS_EXPLAIN * chosen.prior.sigma
     return any(
         SET in one.groups and (one.is_chosen or (one.is_near and (one.prior.sigma < least).all()))
         for one in selected.trials

@@ -3,9 +3,11 @@
 """
 Owns the score of a model: the error of its correction on data that took no part in the fit.
 
-Left out are, in turn, each position and each section of the program in all positions at once. The
-left-out windows are corrected as the node would correct them: by the unit's parameters alone, with
-start states at their run-time mean, without mounting offsets and without tilts of the support.
+Left out are, in turn, each position, and each section and each half of the program in all
+positions at once. A half shows what sections do not: columns that follow one program between its
+sections, and fail in another one. The left-out windows are corrected as the node would correct
+them: by the unit's parameters alone, with start states at their run-time mean, without mounting
+offsets and without tilts of the support.
 Judged are the drift, which is each axis less its mean over the position (a constant attitude needs
 no other knowledge), and the norm of the position where the other positions determine it.
 
@@ -18,6 +20,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,6 +98,7 @@ class Score:
         shape (n, 3)
     drift: drift of each window by the other positions, or where these do not determine it, by the
         other sections, shape (n, 3)
+    halves: drift of left-out halves of the program, at temperatures that the other half has seen
     """
 
     positions: Folds
@@ -102,6 +106,7 @@ class Score:
     norms: Folds
     force: Floats
     drift: Floats
+    halves: Folds
 
     @property
     def kinds(self) -> tuple[Folds, Folds, Folds]:
@@ -145,9 +150,19 @@ def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Scor
             force[rows] = own
             error = np.linalg.norm(own, axis=1) - regression.gravity
             norms[p] = np.average(error**2, weights=weight)
-    by_section, section_drift = _sections(regression, posterior, prior, edges, share)
+    n_sections = windows.n_sections
+    sections = [np.array([one]) for one in range(n_sections if n_sections > 1 else 0)]
+    by_section, section_drift = _by_sections(regression, posterior, prior, share, sections)
+    by_half, _ = _by_sections(
+        regression,
+        posterior,
+        prior,
+        share,
+        np.array_split(np.arange(n_sections), 2) if n_sections > 1 else [],
+        is_within=True,
+    )
     drift = np.where(np.isfinite(drift), drift, section_drift)
-    return Score(Folds(squares, counts), by_section, Folds(norms, counts), force, drift)
+    return Score(Folds(squares, counts), by_section, Folds(norms, counts), force, drift, by_half)
 
 
 def _without_position(
@@ -218,32 +233,46 @@ def _is_norm_determined(
     return bool(along @ covariance @ along < _DETERMINED * everything)
 
 
-def _sections(
-    regression: Regression, posterior: Posterior, prior: Prior, edges: Ints, share: Floats
+def _by_sections(
+    regression: Regression,
+    posterior: Posterior,
+    prior: Prior,
+    share: Floats,
+    folds: Sequence[Ints],
+    *,
+    is_within: bool = False,
 ) -> tuple[Folds, Floats]:
-    """Leave out each section in all positions; the drift is about the mean of what stayed."""
+    """
+    Leave out the sections of each fold in all positions; the drift is about the mean of what
+    stayed. `is_within`: judge it only at temperatures that stayed.
+    """
     windows, layout = regression.windows, posterior.layout
     products = regression.products(layout.used)
+    edges = np.searchsorted(windows.position, np.arange(windows.n_positions + 1))
     drift = np.full((len(windows.time), 3), np.nan)
-    n_sections = windows.n_sections
-    squares, counts = np.full(n_sections, np.nan), np.zeros(n_sections)
-    for section in range(n_sections) if n_sections > 1 else ():
-        grams = products.without(section)
+    squares, counts = np.full(len(folds), np.nan), np.zeros(len(folds))
+    for k, fold in enumerate(folds):
+        grams = products.without(fold)
         state = posterior.state
         for _ in range(_SECTION_STEPS):
             step, *_rest = regression.step(state, prior, layout, grams)
             state = moved_by(state, step, layout)
         force = regression.force(state)
-        gone = windows.section == section
+        gone = np.isin(windows.section, fold)
+        if is_within:
+            t = windows.columns[:, 0]
+            judged = gone & (t >= t[~gone].min()) & (t <= t[~gone].max())
+        else:
+            judged = gone
         for p in range(windows.n_positions):
             rows = np.arange(edges[p], edges[p + 1])
-            out, stayed = rows[gone[rows]], rows[~gone[rows]]
+            out, stayed = rows[judged[rows]], rows[~gone[rows]]
             if len(out) and len(stayed) >= _FEWEST_WINDOWS:
                 level = np.average(force[stayed], axis=0, weights=share[stayed])
                 drift[out] = force[out] - level
-        known = gone & np.isfinite(drift[:, 0])
+        known = judged & np.isfinite(drift[:, 0])
         if known.any():
             square = np.mean(drift[known] ** 2, axis=1)
-            squares[section] = np.average(square, weights=share[known])
-            counts[section] = known.sum()
+            squares[k] = np.average(square, weights=share[known])
+            counts[k] = known.sum()
     return Folds(squares, counts), drift

@@ -27,7 +27,7 @@ from .hyperparameters import downweigh, pruned, settle, white_noise
 from .left_out import Score, score_of
 from .regression import Posterior, Regression
 from .unknowns import InformativePrior, Noise, Prior, State
-from .windows import CURVE
+from .windows import CURVE, SET
 
 # A group is worth a trial if it could add this to the log evidence: e^4 = 55 to one.
 _WORTH_A_TRIAL = 4.0
@@ -36,8 +36,9 @@ _TRIALS = 3
 # Groups that one law of physics needs together: parts that lag by m have the curve of their own
 # temperature, (t - m)^2 = t^2 - 2 t m + m^2; where m is of the flow between two thermometers, the
 # product is mixed.
-_LAGS = ('now', 'board', 'neighbour')
-_TOGETHER = (('product', 'square'), (*_LAGS, 'product', 'mixed', 'square'))
+#: Groups that are linear in a temperature difference.
+LAGS = ('now', 'board', 'neighbour')
+_TOGETHER = (('product', 'square'), (*LAGS, 'product', 'mixed', 'square'))
 # The noise is sought in steps of this factor, then of its roots; its white part follows in so many
 # rounds.
 _NOISE_STEP, _NOISE_ROUNDS = 3.0, 2
@@ -296,10 +297,14 @@ class _Growth:
         gains = {names: inactive.gain(typical, np.isin(self._names, names)) for names in asked}
         likely = [names for names in asked if gains[names] > _WORTH_A_TRIAL]
         likely.sort(key=gains.__getitem__, reverse=True)
+        tried = likely[:_TRIALS]
+        if chosen.groups == (CURVE,) and (SET,) in likely[_TRIALS:]:
+            # The paper's two sets are always looked at.
+            tried.append((SET,))
         state, prior = chosen.posterior.state, chosen.prior
         return [
             self.fit((*chosen.groups, *names), state, prior, self._typical(chosen, names))
-            for names in likely[:_TRIALS]
+            for names in tried
         ]
 
     def _typical(self, chosen: Trial, names: tuple[str, ...]) -> Floats:
@@ -343,7 +348,8 @@ def _gain(before: Score, after: Score) -> float:
     """
     positions, sections, norms = _gains(before, after)
     drift = [one for one in (positions, sections) if one]
-    if norms and norms[0] < -norms[1]:
+    halves = before.halves.gain_of(after.halves)
+    if (norms and norms[0] < -norms[1]) or (halves and halves[0] < 0.0):
         return 0.0
     total = sum(gain for gain, _ in drift)
     if total > _EQUAL and all(gain > error for gain, error in drift):

@@ -34,7 +34,7 @@ CURVE, SET = 'curve', 'set'
 FEWEST_WINDOWS = 20
 #: A position is cut into so many sections of equal length; chamber programs repeat over bags, so
 #: these are sections of the program.
-N_SECTIONS = 5
+N_SECTIONS = 6
 # After this every lag has forgotten how it began [s].
 _EVER_S = 1e9
 
