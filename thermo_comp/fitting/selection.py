@@ -144,7 +144,9 @@ def select(
             break
         chosen = _simplest_of_the_best(chosen, better)
     if chosen is not constants and not is_better(constants.score, chosen.score):
-        chosen = constants
+        gain = chosen.posterior.log_evidence - constants.posterior.log_evidence
+        if not _is_open(constants.score, chosen.score) or gain < _WORTH_A_TRIAL:
+            chosen = constants
     settled = replace(candidates, typical=chosen.typical)
     posterior, prior, score = finish(regression, chosen.posterior, chosen.prior, settled)
     marked = []
@@ -352,12 +354,18 @@ def _gain(before: Score, after: Score) -> float:
     if (norms and norms[0] < -norms[1]) or (halves and halves[0] < 0.0):
         return 0.0
     total = sum(gain for gain, _ in drift)
-    if total > _EQUAL and all(gain > error for gain, error in drift):
+    if total > _EQUAL * len(drift) and all(gain > error for gain, error in drift):
         return total
     is_sure = norms is not None and norms[0] > max(_SURE_ERRORS * norms[1], _EQUAL)
     if is_sure and norms and all(abs(gain) < _EQUAL for gain, _ in drift):
         return norms[0]
     return 0.0
+
+
+def _is_open(before: Score, after: Score) -> bool:
+    """Whether left-out data cannot tell: the drifts are equal, no norms are left out in common."""
+    *drift, norms = _gains(before, after)
+    return norms is None and all(abs(one[0]) < _EQUAL for one in drift if one)
 
 
 def _is_near(chosen: Score, other: Score) -> bool:
