@@ -91,6 +91,8 @@ def rich_calibration():
             term('board', (1e-3, -2e-3, 1e-3), group='product', tau_s=600.0, power=1),
             term('even', (0.3, 0.2, 0.1), (1e-6,) * 3, width_k=1.5, power=1, range=(0.0, 1.0)),
             term('play', (0.1, 0.05, -0.1), (1e-6,) * 3, width_k=0.8, range=(-1.0, 1.0)),
+            term('bend', (0.2, -0.1, 0.1), tau_s=600.0, knee_k=4.0, range=(0.0, 40.0)),
+            term('bend', (0.1, 0.1, 0.2), knee_k=-3.0, range=(0.0, 40.0)),
             term('play', (0.1, -0.1, 0.1), width_k=1.6, tau_s=900.0, range=(-2.0, 2.0)),
         ),
     )

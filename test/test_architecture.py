@@ -41,7 +41,9 @@ def test_the_files_that_a_page_names_exist(page: str) -> None:
 def test_the_table_of_the_response_has_every_group() -> None:
     text = (DOCS / 'theory.md').read_text()
     shown = re.findall(r'^\| `(\w+)` \|', text, re.MULTILINE)
-    assert shown == list(dict.fromkeys(column.group for column in bank(at_rest={'case': -0.5})))
+    assert shown == list(
+        dict.fromkeys(column.group for column in bank(('case',), {'case': -0.5}, (-9.0, 9.0)))
+    )
 
 
 # Not (3) to (5), which take signed counts at +I and -I apart: no command measures those.

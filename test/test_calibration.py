@@ -173,7 +173,7 @@ TEXT = dump_calibration(RICH)
         ('sensors: [case, frame]', 'sensors: [case, case]', 'sensors', 'different names'),
         ('sensors: [case, frame]', 'sensors: []', 'sensors', 'at least one'),
         ('sensors: [case, frame]', 'sensors: [board]', 'sensors', 'none of them board'),
-        ('- kind: now', '- kind: then', 'response[0].kind', "'play', got 'then'"),
+        ('- kind: now', '- kind: then', 'response[0].kind', "'bend', got 'then'"),
         ('tau_s: 600.0', 'tau_s: 0.0', 'response[3].tau_s', 'greater than 0 for board, got 0'),
         ('tau_s: 600.0', 'tau_s: -1.0', 'response[3].tau_s', 'must be at least 0, got -1.0'),
         ('width_k: 1.5', 'width_k: 0.0', 'response[7].width_k', 'greater than 0 for even'),
@@ -182,7 +182,7 @@ TEXT = dump_calibration(RICH)
         ('during: static', 'during: sometimes', 'response[2].during', "got 'sometimes'"),
         ('[2.0e-05, 2.0e-05, 2.0e-05]', '[2.0e-05]', 'response[0].scale', 'must have 3 entries'),
         ('scale: [2.0e-05', 'scale: [0.1', 'static.x.scale_function', 'above 0.1 .* reaches -4'),
-        ('rank: ', 'rank: 9', 'posterior.factor', 'must hold 93 x 993 numbers'),
+        ('rank: ', 'rank: 9', 'posterior.factor', 'must hold 105 x 9105 numbers'),
         ('rank: ', 'rank: -', 'posterior.rank', 'must be at least 0'),
         (
             'smallest_ramp_k_min: ',

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from thermo_comp.thermal.memory import MemorySpec
 from thermo_comp.thermal.settings import DetectorSettings
-from thermo_comp.thermal.state import GRADIENT, Layout
+from thermo_comp.thermal.state import BOARD, GRADIENT, Layout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.columns import (
     BANK_TAUS,
@@ -48,6 +48,11 @@ def test_the_bank():
         'even': 42, 'play': 20,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
+    # Knees within the temperatures seen, for the board and for parts that lag it.
+    assert 'bend' not in by_group(bank(span_k=(-0.4, 0.4)))
+    bends = [column for column in bank(span_k=(-10.0, 2.0)) if column.group == 'bend']
+    assert len(bends) == 12 * len({column.tau_s for column in bends}) == 96
+    assert all(-10.0 < column.knee_k < 2.0 for column in bends)
 
 
 def test_change_is_even_about_rest():
@@ -94,6 +99,9 @@ def test_each_value_by_hand():
         Column('even', 'square', 'tip', power=1, **WIDE),
         Column('even', 'size', 'tip', **WIDE),
         Column('even', 'size', 'tip', power=1, range=(0.0, 0.5)),
+        Column('bend', 'bend', knee_k=2.0, **WIDE),
+        Column('bend', 'bend', tau_s=60.0, knee_k=2.0, **WIDE),
+        Column('bend', 'bend', tau_s=60.0, knee_k=2.6, **WIDE),
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = Layout(spec)
@@ -105,7 +113,7 @@ def test_each_value_by_hand():
     found = ColumnTable(columns, spec, 20.0).values(state)[:, 0]
     expected = [
         -0.7, 0.01, 0.5, -0.3, -0.9, math.tanh(0.64) * 9.0, 0.1, 0.25, 0.375, 0.125 * 27.0,
-        0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0,
+        0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0, 1.0, 0.5, 0.0,
     ]  # fmt: skip
     assert found == pytest.approx(expected)
     # t is held at the edge of the calibrated temperatures, the lag itself is not.
@@ -114,10 +122,31 @@ def test_each_value_by_hand():
     assert at_edge[2] == 0.5
 
 
+def test_a_bend_moves_with_the_board_and_its_lag() -> None:
+    columns = [Column('bend', 'bend', tau_s=tau, knee_k=2.0, **WIDE) for tau in (0.0, 60.0)]
+    spec = memory_of(columns)
+    table = ColumnTable(columns, spec, 20.0)
+    state = np.zeros((Layout(spec).width, 1))
+    lag = Layout(spec).lags['board', 60.0]
+    state[BOARD], state[lag] = 24.0, 0.5
+    # By the number that it is computed from, and by the board at a given lag.
+    assert table.slopes(state)[:, 0].tolist() == [1.0, -1.0]
+    assert table.board_slopes(state)[:, 0].tolist() == [1.0, 1.0]
+    state[BOARD] = 21.0
+    assert not table.slopes(state).any()
+    assert not table.board_slopes(state).any()
+    assert (
+        ColumnTable([Column('now', 'now', **WIDE)], MemorySpec(), 20.0).board_slopes(
+            np.zeros((7, 1))
+        )
+        is None
+    )
+
+
 @given(st.lists(st.floats(-60.0, 60.0), min_size=5, max_size=5))
 @settings(max_examples=50, deadline=None)
 def test_one_state_has_the_bits_of_many(boards):
-    columns = bank(('case', 'tip'))
+    columns = bank(('case', 'tip'), span_k=(-10.0, 10.0))
     tracker = ThermalTracker(DetectorSettings(), memory_of(columns, ('case', 'tip')))
     rows = []
     for second, celsius in enumerate(boards):

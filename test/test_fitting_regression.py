@@ -392,6 +392,11 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise: Noise) -> None:
     gain = max(gains) - posterior.log_evidence
     assert gain > 100.0
     assert inactive.gain(wide, asked) == pytest.approx(gain, rel=0.01)
+    # One after another, those that the data have: never what they do not, none twice.
+    chosen = inactive.chosen(wide, asked, 4.0, 9)
+    assert np.array(GROUPS)[chosen].tolist() == ['board'] * (np.array(GROUPS) == 'board').sum()
+    assert inactive.chosen(wide, asked, 4.0, 1).sum() == 1
+    assert not inactive.chosen(wide, asked, 1e9, 9).any()
 
 
 def test_tangent_basis_is_orthonormal(rng: np.random.Generator) -> None:

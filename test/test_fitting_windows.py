@@ -189,14 +189,15 @@ def test_each_column_stands_without_the_others(bags: list[ReducedBag]) -> None:
 
 def test_the_lag_of_a_column_moves_it_as_its_slope_says() -> None:
     # A lag that began a microkelvin elsewhere, through the columns' own formula.
-    spec = memory_of(bank())
-    layout, table = Layout(spec), ColumnTable(bank(), spec, 20.0)
+    columns = bank(span_k=(-4.0, 12.0))
+    spec = memory_of(columns)
+    layout, table = Layout(spec), ColumnTable(columns, spec, 20.0)
     state = np.zeros((layout.width, 1))
     state[0], state[layout.gradients['case']] = 27.0, 0.4
     for lag, place in layout.lags.items():
         state[place] = 0.3 + 1e-4 * lag[1]
     expected = (table.slopes(state) * table.factors(state[0], state[3])[0])[:, 0]
-    for k, column in enumerate(bank()):
+    for k, column in enumerate(columns):
         if column.lag and column.kind != 'play':
             step = np.zeros_like(state)
             step[layout.lags[column.lag]] = 1e-6

@@ -35,7 +35,7 @@ from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
 from .selection import Selected, is_better
-from .sensors import gradients_at_rest, learn_detector
+from .sensors import board_span, gradients_at_rest, learn_detector
 from .sources import FitSource
 from .start import position_means
 from .windows import FEWEST_WINDOWS, SET, Model, ThermalWindows, thermal_windows
@@ -192,7 +192,9 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     else:
         sets = sets_of(options, bags)
         is_paper = options.model == 'golovach'
-        columns = () if is_paper else bank(sensors, gradients_at_rest(bags, sensors))
+        rests = gradients_at_rest(bags, sensors)
+        span = board_span(bags, options.reference_temperature)
+        columns = () if is_paper else bank(sensors, rests, span)
         if not any(len(bag.case.value) for bag in bags):
             # A gradient that is guessed from the board's rate tells nothing that its lags do not.
             columns = tuple(one for one in columns if not one.is_of_sensor)

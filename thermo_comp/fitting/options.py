@@ -45,7 +45,7 @@ CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
 #: What evidence judges: curve and set of the two sets, then the groups of the response.
 GROUPS = (
     'curve', 'set', 'now', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'change',
-    'play',
+    'play', 'bend',
 )  # fmt: skip
 _ORDERS = {'linear': 1, 'quadratic': 2, 'cubic': 3}
 _SPLINE_PIECES = 4

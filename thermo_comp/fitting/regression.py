@@ -158,6 +158,33 @@ class Inactive:
         S, q2 = square * np.maximum(S, 0.0), square * (along.T @ (sd[at] * self.Q[at])) ** 2
         return 0.5 * float((q2 / (1.0 + S) - np.log1p(S)).sum(axis=1).max(initial=0.0))
 
+    def chosen(self, column_sd: Floats, wanted: Bools, least: float, most: int) -> Bools:
+        """
+        Choose some of the columns wanted, one after another: the one that adds most to the log
+        evidence beside those before it in its prior standard deviation, as long as it adds more
+        than `least`; shape (m,).
+        """
+        k = len(self.columns)
+        sd = column_sd[:, self.columns] * wanted[self.columns]
+        sd = np.repeat(sd[..., None], 3, axis=2).ravel()
+        S, Q = self.S * np.outer(sd, sd), self.Q * sd
+        result = np.zeros_like(wanted)
+        for _ in range(most):
+            square = _PARTS[:, None] ** 2
+            s, q2 = square * np.maximum(np.diag(S), 0.0), square * Q**2
+            each = 0.5 * (q2 / (1.0 + s) - np.log1p(s)).reshape(-1, 2, k, 3).sum(axis=(1, 3))
+            part, best = np.unravel_index(int(np.argmax(each)), each.shape)
+            if each[part, best] < least:
+                break
+            result[self.columns[best]] = True
+            at = np.arange(2 * k * 3).reshape(2, k, 3)[:, best].ravel()
+            at = at[sd[at] > 0.0]
+            own = S[np.ix_(at, at)] + np.eye(len(at)) / _PARTS[part] ** 2
+            solved = np.linalg.solve(own, np.column_stack((S[at], Q[at])))
+            S, Q = S - S[:, at] @ solved[:, :-1], Q - S[:, at] @ solved[:, -1]
+            S[at], S[:, at], Q[at] = 0.0, 0.0, 0.0
+        return result
+
 
 def factored(matrix: Floats) -> Floats:
     """Return the lower Cholesky factor of a positive definite matrix, but for rounding."""

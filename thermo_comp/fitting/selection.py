@@ -27,7 +27,7 @@ from .hyperparameters import downweigh, pruned, settle, white_noise
 from .left_out import Score, score_of
 from .regression import Posterior, Regression
 from .unknowns import InformativePrior, Noise, Prior, State
-from .windows import CURVE, SET
+from .windows import BEND, CURVE, SET
 
 # A group is worth a trial if it could add this to the log evidence: e^4 = 55 to one.
 _WORTH_A_TRIAL = 4.0
@@ -39,6 +39,8 @@ _TRIALS = 3
 #: Groups that are linear in a temperature difference.
 LAGS = ('now', 'board', 'neighbour')
 _TOGETHER = (('product', 'square'), (*LAGS, 'product', 'mixed', 'square'))
+# So many columns of knees are asked for in a round.
+_MOST_BENDS = 16
 # The noise is sought in steps of this factor, then of its roots; its white part follows in so many
 # rounds.
 _NOISE_STEP, _NOISE_ROUNDS = 3.0, 2
@@ -293,6 +295,11 @@ class _Growth:
         typical = self._candidates.typical
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self._regression.inactive(chosen.posterior, chosen.prior, columns)
+        if BEND in absent:
+            # Of many knees few are asked for: those that the data show one after another.
+            is_bend = self._names == BEND
+            knees = inactive.chosen(typical, is_bend, _WORTH_A_TRIAL, _MOST_BENDS)
+            typical = np.where(is_bend & ~knees, 0.0, typical)
         asked: list[tuple[str, ...]] = [(name,) for name in absent]
         together = (tuple(name for name in names if name in absent) for names in _TOGETHER)
         asked += [names for names in together if len(names) > 1]
@@ -305,12 +312,15 @@ class _Growth:
             tried.append((SET,))
         state, prior = chosen.posterior.state, chosen.prior
         return [
-            self.fit((*chosen.groups, *names), state, prior, self._typical(chosen, names))
+            self.fit((*chosen.groups, *names), state, prior, self._typical(chosen, names, typical))
             for names in tried
         ]
 
-    def _typical(self, chosen: Trial, names: tuple[str, ...]) -> Floats:
-        """Typical widths once a group is added: those of its columns explain what is left."""
+    def _typical(self, chosen: Trial, names: tuple[str, ...], most: Floats) -> Floats:
+        """
+        Typical widths once a group is added: those of its columns explain what is left, and are
+        `most` at most.
+        """
         kelvins = self._regression.windows.kelvins
         moved = float(kelvins[0]) or 1.0
         left = float(
@@ -322,7 +332,7 @@ class _Growth:
         )
         slope = left / moved
         units = np.array([[1.0], [1.0 / (self._regression.gravity or 1.0)]])
-        own = np.minimum(slope * units * kelvins, self._candidates.typical)
+        own = np.minimum(slope * units * kelvins, most)
         return np.where(np.isin(self._names, names), own, chosen.typical)
 
 

@@ -25,6 +25,8 @@ from .reduction import NO_READINGS, Readings, ReducedBag
 _SMALLEST_NOISE = 1e-4
 _BIN_S = 10.0
 _BINS_PER_SIDE = 6
+# Shares of readings that are no more than stray ones.
+_STRAY = (0.005, 0.995)
 _MINUTE_S = 60.0
 # A ramp is clear when its rate is this far above the noise of rates.
 _CLEAR = 5.0
@@ -203,6 +205,15 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
         lag = float(moved @ g) / power if power > 0.0 else 0.0
         result[name] = round(float(np.median(g - lag * v)), 3) if len(g) else 0.0
     return result
+
+
+def board_span(bags: Sequence[ReducedBag], reference: float) -> tuple[float, float]:
+    """Return the board temperatures seen, from the reference [K], but for stray readings."""
+    values = np.concatenate([bag.board.value for bag in bags])
+    if not len(values):
+        return 0.0, 0.0
+    lower, upper = (np.quantile(values, _STRAY) - reference).tolist()
+    return lower, upper
 
 
 def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str, int, float]]:

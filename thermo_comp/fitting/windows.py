@@ -29,7 +29,7 @@ from .unknowns import Windows
 # Neighbouring windows of a position are merged up to this length [s].
 _WINDOW_S = 60.0
 #: Groups of the sets themselves, beside those of the response.
-CURVE, SET = 'curve', 'set'
+CURVE, SET, BEND = 'curve', 'set', 'bend'
 #: A short rest still has so many windows: from less, no noise is learnt.
 FEWEST_WINDOWS = 20
 #: A position is cut into so many sections of equal length; chamber programs repeat over bags, so
@@ -192,10 +192,10 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
         start=np.hstack((np.zeros((len(time), len(groups))), rows[:, moved_at:end])),
         start_covariance=start_covariance(spec.lags),
         # Fc is 1 at the reference in either regime, so the scale has no level of its own there;
-        # a play in the scale has never been seen.
+        # a play or a bend in the scale has never been seen.
         in_scale=np.array(
             [not (group == SET and is_level) for group, is_level in sets.levels()]
-            + [column.kind != 'play' for column in columns]
+            + [column.kind not in ('play', 'bend') for column in columns]
         ),
         tilt=tilt[:, is_tilting] / tilt_rms[is_tilting],
     )

@@ -20,6 +20,7 @@ even       tanh((q_s / width)^2)       heat load whichever way the heat flows
 size       abs(q_s)                    the same, as a heat pump's
 play       P_r(v) - v, v = t or        rate-independent hysteresis
            v = L_tau(t)
+bend       max(v - knee, 0)            a slope that changes at one temperature of a part
 =========  ==========================  ====================================================
 
 Kinds *even* and *size* have the same value for heating and cooling. They are computed from ``q_s =
@@ -68,6 +69,9 @@ BANK_TAUS: Final = FINE_TAUS[::2]
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final = (0.0, 450.0, 900.0, 1800.0)
+#: Lags of the parts whose slope changes at a knee [s]; distance [K] and number of the knees.
+BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
+LEAST_KNEE_K, MOST_KNEES = 1.0, 20
 
 
 _Value = Annotated[float, QUANTITIES['value of a column']]
@@ -89,24 +93,30 @@ class Column:
             'even',
             'change',
             'play',
+            'bend',
         ],
         'Group of columns that the fit keeps or drops together.',
     ]
     kind: Annotated[
-        Literal['now', 'rate', 'board', 'neighbour', 'square', 'cube', 'size', 'even', 'play'],
+        Literal[
+            'now', 'rate', 'board', 'neighbour', 'square', 'cube', 'size', 'even', 'play', 'bend'
+        ],
         'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or q_s^2 without '
-        'lag; (T - lagged T)^3; abs(q_s); tanh((q_s / width)^2); play of t minus t, where '
-        'g_s = T_s - T_board and q_s = g_s - rest_k.',
+        'lag; (T - lagged T)^3; abs(q_s); tanh((q_s / width)^2); play of t minus t; max(t - '
+        'knee_k, 0), of t lagged, where g_s = T_s - T_board and q_s = g_s - rest_k.',
     ]
     sensor: Annotated[str, 'The thermometer s of g_s.'] = 'case'
     tau_s: Annotated[
         float,
         QUANTITIES['lag'],
-        'Time constant of the lag (board, neighbour, square, cube; play: 0 = none).',
+        'Time constant of the lag (board, neighbour, square, cube; play, bend: 0 = none).',
     ] = 0.0
     width_k: Annotated[float, QUANTITIES['width'], 'Width of even, half-width of play.'] = 0.0
     rest_k: Annotated[
         float, QUANTITIES['gradient'], 'g_s at rest, for even, size and square without lag.'
+    ] = 0.0
+    knee_k: Annotated[
+        float, QUANTITIES['gradient'], 'Where the slope of bend changes, from the reference.'
     ] = 0.0
     power: Annotated[int, QUANTITIES['power'], 'The value is multiplied by t to this power.'] = 0
     during: Annotated[
@@ -158,11 +168,13 @@ class Column:
 
 
 def bank(
-    sensors: Sequence[str] = ('case',), at_rest: Mapping[str, float] | None = None
+    sensors: Sequence[str] = ('case',),
+    at_rest: Mapping[str, float] | None = None,
+    span_k: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Column, ...]:
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
-    of each sensor at rest [K].
+    of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K].
     """
     now = [Column('now', 'now', sensor, range=UNBOUNDED) for sensor in sensors]
     board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in FINE_TAUS]
@@ -206,7 +218,13 @@ def bank(
         for tau in PLAY_TAUS
         for width in PLAY_WIDTHS
     ]
-    return (*now, *board, *neighbour, *product, *mixed, *square, *even, *play)
+    n_knees = min(int((span_k[1] - span_k[0]) / LEAST_KNEE_K), MOST_KNEES)
+    bend = [
+        Column('bend', 'bend', tau_s=tau, knee_k=knee, range=UNBOUNDED)
+        for tau in BEND_TAUS
+        for knee in np.linspace(*span_k, n_knees + 2)[1:-1].round(3).tolist()
+    ]
+    return (*now, *board, *neighbour, *product, *mixed, *square, *even, *play, *bend)
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
@@ -234,6 +252,7 @@ _FORMS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Flo
     'square': (lambda x: x * x, lambda x: 2.0 * x),
     'cube': (lambda x: x * x * x, lambda x: 3.0 * x * x),
     'size': (np.abs, np.sign),
+    'bend': (lambda x: np.maximum(x, 0.0), lambda x: (x > 0.0).astype(np.float64)),
     'even': (
         lambda x: by_element(math.tanh, x * x),
         lambda x: 2.0 * x * (1.0 - by_element(math.tanh, x * x) ** 2),
@@ -276,6 +295,9 @@ class ColumnTable:
         self._places = np.array([source[0] for source in sources], np.int64)
         self._widths = np.array([source[2] for source in sources])[:, np.newaxis]
         self._rests = np.array([source[3] for source in sources])[:, np.newaxis]
+        # A bend is of the board less its lag: two numbers of a state.
+        self._bends = np.array([k for k, one in enumerate(sources) if one[1] == 'bend'], np.int64)
+        self._is_lagging = self._places[self._bends][:, np.newaxis] != BOARD
         rows = {
             form: [k for k, source in enumerate(sources) if source[1] == form] for form in _FORMS
         }
@@ -287,10 +309,17 @@ class ColumnTable:
 
     def raw(self, states: Floats) -> Floats:
         """Evaluate u of each column, without the limits of its range."""
-        u = (states[self._places] - self._rests) / self._widths
+        u = self._scaled(states)
         for rows, value, _ in self._forms:
             u[rows] = value(u[rows])
         return np.asarray(u[self._source])
+
+    def _scaled(self, states: Floats) -> Floats:
+        numbers = states[self._places]
+        if len(self._bends):
+            lag = np.where(self._is_lagging, numbers[self._bends], 0.0)
+            numbers[self._bends] = states[BOARD] - self._reference - lag
+        return np.asarray((numbers - self._rests) / self._widths)
 
     def held(self, raw: Floats) -> Floats:
         """Limit the result of `raw` to the columns' ranges."""
@@ -318,11 +347,19 @@ class ColumnTable:
     def slopes(self, states: Floats) -> Floats:
         """Differentiate u by the number that it is computed from, without limits of range."""
         slopes = np.ones((len(self._places), states.shape[1]))
+        scaled = self._scaled(states)
         for rows, _, slope in self._forms:
-            slopes[rows] = slope(
-                (states[self._places[rows]] - self._rests[rows]) / self._widths[rows]
-            )
+            slopes[rows] = slope(scaled[rows])
+        slopes[self._bends] *= np.where(self._is_lagging, -1.0, 1.0)
         return np.asarray((slopes / self._widths)[self._source])
+
+    def board_slopes(self, states: Floats) -> Floats | None:
+        """Differentiate u by the board temperature at a given lag; None if none depends on it."""
+        if not len(self._bends):
+            return None
+        slopes = np.zeros((len(self._places), states.shape[1]))
+        slopes[self._bends] = self._scaled(states)[self._bends] > 0.0
+        return np.asarray(slopes[self._source])
 
 
 def _source(column: Column, layout: Layout) -> tuple[int, str, float, float]:
@@ -334,7 +371,10 @@ def _source(column: Column, layout: Layout) -> tuple[int, str, float, float]:
         place = layout.plays[column.tau_s, column.width_k]
     elif column.lag:
         place = layout.lags[column.lag]
+    elif column.kind == 'bend':
+        place = BOARD
     else:
         place = layout.gradients[column.sensor]
     width = column.width_k if form == 'even' else 1.0
-    return place, form, width, column.rest_k if form != 'line' else 0.0
+    rest = column.knee_k if form == 'bend' else column.rest_k
+    return place, form, width, rest if form != 'line' else 0.0

@@ -238,7 +238,10 @@ class Correction:
         variances = (shares * states[VAR_BOARD], states[self._felt_variances])
         felt = self.felt(states, factors[0])
         # The response depends on the board temperature by t^power and by gradients and lags.
-        on_board = self._weigh(raw * factors[1], in_order(self._signs * felt, 0))
+        on_board = raw * factors[1]
+        if (direct := self.table.board_slopes(states)) is not None:
+            on_board = on_board + direct * factors[0]
+        on_board = self._weigh(on_board, in_order(self._signs * felt, 0))
         slopes = self.curves.slopes(board)
         v = self._spread(np.concatenate(variances), np.concatenate((slopes + on_board, felt)))
         v[:, 0] += (shares[:, np.newaxis] * self.curves.unexplained(board)).sum(axis=0)

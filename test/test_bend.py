@@ -1,0 +1,62 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A bias whose slope changes at one temperature, fitted and corrected through the public API."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import thermo_comp as tc
+
+G = 9.80665
+MICRO_G = 1e-6 * G
+KNEE_C, SLOPE = 21.3, 20.0  # [degC], [ug/K]
+BIAS = 1e-3 * G
+#: Sd of the samples [m/s^2]: 0.4 ug in the mean of a minute at 1 Hz.
+NOISE = 3.0 * MICRO_G
+UPS = np.array(
+    [[1, 0, 0], [-1, 0.1, 0], [0, 1, 0.1], [0.1, -1, 0], [0, 0.1, 1], [0, 0, -1],
+     [1, 1, 0], [0, 1, 1], [1, 0, 1], [1, -1, 1], [-1, 1, 1], [1, 1, -1]]
+) / 1.0  # fmt: skip
+
+
+def recording(up: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Simulate times, m/s^2 and board temperatures of two hours, 10 to 32 degC and back."""
+    time_s = np.arange(0.0, 7200.0)
+    board = np.interp(time_s, (0.0, 600.0, 3600.0, 7200.0), (10.0, 10.0, 32.0, 12.0))
+    bias = SLOPE * MICRO_G * np.maximum(board - KNEE_C, 0.0)
+    force = G * up / np.linalg.norm(up) + bias[:, None] * (1.0, -1.0, 0.5) + BIAS
+    return time_s, force + NOISE * rng.standard_normal((len(time_s), 3)), board
+
+
+def left_by(groups: tuple[str, ...]) -> tuple[tc.Calibration, float]:
+    """Fit some groups, and correct another recording: RMS error of minutes [ug]."""
+    rng = np.random.default_rng(8)
+    bags = [
+        tc.Columns(time_s, force, {'board': (time_s[::5], board[::5])}, name=f'rest{k}')
+        for k, (time_s, force, board) in enumerate(recording(up, rng) for up in UPS)
+    ]
+    unit = tc.fit(bags, gravity=G, input='m/s^2', groups=groups, mounting_sd=1e-7)
+    up = np.array([0.3, -0.5, 0.8])
+    time_s, force, board = recording(up, rng)
+    found = unit.correct(time_s, force, board=(time_s[::5], board[::5])).specific_force
+    error = found[600:] - G * up / np.linalg.norm(up)
+    minutes = error.reshape(-1, 60, 3).mean(axis=1)
+    return unit, float(np.sqrt(np.mean(minutes**2)) / MICRO_G)
+
+
+def test_a_knee_of_the_bias_is_found() -> None:
+    unit, left = left_by(('curve', 'bend'))
+    knees = [term.knee_k for term in unit.response if term.group == 'bend']
+    # Knees stand a kelvin apart: those on both sides of the true one are used.
+    assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
+    # Between two knees the slope of the mean of both: at most 20 ug/K times a quarter of their
+    # distance, over a kelvin of the 22 that the recording goes through.
+    assert left < 1.5
+
+
+def test_a_curve_without_a_knee_has_no_bend(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), 'SLOPE', 0.0)
+    unit, _ = left_by(('curve', 'bend'))
+    assert not [term for term in unit.response if term.group == 'bend']
