@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set, term
 
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.unit.calibration import Axes, AxisReference, Calibration, Unit
@@ -173,6 +174,21 @@ def bag(
             for second, value in zip(times.tolist(), noisy.tolist(), strict=True)
         ]
     return sorted(events, key=lambda event: event[1])
+
+
+def corrected(
+    events: list[Event], compensator: Compensator | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps and rows (force, covariance) of the published samples, without DDS."""
+    compensator = compensator or Compensator(unit(), CONFIG)
+    stamps, rows = [], []
+    for topic, stamp_ns, message in events:
+        if topic != 'counts':
+            compensator.push(topic, stamp_ns, message)
+        elif row := compensator.process(stamp_ns, *message):
+            stamps.append(stamp_ns)
+            rows.append(row)
+    return np.array(stamps, np.int64), np.array(rows).reshape(-1, 9)
 
 
 def seconds_of(stamp_ns: int) -> float:

@@ -18,9 +18,8 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from fault_bench import Bench, Heard, bench
-from fault_rig import CONFIG, RATE_HZ, START_NS, bag, force_at, seconds_of, unit
+from fault_rig import RATE_HZ, START_NS, bag, corrected, force_at, seconds_of, unit
 
-from thermo_comp.online.compensator import Compensator
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import SIZE_LIMIT, dump_calibration, save_calibration
 
@@ -39,18 +38,6 @@ def node(path: Path) -> Iterator[Bench]:
         yield started
 
 
-def expected(events: list[Any]) -> np.ndarray:
-    """Return what the compensator gives in a process of its own, sample by sample."""
-    compensator = Compensator(unit(), CONFIG)
-    rows = []
-    for topic, stamp_ns, value in events:
-        if topic == 'counts':
-            rows.append(compensator.process(stamp_ns, *value))
-        else:
-            compensator.push(topic, stamp_ns, value)
-    return np.array([row for row in rows if row is not None])
-
-
 def sigmas(heard: Heard) -> float:
     """Return the largest error in the standard deviations that it was published with."""
     seconds = (heard.stamp_ns - START_NS) * 1e-9
@@ -63,14 +50,14 @@ def test_a_publisher_restarts(node: Bench) -> None:
     first = node.play([e for e in events if seconds_of(e[1]) < 50.0])
     node.restart_publishers()
     second = node.play([e for e in events if seconds_of(e[1]) >= 50.0])
-    table = expected(events)
+    _, table = corrected(events)
     np.testing.assert_array_equal(np.concatenate((first.force, second.force)), table[:, :3])
     assert second.values['lost'] == '0'
 
 
 def test_the_node_is_killed_and_restarts_in_the_ramp(path: Path) -> None:
     events = [e for e in bag() if seconds_of(e[1]) < 300.0]
-    undisturbed = expected(events)
+    _, undisturbed = corrected(events)
     with bench(path) as node:
         before = node.play([e for e in events if seconds_of(e[1]) < 90.0])
         assert sigmas(before) < SIGMAS
@@ -163,7 +150,7 @@ def test_calibration_files_that_go_bad(path: Path, tmp_path: Path) -> None:
             assert '\n' not in result.reason
     # All the while the calibration that was read runs on.
     n = sum(len(one.force) for one in heard)
-    table = expected(events)[:n, :3]
+    table = corrected(events)[1][:n, :3]
     np.testing.assert_allclose(
         np.concatenate([one.force for one in heard]), table, rtol=0.0, atol=1e-9
     )
