@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from triads import sibling, unit_of
 
 from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.priors import population
@@ -28,7 +29,6 @@ from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording.blocks import Block, Readings
 from thermo_comp.simulation.campaign import plan
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import SimulatedRun, arrays
 from thermo_comp.typing import Floats
 from thermo_comp.unit.calibration import Calibration, parameter_layout
@@ -218,7 +218,7 @@ def part_kinds(options: argparse.Namespace) -> None:
     for kind in options.kinds or GOALS:
         goal = GOALS[kind]
         for seed in range(1, options.seeds + 1):
-            unit = unit_preset(kind, seed)
+            unit = unit_of(kind, seed)
             records = arrays(unit, plan(goal.plan, seed), seed, rate_hz=options.rate_hz)
             tests = arrays(unit, plan('held-out', seed), seed + 500, rate_hz=options.rate_hz)
             least = floor(tests)
@@ -242,13 +242,13 @@ def part_plans(options: argparse.Namespace) -> None:
     print('|---|---|---|---|---|---|---|')
     for kind in options.kinds or ('own-lags', 'between', 'products'):
         for seed in range(1, options.seeds + 1):
-            unit = unit_preset(kind, seed)
+            unit = unit_of(kind, seed)
             tests = arrays(unit, plan('held-out', seed), seed + 500, rate_hz=options.rate_hz)
             least = floor(tests)
             siblings = population([
                 fitted(
                     arrays(
-                        unit.sibling(number), plan('chamber-18', number), 100 * seed + number,
+                        sibling(unit, number), plan('chamber-18', number), 100 * seed + number,
                         rate_hz=options.rate_hz,
                     ),
                     serial=f'sibling-{number}',

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.thermal.settings import DetectorSettings
-from thermo_comp.unit.calibration import GroupEvidence, parameter_layout
+from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import (
     SIZE_LIMIT,
     dump_calibration,
@@ -23,6 +23,7 @@ from thermo_comp.unit.calibration_file import (
     parse_calibration,
 )
 from thermo_comp.unit.functions import CubicSpline, Exponential
+from thermo_comp.unit.provenance import GroupEvidence
 
 REPOSITORY = Path(__file__).parents[1]
 # Within twice the full scale of 32767.

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 
-from thermo_comp.ros.relay import SampleConverter, read_temperature
+from thermo_comp.ros.conversion import SampleConverter, read_temperature
 
 floats = st.floats(allow_nan=True, allow_infinity=True, width=64)
 # A NUL ends the string in CDR, and lone surrogates have no UTF-8.

@@ -209,12 +209,12 @@ class TestSimulate:
             assert [one.after[0] for one in block.temperatures.values()] == [0, 0]
         assert len({tuple(up) for up in ups}) == 3
 
-    def test_a_plan_is_a_whole_test_of_a_sibling(self, tmp_path: Path, cli: Cli) -> None:
-        plan = ('--plan', 'tumble-1', '--unit', 'own-lags', '--sibling', '4')
+    def test_a_plan_is_a_whole_test(self, tmp_path: Path, cli: Cli) -> None:
+        plan = ('--plan', 'tumble-1', '--unit', 'demo')
         cli('simulate', *plan, '--rate-hz', '1', '-o', tmp_path / 'sim')
         infos = [inspect_recording(path) for path in sorted((tmp_path / 'sim').iterdir())]
         assert [round((info.end_ns - info.start_ns) / 6e10) for info in infos] == [*[20] * 18, 180]
-        assert {info.metadata['serial'] for info in infos} == {'own-lags-0001-04'}
+        assert {info.metadata['serial'] for info in infos} == {'demo-0001'}
         assert json.loads(infos[0].metadata['truth'])['profile'] == 'tumble-1'
 
     def test_a_seed_is_a_recording(self, tmp_path: Path, cli: Cli) -> None:

@@ -8,15 +8,11 @@ The whole table, every command on every input, is `benchmarks/degenerate.py`.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
-import pytest
-from conftest import ROOT, Cli
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
 import degenerate
+import pytest
+from conftest import Cli
 
 
 @pytest.mark.parametrize(

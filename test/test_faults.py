@@ -20,9 +20,9 @@ from fault_rig import CONFIG, Event, bag, corrected, force_at, unit
 from fault_rows import ROWS, Row, true_seconds
 
 from thermo_comp.online.compensator import Compensator
+from thermo_comp.ros.conversion import Traffic
 from thermo_comp.ros.diagnostics import findings_of
 from thermo_comp.ros.reader import LoadedCalibration
-from thermo_comp.ros.relay import Traffic
 from thermo_comp.unit.calibration_file import save_calibration
 
 #: Largest error of a sound number, in the standard deviations that it was published with.

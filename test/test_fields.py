@@ -16,10 +16,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording.blocks import Messages
 from thermo_comp.recording.fields import Field, definitions_of
 from thermo_comp.recording.overview import survey_recording, unused_thermometers
 from thermo_comp.recording.reader import open_recording, read_recording
+from thermo_comp.recording.serialized import Messages
 from thermo_comp.recording.topics import Topics
 
 # As px4_msgs has them: no header, and the driver's temperature beside the samples.

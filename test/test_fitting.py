@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import ArrayBlock
+from triads import triad
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import SimulatedRun, arrays
 from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.typing import Floats
@@ -82,7 +82,7 @@ def claimed(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
 
 # A reading every four seconds: within them a ramp of 1.5 K/min moves the board by 0.1 K.
 OWN_LAGS, PAPER, PLAIN = (
-    unit_preset(name, 1).with_thermometers(rate_hz=0.25) for name in ('own-lags', 'paper', 'plain')
+    triad(name, 1).with_thermometers(rate_hz=0.25) for name in ('own-lags', 'paper', 'plain')
 )
 
 

@@ -10,10 +10,10 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from test_fitting import FACES, sources_of
+from triads import triad
 
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.simulation.campaign import Position, parse_cyclogram
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import SimulatedRun, arrays
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.thermal.state import WEIGHT
@@ -58,7 +58,7 @@ def weight(record: SimulatedRun, closes: Closes) -> Floats:
 )
 def test_evidence_says_when_the_regime_closes(closes: Closes, options: dict[str, Any]) -> None:
     # A reading every four seconds: the case changes by 0.1 K meanwhile.
-    unit = unit_preset('plain', 1).with_thermometers(rate_hz=0.25)
+    unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
     plan = [Position(PROGRAM, up) for up in FACES]
     for record in arrays(unit, plan, 11, rate_hz=2.0):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builders import ArrayBlock
+from triads import triad
 
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit_bags, reduce_bag
 from thermo_comp.fitting.claim import Claim, claim_of
@@ -18,7 +19,6 @@ from thermo_comp.fitting.options import sets_of
 from thermo_comp.fitting.reduction import Readings, ReducedBag
 from thermo_comp.fitting.windows import N_SECTIONS, Model, ThermalWindows, thermal_windows
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import arrays
 from thermo_comp.thermal.memory import MemorySpec, ThermalMemory, memory_on_grid
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
@@ -39,7 +39,7 @@ SECOND = 1_000_000_000
 def sources(n: int, seed: int = 1) -> list[FitSource]:
     plan = [Position(PROGRAM, up) for up in positions(n, seed)]
     result = []
-    unit = unit_preset('own-lags', seed).with_thermometers(rate_hz=0.25)
+    unit = triad('own-lags', seed).with_thermometers(rate_hz=0.25)
     for record in arrays(unit, plan, seed):
         counts = record.counts.astype(np.float64)
         board, case = (record.board_stamp_ns, record.board), (record.case_stamp_ns, record.case)

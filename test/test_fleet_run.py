@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from fleet_helpers import OPTIONS, damage, write_unit
+from triads import sibling
 
 from thermo_comp.cli.app import run as run_command
 from thermo_comp.errors import OutputError, ThermoCompError
@@ -349,7 +350,7 @@ def test_options_are_part_of_a_result(client: Any, fleet: Path, tmp_path: Path) 
 def test_siblings_help_a_unit_that_lacks_data(client: Any, tmp_path: Path) -> None:
     # WHY: a unit with one position in the chamber says nothing of what tells bias from scale.
     kind = unit_preset('mems', 1)
-    siblings = [kind.sibling(number) for number in range(4)]
+    siblings = [sibling(kind, number) for number in range(4)]
     for number, unit in enumerate(siblings):
         folder, n_bags = tmp_path / 'bags' / f'u{number}', 9 if number else 1
         write_unit(folder, number, n_bags, unit=unit, serial=f's{number}')

@@ -4,14 +4,10 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
-from conftest import ROOT
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-sys.path.insert(0, str(ROOT / 'fuzz'))
 
 
 import targets

@@ -4,14 +4,8 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
-from conftest import ROOT
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
 from ins import EARTH_RADIUS, FREE_S, Model, Navigator, fly, levelled
 
 G = 9.80665

@@ -24,8 +24,9 @@ from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter, table_writer
 from thermo_comp.replay import replay
-from thermo_comp.unit.calibration import Calibration, Provenance, ResidualSummary, Source
+from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, spoken
+from thermo_comp.unit.provenance import Provenance, ResidualSummary, Source
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000

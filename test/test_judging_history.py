@@ -15,9 +15,10 @@ from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.judging.evaluation import drifts_of, history_of
 from thermo_comp.report.page import render_report
-from thermo_comp.unit.calibration import AxisReference, Calibration, Source
+from thermo_comp.unit.calibration import AxisReference, Calibration
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.provenance import Source
 
 pytestmark = pytest.mark.usefixtures('equal_fits_once')
 

@@ -17,7 +17,7 @@ from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Layout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.posterior import posterior_of
-from thermo_comp.unit.prediction import ramp_states, sd_of_states, step_states
+from thermo_comp.unit.prediction import ramp_states, sd_of_states
 
 
 def slope_and_lag(variances: dict[int, float]):
@@ -77,13 +77,3 @@ def test_ramp_is_what_the_memory_makes_of_one(rate):
         if not tau:
             assert state[place] == pytest.approx(-width * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - layout.first_lag])
-
-
-def test_step_is_forgotten_with_each_lags_own_time():
-    one = rich_calibration()
-    layout = Layout(Correction(one).memory)
-    states = step_states(one, 21.0, np.array([0.0, 600.0, np.inf]))
-    assert states[:, BOARD].tolist() == [21.0] * 3
-    assert states[:, layout.lags['board', 600.0]] == pytest.approx([1.0, np.exp(-1.0), 0.0])
-    assert states[:, layout.lags['board', 2400.0]] == pytest.approx([1.0, np.exp(-0.25), 0.0])
-    assert not states[:, layout.lags['case', 240.0]].any()

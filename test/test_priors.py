@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builders import ArrayBlock
+from triads import sibling, triad
 
 from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError
@@ -19,14 +20,13 @@ from thermo_comp.fitting.priors import population
 from thermo_comp.fitting.selection import Selected, fit_all
 from thermo_comp.fitting.unknowns import InformativePrior, Prior
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import SimulatedRun, arrays
 from thermo_comp.unit.calibration import Calibration, parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
-KIND = unit_preset('products', 1)
+KIND = triad('products', 1)
 #: The groups that this kind has: the bank is a third of the whole, and a fit takes half as long.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
@@ -49,7 +49,7 @@ def test_of(number: int, first: int, last: int) -> tuple[SimulatedRun, ...]:
     """Record some of twelve positions of one sibling."""
     ups = positions(12, number)[first:last]
     stations = [Position(PROGRAM, up) for up in ups]
-    return tuple(arrays(KIND.sibling(number, 0.15), stations, 100 * number + first))
+    return tuple(arrays(sibling(KIND, number, 0.15), stations, 100 * number + first))
 
 
 test_of.__test__ = False
@@ -130,7 +130,7 @@ def test_siblings_make_one_position_worth_more():
     options = replace(OPTIONS, serial='unit-9')
     alone = fit(few, options).calibration
     helped = fit(few, replace(options, prior=population(siblings()))).calibration
-    truth = KIND.sibling(9, 0.15)
+    truth = sibling(KIND, 9, 0.15)
     errors = []
     for one in (alone, helped):
         relative = [axis.scale_factor for axis in (one.axes.x, one.axes.y, one.axes.z)]
@@ -173,7 +173,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
         return replace(record, counts=record.counts + by.astype(record.counts.dtype))
 
     rests = [Position(day, up) for up in positions(6, 77)]
-    later = [source(aged(record)) for record in arrays(KIND.sibling(9, 0.15), rests, 999)]
+    later = [source(aged(record)) for record in arrays(sibling(KIND, 9, 0.15), rests, 999)]
     new = fit(later, replace(OPTIONS, serial='unit-9', prior=old)).calibration
     for now, before in zip(new.regime_sets(), old.regime_sets(), strict=True):
         assert now.temperature_range_c == before.temperature_range_c

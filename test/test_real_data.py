@@ -10,18 +10,14 @@ from __future__ import annotations
 
 import re
 import subprocess
-import sys
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import ROOT
-from scipy.optimize import least_squares
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
 from recorded.data import GRAVITY, faces_bag, freezer_bag, handheld_bag
+from scipy.optimize import least_squares
 
 from thermo_comp.errors import FitError, RecordingError
 from thermo_comp.fitting import FitOptions, fit

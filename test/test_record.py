@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import ROOT, Cli
+from triads import triad
 
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.growing import growing_blocks, leftovers, numbered_bags
@@ -23,12 +24,11 @@ from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import simulate_blocks
 from thermo_comp.unit.calibration_file import load_calibration
 
 N_POSITIONS, SOAK_S, TURN_S, RATE = 9, 100.0, 20.0, 10.0
-UNIT = unit_preset('plain', 1)
+UNIT = triad('plain', 1)
 UPS = positions(N_POSITIONS, 2)
 START_NS = 1_767_225_600_000_000_000
 

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.recording.blocks import Messages
 from thermo_comp.recording.chunks import DamagedError, locate, walk
+from thermo_comp.recording.serialized import Messages
 
 MESSAGE, CHANNEL = 5, 4
 

@@ -12,10 +12,8 @@ import pytest
 from builders import axis_set, calibration, regime_set, rich_calibration, term
 from matplotlib.artist import Artist
 from matplotlib.colors import to_rgb
-from matplotlib.container import ErrorbarContainer
 from report_helpers import evidence, fitted
 
-from thermo_comp.judging.evaluation import history_of
 from thermo_comp.report import figures_bags as of_bags
 from thermo_comp.report import figures_unit as of_unit
 from thermo_comp.report.html import label_text, number
@@ -52,24 +50,6 @@ def test_bias_and_scale_curves_by_hand():
     assert heating.value[:, 0] == pytest.approx((0.3 * t + 0.5 + 0.3 * behind) * count)
     assert heating.value[:, 2] == pytest.approx((0.3 * t + 0.5) * count)
     assert heating.value[:, 4] == pytest.approx(70.0 * t + behind)
-    minutes, bias, scale = of_unit.step_answer(one)
-    left = np.exp(-minutes / 10.0)
-    assert bias[:, 0] == pytest.approx(0.3 * left * count)
-    assert scale[:, 1] == pytest.approx(left, abs=1e-9)
-    assert not bias[:, 1:].any()
-
-
-def test_hysteresis_loop_by_hand():
-    # 3 counts per kelvin of a play of 2 K: it is pushed from one end to the other within 4 K.
-    one = calibration(response=(term('play', (3.0, 0.0, 0.0), width_k=2.0),))
-    temperature, heating, cooling = of_unit.hysteresis_loop(one)
-    count = 1.0 / 300.0 / MICRO_G
-    lower, upper = one.static.temperature_range_c
-    up = np.maximum(2.0 - (temperature - lower), -2.0)
-    down = np.minimum(-2.0 + (upper - temperature), 2.0)
-    assert heating[:, 0] - cooling[:, 0] == pytest.approx(3.0 * (up - down) * count)
-    assert np.abs(heating - cooling)[len(temperature) // 2, 0] == pytest.approx(12.0 * count)
-    assert heating[:, 1:] == pytest.approx(cooling[:, 1:])
 
 
 def test_a_soak_measures_what_the_calibration_lacks():
@@ -121,10 +101,8 @@ def test_trace_without_a_case_sensor_follows_the_board():
     assert any(stretch.regime == Regime.DYNAMIC for stretch in shown.stretches)
 
 
-def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
+def look(line: Artist) -> tuple[object, ...]:
     """Give what a reader without colours tells lines apart by: dashes, marker, darkness."""
-    if isinstance(line, ErrorbarContainer):
-        line = line.lines[0]
     dashes, colour = line._unscaled_dash_pattern, line.get_color()
     marker = f'{line.get_marker()} {line.get_markerfacecolor()}'
     darkness = round(float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))), 1)
@@ -141,16 +119,11 @@ def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
         of_unit.draw_functions,
         of_bags.draw_positions,
         of_bags.draw_every_position,
-        of_unit.draw_step,
-        of_unit.draw_hysteresis,
-        of_unit.draw_history,
     ],
 )
 def test_figures_are_legible_in_black_and_white(draw):
-    known = evidence().calibration
-    older = replace(known, provenance=replace(known.provenance, created='2020', sources=()))
     with drawing():
-        figure = draw(replace(evidence(), history=history_of([known, older])))
+        figure = draw(evidence())
         figure.draw_without_rendering()
         for axes in figure.axes:
             looks = [look(line) for line in axes.get_legend_handles_labels()[0]]

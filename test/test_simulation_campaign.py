@@ -6,25 +6,20 @@ A whole test in memory: the run of the bags, the units of every kind, the physic
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from accuracy import corrected_by_truth
 from simulation_helpers import of_part
+from triads import TRIAD_NAMES, SlipEffect, sibling, triad
 
 from thermo_comp.simulation.campaign import PLAN_NAMES, Position, parse_cyclogram, plan
-from thermo_comp.simulation.drift import FlowEffect, PartHistory, SlipEffect
-from thermo_comp.simulation.presets import TRIAD_NAMES, unit_preset
+from thermo_comp.simulation.drift import FlowEffect, PartHistory
 from thermo_comp.simulation.run import arrays, simulate
 from thermo_comp.simulation.unit import SwitchedLoad, UnitModel
 from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
-from accuracy import corrected_by_truth
 
 PROGRAM = parse_cyclogram('20 10min, 30@1 20min, 24@0.5 10min')
 STATION = Position(PROGRAM, np.array([0.48, -0.6, 0.64]))
@@ -38,7 +33,7 @@ def _history(temperature: Floats, step: float = 1.0) -> PartHistory:
 
 @pytest.mark.parametrize('kind', ['own-lags', 'switched-load', 'slow-noise', 'convection'])
 def test_a_record_is_the_run_of_a_bag(kind: str) -> None:
-    unit = unit_preset(kind, 1)
+    unit = triad(kind, 1)
     _, record = arrays(unit, [STATION, STATION], 3)
     run = simulate(unit, PROGRAM, STATION.up, rate_hz=4.0, seed=3001, start_ns=0)
     np.testing.assert_array_equal(record.counts, run.counts)
@@ -53,7 +48,7 @@ def test_a_record_is_the_run_of_a_bag(kind: str) -> None:
 @pytest.mark.parametrize('kind', TRIAD_NAMES)
 def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
     """The floor that every table is held against: 0.65 ug of |g| over 60 s, 1.12 of the vector."""
-    unit = unit_preset(kind, 2)
+    unit = triad(kind, 2)
     errors, norms = [], []
     for record in arrays(unit, plan('held-out', 2), 7):
         found = corrected_by_truth(record) / MICRO_G
@@ -70,8 +65,8 @@ def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
 
 
 def test_siblings_are_near_and_not_the_same() -> None:
-    unit = unit_preset('between', 1)
-    first, again, second = (unit.sibling(seed) for seed in (1, 1, 2))
+    unit = triad('between', 1)
+    first, again, second = (sibling(unit, seed) for seed in (1, 1, 2))
     assert first == again
     assert first.serial != second.serial
     for other in (first, second):
@@ -147,7 +142,7 @@ def test_a_limited_flow_is_a_matter_of_on_and_off() -> None:
 
 def test_a_switched_load_heats_its_part() -> None:
     """By what the heat balance of an endless spell says, and not before it is on."""
-    unit = unit_preset('own-lags', 1)
+    unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
     loaded: UnitModel = replace(unit, load=load)

@@ -6,11 +6,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from triads import TRIAD_NAMES, unit_of
 
 from thermo_comp.simulation.drift import PartHistory, drift_of
 from thermo_comp.simulation.presets import UNIT_NAMES, unit_preset
 from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.typing import Floats
+
+NAMES = (*UNIT_NAMES, *TRIAD_NAMES)
 
 
 def _static(unit: UnitModel, board: Floats) -> tuple[Floats, ...]:
@@ -25,9 +28,9 @@ def _static(unit: UnitModel, board: Floats) -> tuple[Floats, ...]:
     return np.concatenate(bias), np.concatenate(scale)
 
 
-@pytest.mark.parametrize('name', UNIT_NAMES)
+@pytest.mark.parametrize('name', NAMES)
 def test_constants_hold_at_the_reference(name: str) -> None:
-    unit = unit_preset(name, 3)
+    unit = unit_of(name, 3)
     bias, scale = _static(unit, np.array([20.0]))
     np.testing.assert_allclose(bias, 0.0, atol=1e-9)
     np.testing.assert_allclose(scale, 0.0, atol=1e-12)
@@ -62,10 +65,10 @@ def test_mems_bias_moves_by_hundreds_of_micro_g(seed: int) -> None:
 
 
 def test_specimens_differ_and_return() -> None:
-    for name in UNIT_NAMES:
-        assert unit_preset(name, 1) == unit_preset(name, 1)
-        assert unit_preset(name, 1) != unit_preset(name, 2)
-        assert unit_preset(name, 1).serial == f'{name}-0001'
+    for name in NAMES:
+        assert unit_of(name, 1) == unit_of(name, 1)
+        assert unit_of(name, 1) != unit_of(name, 2)
+        assert unit_of(name, 1).serial == f'{name}-0001'
     with pytest.raises(ValueError, match=r"`name` must be one of thermostatted, .*, got 'laser'"):
         unit_preset('laser')
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from triads import TRIAD_NAMES, unit_of
 
 from thermo_comp.simulation.campaign import parse_cyclogram
 from thermo_comp.simulation.drift import CreepEffect, PartHistory
@@ -60,9 +61,9 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
     np.testing.assert_allclose(response.temperatures(time), expected, atol=ROUNDING)
 
 
-@pytest.mark.parametrize('name', UNIT_NAMES)
+@pytest.mark.parametrize('name', [*UNIT_NAMES, *TRIAD_NAMES])
 def test_presets_agree_with_a_numerical_integrator(name: str) -> None:
-    unit = unit_preset(name, 3)
+    unit = unit_of(name, 3)
     program = parse_cyclogram('demo')
     response = response_of(unit.network, program.time_s, program.temperature_c)
     network = unit.network

@@ -14,7 +14,6 @@ import pytest
 from conftest import ROOT
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-sys.path.insert(0, str(ROOT / 'benchmarks'))
 
 import soak
 

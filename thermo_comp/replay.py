@@ -28,8 +28,9 @@ from .files import shown_name
 from .online.batch import CompensatedBlock, process_block
 from .online.compensator import CONTINUED, SWAPPED, Compensator
 from .online.status import CompensatorConfig, Counters
-from .recording.blocks import Block, ImuColumns, Messages, RecordingInfo, Role
+from .recording.blocks import Block, ImuColumns, RecordingInfo, Role
 from .recording.reader import RecordingReader, open_recording
+from .recording.serialized import Messages
 from .recording.topics import Topics
 from .recording.writer import TABLES, BagWriter, WriteRows, table_writer
 from .topics import FLAGS, IMU_OUT, OUTPUTS, TEMPERATURE, thermometer

@@ -20,17 +20,15 @@ from ..unit.calibration import (
     AxisReference,
     AxisSet,
     Calibration,
-    Provenance,
     RegimeSet,
-    ResidualSummary,
     ResponseTerm,
-    Source,
     Unit,
     parameter_layout,
 )
 from ..unit.columns import USUAL_BOARD_LAG_S, Column
 from ..unit.functions import TemperatureFunction
 from ..unit.posterior import posterior_of
+from ..unit.provenance import Provenance, ResidualSummary, Source
 from .bayes_factors import group_evidence
 from .claim import Claim
 from .data_checks import Finding

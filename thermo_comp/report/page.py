@@ -269,29 +269,6 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             'rate and the turn-on blur.',
             '' if judged is None else f'Judged on these bags, {judged}.',
         )
-    moved = (one for one in calibration.response if any((*one.bias, *one.scale)))
-    if any(one.lag and not one.is_of_sensor for one in moved):
-        yield (
-            'For how long does the unit remember a change of temperature?',
-            of_unit.draw_step,
-            'After a step of board and case by 1 K: distance of bias and scale from their final '
-            'values. Where a line reaches zero, the unit has settled.',
-        )
-    if any(term.kind == 'play' for term in calibration.response):
-        yield (
-            'Does the bias differ between warming and cooling?',
-            of_unit.draw_hysteresis,
-            'A run through the whole range and back, too slow for any lag: bias of each axis less '
-            'the mean of both directions. No curve over temperature corrects the width of the '
-            'loop.',
-        )
-    if len(evidence.history) > 1:
-        yield (
-            'What has drifted between the calibrations of this unit?',
-            of_unit.draw_history,
-            'Bias and scale in a soak at the reference temperature, by the date of each '
-            'calibration, less those of the first; bars: 95 % interval of each.',
-        )
 
 
 def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
