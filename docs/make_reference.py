@@ -38,16 +38,16 @@ AXES = ('x', 'y', 'z')
 CALIBRATION_HEAD = """\
 # The calibration file
 
-One file = one unit = one object, in YAML, written by `thermo_comp fit`. An annotated example is
-`config/calibration.example.yaml`, the JSON Schema
-`config/calibration.schema.json`; this page is made from it.
+A calibration file describes one unit. It is YAML, written by `thermo_comp fit`.
+`config/calibration.example.yaml` is an annotated example, `config/calibration.schema.json` the JSON
+Schema; this page is generated from the schema.
 
-The reader refuses, with the file, the key, the value and what was expected: unknown or missing
-keys, texts where numbers belong, NaN and infinity, ranges that do not rise, functions that are not
-normalised at the reference, a scale that could reach zero within its ranges, a posterior of another
-size, a newer `format_version`, YAML aliases and tags, files above 8 MiB. Numbers are written with all
-their digits and the posterior in single precision, so a file that is read and written again is the
-same file.
+A file is refused if it has unknown or missing keys, text in place of a number, NaN or infinity,
+ranges that do not rise, functions that are not normalised at the reference temperature, a scale that
+could reach zero within its ranges, a posterior of the wrong size, a newer `format_version`, YAML
+aliases or tags, or more than 8 MiB. The error names the file, the key, the value and the expected
+value. Numbers are written with all digits and the posterior in single precision, so that reading
+and writing a file again does not change it.
 
 The main keys:
 
@@ -55,7 +55,7 @@ The main keys:
 format_version: 2
 unit: {serial: EXAMPLE-1, input: counts, full_scale: 32767.0, cycle_time_s: 0.01}
 reference_temperature_c: 20.0
-gravity_m_s2: 9.80665                                     # given to the fit
+gravity_m_s2: 9.80665                                     # local gravity, input of the fit
 axes:                                                     # at the reference temperature
   x: {scale_factor: 299.1, bias: 4.2}                     # counts per m/s^2, counts
 static:                                                   # the set of the static regime
@@ -72,21 +72,22 @@ response:                                                 # columns that both se
 # posterior: the covariance of all parameters; evidence: contribution of each group of columns
 ```
 
-The parameters of the posterior are, for each axis x, y, z: the bias (level of the static set, free
-coefficients of its Fs, level of the dynamic set, free coefficients of its Fs, weights of the response
-in the order of the file), in input units; then the scale in the same order, relative; at the end
-`M[1][0]`, `M[2][0]`, `M[2][1]`. `covariance = factor @ factor.T + diag(rest)`. That of a `gyroscope` holds the bias alone,
-in rad/s, in the same order; ranges, reference temperature and thermometers are the unit's.
+The parameters of the posterior are, for each axis x, y, z: first the bias in input units (level of
+the static set, free coefficients of its Fs, level of the dynamic set, free coefficients of its Fs,
+weights of the response in the order of the file); then the relative scale in the same order. The
+last three parameters are `M[1][0]`, `M[2][0]` and `M[2][1]`. The covariance is
+`factor @ factor.T + diag(rest)`. The posterior of a `gyroscope` has the bias only, in rad/s and in the
+same order; it uses the ranges, the reference temperature and the thermometers of the unit.
 """
 
 BOUNDS = """\
 ## Bounds
 
-Every number of a calibration is of one of these quantities. The bounds lie beyond any instrument, so that whatever
-keeps them gives finite numbers and a covariance that is positive definite. What belongs to a unit hangs on its own
-full scale: a bias, with its curve anywhere in its range, stays within twice the full scale, a column at its worst and
-what one parameter leaves open within a million times that, and a relative scale, with all its columns at their worst,
-between 0.1 and 10.
+Each number in a calibration belongs to one of these quantities. The bounds are wider than any instrument needs; a file
+within them gives finite results and a positive definite covariance. Further bounds depend on the full scale of the unit.
+The bias including its curve must stay within twice the full scale over the whole temperature range. The largest
+contribution of a column, and of one standard deviation of a parameter, must stay within a million times that. The
+relative scale including the largest contributions of all columns must stay between 0.1 and 10.
 """
 
 INTERFACE = """\

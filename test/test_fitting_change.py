@@ -53,7 +53,7 @@ def recorded(rng, up, name: str, targets: tuple[float, ...]) -> FitSource:
 
 def test_what_a_change_does_is_found_about_rest(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
-    bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(9, 3))]
+    bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(6, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
     # Of two readings of 3 mK a minute, for some twenty hours: 0.1 mK, and rates of minutes.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
