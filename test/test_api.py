@@ -201,7 +201,10 @@ def test_nothing_in_is_nothing_out() -> None:
         ({'board': [20.0, 20.0]}, r'`board` must have a value for each of the 3 times'),
         ({'board': ([0.0, 1.0], [20.0])}, r'`board` must have as many values as times, 2'),
         ({'board': ([1.0, 0.0], [20.0, 20.0])}, r'`board time_s` must rise, got 1.0 at 0'),
-        ({'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])}, 'must be seconds or datetime64, as those of `time_s`'),
+        (
+            {'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])},
+            'must be seconds or datetime64, as',
+        ),
         ({'lid': [20.0] * 3}, r'`lid` is no thermometer of this calibration: it has board, case'),
     ],
 )

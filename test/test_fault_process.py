@@ -163,7 +163,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
     save_calibration(fast, path)
     # Long enough for any machine: it ends with the last answer.
     events = bag(rate_hz=1000.0, duration_s=60.0)
-    n_reloads = 400
+    n_reloads = 200
     with bench(path) as node:
         answers, news = list[bool](), threading.Event()
         node.take()

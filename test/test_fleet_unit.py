@@ -74,6 +74,7 @@ def test_the_verdict_is_that_of_evaluate(
 
 
 class TestRow:
+    @pytest.mark.usefixtures('no_figures')
     def test_a_good_unit(self, fleet: Path, brief: UnitOutcome) -> None:
         outcome = processed(fleet, certificates=True)
         row = outcome.row
