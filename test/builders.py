@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the small calibrations and blocks that the tests of the core are built on."""
+"""Owns the small calibrations and blocks for the tests of the core."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ def regime_set(x=None, y=None, z=None, **keys):
 
 
 def calibration(**keys):
-    """Make a unit of 300 counts per m/s^2; with no arguments it only scales."""
+    """
+    Make a unit of 300 counts per m/s^2; without arguments it has no bias and no temperature
+    function.
+    """
     values = {
         'format_version': 2,
         'unit': Unit('T-1', 'counts', 32767.0, 0.01),
@@ -52,18 +55,20 @@ def calibration(**keys):
 
 
 def thermal_calibration():
-    """Make such a unit that needs a temperature all the same: ramps change a last digit."""
+    """Make such a unit whose correction depends on temperature, by a negligible amount."""
     return calibration(dynamic=regime_set(z=axis_set((0.0, 1e-12))))
 
 
 def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
-    """Make a term of the response; its group is its kind, its range wide."""
+    """Make a term of the response, by default of the group of its kind and with a wide range."""
     values = {'group': kind, 'range': (-50.0, 50.0), **keys}
     return ResponseTerm(kind=kind, bias=tuple(bias), scale=tuple(scale), **values)
 
 
 def rich_calibration():
-    """Put every term to work, on every axis, in both regimes, with a posterior."""
+    """
+    Make a calibration with every kind of term, on every axis and in both regimes, and a posterior.
+    """
 
     def one(sign, dynamic):
         size = 2 if dynamic else 1
@@ -103,7 +108,7 @@ def rich_calibration():
 
 
 def rich_gyroscope():
-    """Make a gyroscope with columns of its own beside some of `rich_calibration`'s."""
+    """Make a gyroscope with some columns of `rich_calibration` and others of its own."""
 
     def one(size):
         curve = RateCurve(Polynomial((0.0, *(size / k for k in (1e4, 1e6)))), delta=size * 1e-5)
@@ -133,7 +138,7 @@ def rich_gyroscope():
 
 @dataclass
 class Columns:
-    """Columns in file order, as a recording gives them."""
+    """Columns in file order, as a recording contains them."""
 
     accel_stamp_ns: np.ndarray
     accel: np.ndarray
@@ -169,7 +174,7 @@ def columns_from_events(events):
 
 @dataclass(frozen=True)
 class ArrayBlock:
-    """A block made of arrays at hand."""
+    """A block built from arrays."""
 
     accel_stamp_ns: np.ndarray
     accel: np.ndarray

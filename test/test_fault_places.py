@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Faults at the places of a ramp where they are worst, through the compensator without DDS.
+Faults at the worst times of a ramp, through the compensator without DDS.
 
-WHY: a covariance that held for a fault in the middle of a ramp did not for the same fault where
-the ramp was about to begin, or where a sensor came back elsewhere.
-PROMISE: whatever is published is within five of the standard deviations it was published with.
+WHY: the covariance was large enough for a fault in the middle of a ramp, but not for the same
+fault at the start of the ramp, or when a sensor came back with another value. PROMISE: every
+published sample is within five of its standard deviations.
 """
 
 from __future__ import annotations
@@ -57,19 +57,19 @@ def test_nothing_wrong_is_published(inject: Inject) -> None:
     sd = np.sqrt(table[:, [3, 6, 8]])
     off = (np.abs(table[:, :3] - force_at(seconds)) / sd).max(axis=1)
     assert seconds[off > SIGMAS].tolist() == []
-    # Not by a covariance that covers anything: before the fault it is noise and residual.
+    # The covariance before the fault is only noise and residual, not large enough for everything.
     assert sd[450:540].max() < 3e-4
 
 
 def settling_s() -> float:
-    """Give the time in which the board's lag takes the rate of a ramp down, and the dwell [s]."""
+    """Return the time until the board's lag has reduced the rate of a ramp, plus the dwell [s]."""
     detector = unit().detector
     ramp = 60.0 * RAMP_K_S
     return BOARD_LAG_S * math.log(ramp / detector.relaxed_rate_k_min) + detector.dwell_s
 
 
 def ended_s(row: Row) -> float:
-    """Find the time of the bag after which the messages are the undisturbed ones again."""
+    """Return the time from which the messages are those of the undisturbed bag again."""
     at, _ = row.shift
     if math.isfinite(at):
         return at

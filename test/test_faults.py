@@ -27,7 +27,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 
 #: Largest error of a sound number, in the standard deviations that it was published with.
 SIGMAS = 5.0
-#: Largest distance [m/s^2] of a recovered output from the undisturbed run: 1 ug.
+#: Largest difference [m/s^2] of a recovered output to the undisturbed run: 1 ug.
 RECOVERED = 9.80665e-6
 #: Rows about the order of arrival, which the node takes from the middleware.
 OVER_DDS = (
@@ -60,7 +60,7 @@ def direct(events: list[Event]) -> Heard:
 
 
 def wrong(row: Row, heard: Heard) -> np.ndarray:
-    """Find the published samples that are wrong, the blind span left out."""
+    """Return the times of wrong published samples outside the blind span."""
     seconds = true_seconds(row, heard.stamp_ns)
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
     is_wrong = (np.abs(heard.force - force_at(seconds)) > SIGMAS * sd).any(axis=1)
@@ -84,7 +84,7 @@ def test_row(row: Row, reference: tuple[np.ndarray, np.ndarray]) -> None:
         assert not ((begin <= seconds) & (seconds < end)).any(), (begin, end)
     for level, text in row.says:
         assert heard.says(text, level), (level, text, sorted(set(heard.reports)))
-    # What is finite and positive definite is sound, wrong or not.
+    # Wrong or not, the output must be finite and the covariance positive definite.
     assert np.isfinite(heard.force).all()
     if len(seconds):
         assert np.linalg.eigvalsh(heard.covariance).min() > 0.0
