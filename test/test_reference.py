@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the documentation takes from the code is what the code says today."""
+"""Generated parts of the documentation agree with the code."""
 
 from pathlib import Path
 
