@@ -90,5 +90,5 @@ def test_commands_tell_the_history(cli, tmp_path: Path, monkeypatch: pytest.Monk
     page = tmp_path / 'page.html'
     drawn = json.loads(cli('report', *given, '-o', page).stdout)
     assert drawn['history'] == told['history']
-    assert 'What has drifted between the calibrations' in page.read_text(encoding='utf-8')
+    assert '2020-01-01' in page.read_text(encoding='utf-8')
     assert '<h2>History</h2>' not in render_report(evidence(), figures=[])

@@ -101,8 +101,8 @@ def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
         '9.80665 m/s²',
         f'{1:064x}',
         f'{9:064x}',
-        'What each step of the model leaves',
-        'What each part of the model explains',
+        'Residual after each step of the model',
+        'Contribution of each part of the model',
         'parts that lag the board',
         'after 600 s, m',
         '12.7 m per µg',
@@ -113,12 +113,12 @@ def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
     assert not re.search(r'\bnan\b', page.text)
 
 
-def test_certificate_says_what_the_other_positions_say_of_each(page):
+def test_certificate_has_the_residual_of_each_position_left_out(page):
     # The last position cannot be left out.
     shown = [one.residual_rms.get(LEFT_OUT) for one in evidence().positions]
     assert shown == [*LEFT_OUT_RMS, None]
     assert 'left out, µg RMS' in page.text
-    assert 'Left out: with what the other positions say' in page.text
+    assert 'Left out: with a fit to the other positions' in page.text
 
 
 def test_page_needs_no_network_and_runs_nothing(page):

@@ -120,9 +120,7 @@ def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_v
         begin = end
     assert found == expected
     assert many.n_same == one.n_same
-    np.testing.assert_array_equal(
-        many.run, one.run
-    )  # equal_nan: there is none before the first sample
+    np.testing.assert_array_equal(many.run, one.run)  # NaN before the first sample
 
 
 def test_noughts_are_no_measurement_from_the_first_on(rng):
