@@ -288,7 +288,7 @@ def _bounds_table() -> list[str]:
             upper = f'{bounds.below if bounds.at_most is None else bounds.at_most:g}'
             unit = bounds.unit
         rows.append(f'| {name} | {lower} | {upper} | {unit} | {bounds.why} |')
-    table = ['| quantity | from | to | unit | why so far |', '|---|---|---|---|---|', *rows]
+    table = ['| quantity | from | to | unit | reason |', '|---|---|---|---|---|', *rows]
     return [BOUNDS, *table, '']
 
 
