@@ -80,7 +80,9 @@ def _only(axis: int, value: float) -> Triple:
 
 
 def triad(kind: str, seed: int = 0) -> UnitModel:
-    """Return a triad of bare heads on a board: tempcos that lag, and the physics of its kind."""
+    """
+    Return a triad of bare heads on a board, with lagging tempcos and the physics of its kind.
+    """
     draw = Specimen(kind, seed, FIRST_KIND + TRIAD_NAMES.index(kind))
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
     board_tau, taus = draw.between(400.0, 900.0), [draw.between(500.0, 1500.0) for _ in heads]
@@ -148,13 +150,13 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
         )
     ],
     'hysteresis': _slips,
-    # A heat pump between case and board: its load, its losses, and the gas it stirs.
+    # A heat pump between case and board: its load, its losses, and the convection it causes.
     'even': lambda draw: [
         FlowEffect('case', 'board', 1.0, bias=draw.signed(3.0, 12.0), scale=draw.normal(10.0)),
         FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
         FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
     ],
-    # Doubles every 7 to 10 K; a few ug at the reference.
+    # Leakage doubles every 7 to 10 K; a few ug at the reference.
     'convection': lambda draw: [
         LeakageEffect('board', draw.between(10.0, 14.5), bias=draw.signed(1.0, 5.0))
     ],

@@ -177,7 +177,7 @@ Every fault with its test: [faults](faults.md).
 
 
 def json_schema(cls: type) -> dict[str, Any]:
-    """Return the JSON Schema of a dataclass and of all that it holds."""
+    """Return the JSON Schema of a dataclass including nested ones."""
     definitions: dict[str, Any] = {}
     top = _schema(cls, definitions)['$ref'].rpartition('/')[2]
     result = definitions.pop(top)
@@ -227,7 +227,7 @@ def _define(cls: Any, definitions: dict[str, Any]) -> None:
     if cls.__name__ in definitions:
         return
     hints, required = fields_of(cls)
-    # It stands before those that it holds.
+    # A schema comes before those of its fields.
     result = definitions[cls.__name__] = {
         'type': 'object',
         'description': inspect.cleandoc(cls.__doc__),
@@ -304,7 +304,7 @@ def _section(
         if len(default) > 40:
             default = 'see there'
         meaning = value.get('description', '') or _described(value, definitions)
-        # An element of a matrix is no link.
+        # Escaped, as an element of a matrix is not a link.
         meaning = re.sub(r'\w+(\[\d\]){2}', r'`\g<0>`', meaning)
         lines.append(f'| `{key}` | {_type(value)} | {default} | {meaning} |')
     return [*lines, '']
