@@ -55,21 +55,29 @@ The main keys:
 format_version: 2
 unit: {serial: EXAMPLE-1, input: counts, full_scale: 32767.0, cycle_time_s: 0.01}
 reference_temperature_c: 20.0
-gravity_m_s2: 9.80665                                     # local gravity, input of the fit
-axes:                                                     # at the reference temperature
-  x: {scale_factor: 299.1, bias: 4.2}                     # counts per m/s^2, counts
-static:                                                   # the set of the static regime
-  temperature_range_c: [4.0, 37.0]                        # outside: along the tangent
+gravity_m_s2: 9.80665                # local gravity, input of the fit
+axes:                                # at the reference temperature
+  x: {scale_factor: 299.1, bias: 4.2}   # counts per m/s^2, counts
+static:                              # the set of the static regime
+  temperature_range_c: [4.0, 37.0]   # outside: along the tangent
   x:
-    bias_function: {kind: polynomial, coefficients: [0.0, 0.0031]}       # Fs(t), 0 at t = 0
-    scale_function: {kind: polynomial, coefficients: [1.0, 7.7e-05]}     # Fc(t), 1 at t = 0
-response:                                                 # columns that both sets share
-  - {kind: now, group: now, range: [-9.0, 9.0],           # T_case - T_board; range: held at edges
-     bias: [0.0021, 0.0014, -0.0006],                     # x, y, z: counts per K
-     scale: [1.1e-06, 9.0e-07, 1.3e-06]}                  # relative, per K
-  - {kind: board, group: board, tau_s: 960.0,             # T_board minus its lag
-     range: [-20.0, 20.0], bias: [0.0008, 0.0, 0.0003], scale: [2.0e-07, 1.0e-07, 0.0]}
-# posterior: the covariance of all parameters; evidence: contribution of each group of columns
+    # Fs(t), 0 at t = 0, and Fc(t), 1 at t = 0
+    bias_function: {kind: polynomial, coefficients: [0.0, 0.0031]}
+    scale_function: {kind: polynomial, coefficients: [1.0, 7.7e-05]}
+response:                            # columns of both sets
+  - kind: now                        # T_case - T_board
+    group: now
+    range: [-9.0, 9.0]               # held at its edges
+    bias: [0.0021, 0.0014, -0.0006]  # x, y, z: counts per K
+    scale: [1.1e-06, 9.0e-07, 1.3e-06]  # relative, per K
+  - kind: board                      # T_board minus its lag
+    group: board
+    tau_s: 960.0
+    range: [-20.0, 20.0]
+    bias: [0.0008, 0.0, 0.0003]
+    scale: [2.0e-07, 1.0e-07, 0.0]
+# posterior: the covariance of all parameters
+# evidence: contribution of each group of columns
 ```
 
 The parameters of the posterior are, for each axis x, y, z: first the bias in input units (level of
