@@ -28,7 +28,7 @@ from thermo_comp.unit.provenance import GroupEvidence
 REPOSITORY = Path(__file__).parents[1]
 # Within twice the full scale of 32767.
 number = st.floats(-6.5e4, 6.5e4)
-# The fourth power of 15 K times this stays far from turning a scale function to 0.
+# The fourth power of 15 K times this is far from making a scale function 0.
 small = st.floats(-1e-6, 1e-6)
 RICH = rich_calibration()
 
@@ -228,7 +228,7 @@ def test_refusals_name_key_value_and_rule(old, new, key, message):
 def test_bytes_that_are_no_calibration(content, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
-    # Those who may not read the file hear as much, but for what may quote it.
+    # Peers without access to the file get the same message without quotations from it.
     told, whole = caught.value.rule or str(caught.value), str(caught.value)
     quotes = whole.startswith('not valid YAML: ')
     assert re.fullmatch(r'not valid YAML( \(line \d+\))?', told) if quotes else told == whole
@@ -284,7 +284,7 @@ def test_files_that_are_no_files(tmp_path):
             'static.x.bias_function',
             'must be finite over its range',
         ),
-        # 1 - 0.05 t is 0.15 at 37 degC, and less than nothing along its tangent.
+        # 1 - 0.05 t is 0.15 at 37 degC, and negative along its tangent.
         ('[1.0, 7.7e-05]', '[1.0, -0.05]', 'static.x.scale_function', 'must stay above 0.1'),
     ],
 )

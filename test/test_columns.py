@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The table of columns: the bank, what it needs remembered, and each value by hand."""
+"""The table of columns: all columns, the memory they need, and each value by hand."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_change_is_even_about_rest():
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((Layout(MemorySpec(('case', 'tip'))).width, 3))
-    # At rest, and as far to either side of it.
+    # At the gradient at rest, and equally far on either side.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -69,7 +69,7 @@ def test_change_is_even_about_rest():
 def test_what_the_bank_needs_remembered():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
-    # Lags of their own for the plays that follow one.
+    # Separate lags for the plays that follow a lag.
     assert spec.taus('board') == tuple(sorted((*FINE_TAUS, 450.0, 900.0, 1800.0)))
     assert spec.taus('case') == spec.taus('tip') == FINE_TAUS
     assert len(spec.plays) == 20
@@ -108,7 +108,7 @@ def test_each_value_by_hand():
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0,
     ]  # fmt: skip
     assert found == pytest.approx(expected)
-    # t is held at the edge of the calibrated temperatures, the lag itself is not.
+    # t is limited to the calibrated temperatures, the lag is not.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
     assert at_edge[2] == 0.5
@@ -132,7 +132,7 @@ def test_one_state_has_the_bits_of_many(boards):
 
 
 def test_lags_of_a_neighbour_in_a_ramp():
-    # The gradient of a sensor that runs away from the board at r K/s: L = r (t - tau (1 - e)).
+    # The gradient of a sensor that departs from the board at r K/s: L = r (t - tau (1 - e)).
     rate, n = 0.002, 3000
     columns = [Column('neighbour', 'neighbour', 'tip', tau, **WIDE) for tau in BANK_TAUS]
     spec = memory_of(columns, ('case', 'tip'))
@@ -144,7 +144,7 @@ def test_lags_of_a_neighbour_in_a_ramp():
     state = np.array(tracker.sample(n * SECOND_NS))[:, np.newaxis]
     found = ColumnTable(columns, spec, 20.0).values(state)[:, 0]
     expected = [rate * (n - tau * -math.expm1(-n / tau)) for tau in BANK_TAUS]
-    # The thermometer needs some readings to bend into the ramp: a few mK.
+    # The thermometer needs some readings to follow the ramp: a few mK.
     assert found == pytest.approx(expected, abs=0.02)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""When the regime closes is chosen by evidence: by the unit, not by the chamber."""
+"""The end of the dynamic regime is chosen by evidence: by the unit, not by the chamber."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 Closes = Literal['board', 'case']
-#: Soaks long enough for the board to relax.
+#: Soaks long enough for the board to settle.
 PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min')
-#: What the dynamic set differs by in each axis, far above the 2 ug of a window.
+#: Difference of the dynamic set in each axis, far above the 2 ug of a window.
 STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
 
 
 def weight(record: SimulatedRun, closes: Closes) -> Floats:
-    """Weight of the dynamic set at each sample, by a detector that was told the sensors."""
+    """Weight of the dynamic set at each sample, by a detector with the true sensor settings."""
     tracker = ThermalTracker(replace(DetectorSettings(), closes=closes))
     readings = sorted(
         (stamp, name, value)
@@ -57,7 +57,7 @@ def weight(record: SimulatedRun, closes: Closes) -> Floats:
     ],
 )
 def test_evidence_says_when_the_regime_closes(closes: Closes, options: dict[str, Any]) -> None:
-    # A reading every four seconds: the case changes by 0.1 K meanwhile.
+    # A reading every four seconds: the case changes by 0.1 K between them.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
     plan = [Position(PROGRAM, up) for up in FACES]
@@ -66,6 +66,7 @@ def test_evidence_says_when_the_regime_closes(closes: Closes, options: dict[str,
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.closes == closes
-    # What is left is where a set begins and ends: the fit's detector has learnt the sensors.
+    # The remaining difference is when a set starts and ends, as the fit estimates the sensor
+    # settings.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
