@@ -25,8 +25,8 @@ that then opens the other's shared memory may stand still for a third of a secon
 to see whether somebody reads there, and sends nothing meanwhile. So nothing is measured until all
 have met.
 
-A core with nothing to do sleeps, and takes its time to wake; a virtual one is given to others
-meanwhile. Where the system allows it (Linux, as root) all cores are therefore kept awake for all
+An idle core sleeps and needs time to wake up, and an idle virtual core may be given away.
+Where the system allows it (Linux, as root) all cores are therefore kept awake for all
 relays alike, by a request for no latency in /dev/cpu_dma_latency, as cyclictest has it;
 `--sleep` leaves them alone. The host may stop a virtual machine all the same; while it does, no
 process gets on. How much of the time that was stands behind each row ("stolen"): latencies say

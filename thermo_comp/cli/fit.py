@@ -251,7 +251,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
 
 
 def _say_models(out: Output, trials: Sequence['Trial']) -> None:
-    """Print what each model leaves on data left out of its fit, and what the columns mean."""
+    """Print the error of each model on data left out of its fit, and explain the columns."""
     columns = {
         'positions': 'drift of an axis in a position left out',
         'sections': 'drift of an axis in a part of the program left out',
@@ -287,7 +287,7 @@ def _named(groups: tuple[str, ...]) -> str:
 
 
 def _model(trial: 'Trial') -> dict[str, Any]:
-    """Say of a model that was looked at what it left on data left out [m/s^2]."""
+    """Return the groups of a compared model, and its error on data left out [m/s^2]."""
     names = ('positions', 'sections', 'norms')
     left_out = {name: folds.rms for name, folds in zip(names, trial.score.kinds, strict=True)}
     return {'groups': trial.groups, 'is_chosen': trial.is_chosen, 'left_out_rms_m_s2': left_out}
@@ -300,7 +300,7 @@ def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> s
 def _steps(
     rows: Iterable[Any], steps: Iterable[str], shown: Callable[[float], str | None], axes: int = 1
 ) -> list[tuple[Cell, ...]]:
-    """Give what each step of the model leaves in each section; the last is a new attitude's."""
+    """Return the residual of each section after each step of the model, and on data left out."""
     return [
         (row.section, row.fitted.n // axes, *(shown(getattr(row, x).rms) for x in steps))
         for row in rows

@@ -111,7 +111,7 @@ def fleet_fit(
         if one.is_significant
     )
     if result.prior is not None:
-        out.line(f'{result.prior}: what the units that hold have in common')
+        out.line(f'{result.prior}: prior of the type, from the valid units')
     elif with_prior:
         out.line(f'- fitted without a prior: {result.no_prior}')
     out.line(
@@ -131,6 +131,6 @@ def _micro(value: object) -> str | None:
 
 
 def _short(name: object) -> str:
-    """Keep the end of a long name, which tells units apart, so that the table fits 80 columns."""
+    """Keep the end of a long name, which differs most, so that the table fits 80 columns."""
     clean = one_line(str(name))
     return clean if len(clean) <= 22 else f'~{clean[-21:]}'

@@ -196,7 +196,7 @@ class Evidence:
 def given(value: _T | None) -> _T:
     """Return a value that is not None: a figure is drawn only if its data exist."""
     if value is None:
-        raise ValueError('`evidence` lacks what is to be drawn')
+        raise ValueError('`evidence` lacks the data of this figure')
     return value
 
 

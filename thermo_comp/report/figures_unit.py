@@ -96,8 +96,8 @@ def _draw_less_line(
 
 def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     """
-    Average what is left in each soak of each position: temperatures (n,), bias [micro-g] and scale
-    [ppm] (n, 6), as if all were one of them; NaN of an axis with less than half of gravity.
+    Average the residual in each soak of each position: temperatures (n,), bias [micro-g] and scale
+    [ppm] (n, 6), attributed to bias or to scale alone; scale is NaN below half of gravity.
     """
     windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
     if windows is None or residual is None:

@@ -142,7 +142,7 @@ def remarks_of(bag: ReducedBag) -> list[str]:
 
 
 def _seen(evidence: Evidence) -> list[str]:
-    """Describe the bags of the verdict, and whether the regime was never known."""
+    """Describe the bags of the verdict, and state if their regime was never known."""
     said = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board
@@ -230,7 +230,7 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         'Does |f| stay constant over the whole program?',
         of_bags.draw_gravity,
         f'|f| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
-        'a unit at rest must show zero whatever the temperature does. Above: before and after '
+        'for a unit at rest it is zero at any temperature. Above: before and after '
         'the correction; below: after it, in a larger scale. '
         f'{read} 7 of the paper.',
     )
@@ -243,7 +243,7 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         return
     has_band = calibration.posterior is not None
     yield (
-        'What is corrected, and how well is it known?',
+        'Which bias and scale are corrected, and how uncertain are they?',
         of_unit.draw_functions,
         'Bias and scale factor over temperature, in a soak and in ramps through the whole range '
         'that begin in a soak at its end, less the value at '
@@ -261,7 +261,7 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     if calibration.gyroscope is not None:
         judged = None if evidence.judgement is None else evidence.judgement.rate
         yield (
-            'What is corrected of the angular rate?',
+            'Which bias of the angular rate is corrected?',
             of_unit.draw_rates,
             'Bias of the gyroscope over temperature, in a soak and in ramps as above, less the '
             'value at the reference temperature and less a straight line, whose slope stands '
