@@ -62,26 +62,21 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 #: The longest files first: parallel workers begin with them, so that no worker is left with a long
 #: one at the end (`make test` keeps this order).
 _LONG = (
-    *('test_fitting_selection', 'test_fitting', 'test_priors', 'test_fitting_change'),
-    *('test_gyroscope', 'test_cli_help', 'test_third_thermometer', 'test_real_data'),
-    *('test_report_certificate', 'test_offset', 'test_fitting_windows', 'test_record'),
-    *('test_docs', 'test_cli_demo', 'test_fleet_unit', 'test_node_startup'),
-    *('test_convert', 'test_simulation_presets', 'test_readme'),
-    *('test_properties', 'test_text', 'test_recording_damage'),
-    *('test_report_figures', 'test_stillness', 'test_cli_errors', 'test_recording_walk'),
-    *('test_fault_files', 'test_allow', 'test_faults', 'test_cli', 'test_degenerate'),
-    *('test_layers', 'test_rests', 'test_compensator', 'test_sample_checks', 'test_report'),
-    *('test_judging', 'test_report_browser', 'test_one_position', 'test_recording_promises'),
-    *('test_fitting_regression', 'test_recording_read', 'test_fault_process'),
-    *('test_node_reload', 'test_ins', 'test_middleware', 'test_regime', 'test_least_known'),
-    *('test_one_judge', 'test_fleet_run', 'test_plausibility', 'test_fleet_summary'),
-    *('test_acquisition', 'test_thermometer'),
+    *('real_data', 'cli_help', 'fitting', 'faults', 'fault_process', 'priors', 'fault_files'),
+    *('cli_demo', 'gyroscope', 'degenerate', 'fitting_selection', 'fleet_run', 'record'),
+    *('regime', 'drivers', 'few_positions', 'fitting_closing', 'properties', 'judging'),
+    *('node_parity', 'node_defence', 'report', 'compensator', 'allow', 'replay', 'attacks'),
+    *('fitting_regression', 'fitting_change', 'fitting_windows', 'docs', 'node_startup'),
+    *('report_certificate', 'fleet_unit', 'acquisition', 'third_thermometer', 'api', 'player'),
+    *('middleware', 'correction', 'plausibility', 'node_sources', 'recording_read', 'soak'),
+    *('node_reload', 'cli', 'recording_damage', 'node', 'cli_errors', 'ins', 'sample_checks'),
+    *('files', 'fleet_storage', 'calibration', 'readme', 'recording_walk', 'recording_write'),
 )
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    rank = {name: place for place, name in enumerate(_LONG)}
+    rank = {f'test_{name}': place for place, name in enumerate(_LONG)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(_LONG)))
 
 
