@@ -245,6 +245,28 @@ def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]
 
 
 @pytest.fixture
+def peer() -> Iterator[Any]:
+    """Return the other end of a node, a peer on DDS."""
+    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    from ros_helpers import Peer
+
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    """Write the calibration of a unit without temperature functions; return its path."""
+    from builders import calibration
+
+    from thermo_comp.unit.calibration_file import save_calibration
+
+    save_calibration(calibration(), tmp_path / 'unit.yaml')
+    return tmp_path / 'unit.yaml'
+
+
+@pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make pages without figures, whose drawing is slow; test_report.py draws them."""
     monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: [])

@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from subprocess import PIPE
 
@@ -94,13 +93,6 @@ def send(driver: Driver, first: int, last: int, pause_s: float) -> None:
             driver.temperatures(k * CYCLE_NS, 20.0, 20.0)
         driver.counts(k * CYCLE_NS, *standing(k))
         pause.wait(pause_s)
-
-
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
 
 
 @pytest.fixture

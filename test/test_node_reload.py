@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
@@ -81,13 +81,6 @@ class Flow:
         self._thread.join(TIMEOUT)
         last = START_NS + (self.n_sent - 1) * CYCLE_NS
         self._peer.wait_for(lambda: stamp_of(self.heard[-1]) == last, 'the last sample')
-
-
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
 
 
 def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:

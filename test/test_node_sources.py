@@ -41,20 +41,6 @@ from thermo_comp.ros.waitloop import Sources
 from thermo_comp.unit.calibration_file import save_calibration
 
 
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
-
-
-@pytest.fixture
-def unit(tmp_path: Path) -> Path:
-    path = tmp_path / 'unit.yaml'
-    save_calibration(calibration(), path)
-    return path
-
-
 def contested(
     peer: Peer, heard: list[DiagnosticArray], topic: str, send: Callable[[], None]
 ) -> DiagnosticStatus:

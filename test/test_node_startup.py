@@ -29,13 +29,6 @@ def arguments(*overrides: str) -> list[str]:
     return ['thermo_comp_node', '--ros-args', *words]
 
 
-@pytest.fixture
-def unit(tmp_path: Path) -> Path:
-    path = tmp_path / 'unit.yaml'
-    save_calibration(calibration(), path)
-    return path
-
-
 @pytest.mark.parametrize(
     ('overrides', 'text'),
     [

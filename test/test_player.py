@@ -8,7 +8,6 @@ import hashlib
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +46,6 @@ CYCLE_NS = 2_500_000
 TOPICS = Topics()
 UNLIMITED = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 NAMES = ('accel/counts', 'temperature/board', 'temperature/case')
-
-
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
 
 
 def bag_of(path: Path, n: int, rng: np.random.Generator) -> Path:

@@ -40,13 +40,6 @@ def node() -> Iterator[Node]:
     context.try_shutdown()
 
 
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
-
-
 class Running:
     """A loop in a thread; stores the data of its raw subscription."""
 
