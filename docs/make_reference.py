@@ -65,8 +65,8 @@ static:                              # the set of the static regime
     bias_function: {kind: polynomial, coefficients: [0.0, 0.0031]}
     scale_function: {kind: polynomial, coefficients: [1.0, 7.7e-05]}
 response:                            # columns of both sets
-  - kind: now                        # T_case - T_board
-    group: now
+  - kind: gradient                   # T_case - T_board
+    group: gradient
     range: [-9.0, 9.0]               # held at its edges
     bias: [0.0021, 0.0014, -0.0006]  # x, y, z: counts per K
     scale: [1.1e-06, 9.0e-07, 1.3e-06]  # relative, per K

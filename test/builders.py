@@ -85,16 +85,23 @@ def rich_calibration():
         slow_noise_m_s2_sqrt_h=(1e-5, 2e-5, 1e-5),
         sensors=('case', 'frame'),
         response=(
-            term('now', (0.5, -0.5, 0.5), (2e-5, 2e-5, 2e-5)),
-            term('now', (0.1, 0.2, -0.1), (0.0, 1e-6, 0.0), sensor='frame', during='dynamic'),
+            term('gradient', (0.5, -0.5, 0.5), (2e-5, 2e-5, 2e-5)),
+            term('gradient', (0.1, 0.2, -0.1), (0.0, 1e-6, 0.0), sensor='frame', during='dynamic'),
             term(
                 'rate', (3.0, 3.0, -2.0), (1e-3, -1e-3, 1e-3), during='static', range=(-0.1, 0.1)
             ),
             term('board', (0.1, 0.1, 0.2), (1e-6, 2e-6, 1e-6), tau_s=600.0),
             term('board', (-0.05, 0.02, 0.0), (2e-6, -2e-6, 2e-6), tau_s=2400.0),
-            term('neighbour', (0.2, -0.1, 0.1), (1e-6, 0.0, -1e-6), tau_s=240.0),
+            term('gradient_lag', (0.2, -0.1, 0.1), (1e-6, 0.0, -1e-6), tau_s=240.0),
             term('board', (1e-3, -2e-3, 1e-3), group='product', tau_s=600.0, power=1),
-            term('even', (0.3, 0.2, 0.1), (1e-6,) * 3, width_k=1.5, power=1, range=(0.0, 1.0)),
+            term(
+                'gradient_even',
+                (0.3, 0.2, 0.1),
+                (1e-6,) * 3,
+                width_k=1.5,
+                power=1,
+                range=(0.0, 1.0),
+            ),
             term('play', (0.1, 0.05, -0.1), (1e-6,) * 3, width_k=0.8, range=(-1.0, 1.0)),
             term('play', (0.1, -0.1, 0.1), width_k=1.6, tau_s=900.0, range=(-2.0, 2.0)),
         ),
@@ -118,10 +125,10 @@ def rich_gyroscope():
         return RateTerm(group=kind, kind=kind, bias=bias, range=(-50.0, 50.0), **keys)
 
     response = (
-        of('now', (1e-4, -2e-4, 3e-4)),
+        of('gradient', (1e-4, -2e-4, 3e-4)),
         of('board', (3e-4, 1e-4, -1e-4), tau_s=600.0),
         of('board', (-2e-4, 1e-4, 1e-4), tau_s=120.0),
-        of('neighbour', (1e-4, 0.0, 1e-4), tau_s=240.0, sensor='frame'),
+        of('gradient_lag', (1e-4, 0.0, 1e-4), tau_s=240.0, sensor='frame'),
     )
     n = 3 * (2 + len(response)) + 2 * (2 + 1 + 2)
     return Gyroscope(

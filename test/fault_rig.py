@@ -80,7 +80,7 @@ def unit(**changes: Any) -> Calibration:
         'dynamic': regime_set(*[one(True)] * 3, **ranges),
         'noise_density_m_s2_sqrt_hz': (NOISE_SD / math.sqrt(RATE_HZ),) * 3,
         'response': (
-            term('now', (BY_GRADIENT,) * 3, during='dynamic', range=(-6.0, 6.0)),
+            term('gradient', (BY_GRADIENT,) * 3, during='dynamic', range=(-6.0, 6.0)),
             term('board', (BY_MEMORY,) * 3, tau_s=MEMORY_S),
         ),
         'board_lag_s': BOARD_LAG_S,

@@ -63,7 +63,7 @@ def fitted() -> FitResult:
             )
         )
     # Without products the bank of columns is a third as large.
-    groups = ('curve', 'set', 'now', 'board')
+    groups = ('curve', 'set', 'gradient', 'board')
     return fitting.fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))
 
 

@@ -111,7 +111,7 @@ def test_every_term_by_hand():
     unit = calibration(
         axes=Axes(*[AxisReference(300.0, 7.0)] * 3),
         static=regime_set(one, one, one),
-        response=(term('now', (9.0,) * 3, (9.0,) * 3, range=(-0.05, 0.05)),),
+        response=(term('gradient', (9.0,) * 3, (9.0,) * 3, range=(-0.05, 0.05)),),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (2e-3, -3e-3, 1.0)),
     )
     compensator = Compensator(unit)
@@ -125,7 +125,7 @@ def test_every_term_by_hand():
 
 
 def test_gradient_has_the_sign_of_the_ramp():
-    unit = calibration(response=(term('now', (30.0,) * 3),))
+    unit = calibration(response=(term('gradient', (30.0,) * 3),))
     for sign in (1.0, -1.0):
         compensator = Compensator(unit)
         warm(compensator, 20.0, 20.0 + sign * 2.0, until_s=300)

@@ -60,7 +60,7 @@ def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
             name: getattr(column, name)
             for name in ('group', 'kind', 'sensor', 'tau_s', 'width_k', 'power', 'during')
         }
-        edge = 1.0 if column.kind == 'even' else 4.0 + 4.0 * rng.random()
+        edge = 1.0 if column.kind == 'gradient_even' else 4.0 + 4.0 * rng.random()
         terms.append(
             ResponseTerm(
                 **keys, range=(-edge, edge), bias=tuple(bias.tolist()), scale=tuple(scale.tolist())
@@ -292,7 +292,9 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
 
 
 def test_a_further_sensor_that_is_lost_is_paid_for():
-    unit = calibration(sensors=SENSORS, response=(term('now', (30.0, 0.0, 0.0), sensor='tip'),))
+    unit = calibration(
+        sensors=SENSORS, response=(term('gradient', (30.0, 0.0, 0.0), sensor='tip'),)
+    )
     compensator = Compensator(unit, UNCHECKED)
     variances = []
     for k in range(200):
@@ -330,7 +332,7 @@ def test_a_swap_keeps_the_memory_where_the_same_is_remembered(rng):
 def test_the_state_at_the_edge_of_a_column_is_held_and_what_is_cut_off_is_paid_for():
     unit = calibration(
         axes=Axes(*[AxisReference(300.0, 0.0)] * 3),
-        response=(term('now', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
+        response=(term('gradient', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
     )
     correction = Correction(unit)
     inside, outside = ((20.0, 0.0, 0.0, 0.0, 0.0, g, 0.0) for g in (1.0, 3.0))

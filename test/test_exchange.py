@@ -237,14 +237,14 @@ def test_what_is_lost_is_said(cubic: Calibration) -> None:
         cubic,
         static=static,
         dynamic=dynamic,
-        response=(term('now', (0.0, 1e-3, 0.0)), term('board', tau_s=60.0)),
+        response=(term('gradient', (0.0, 1e-3, 0.0)), term('board', tau_s=60.0)),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (0.0, 0.0, 1.0)),
     )
     text = export_calibration(calibration, 'ardupilot')
     for expected in (
         'replaced by cubics',
         '1e+03 urad',
-        r'response is lost (now): ',
+        r'response is lost (gradient): ',
         'dynamic set is lost',
     ):
         assert any(expected in note for note in text.notes), expected

@@ -59,14 +59,14 @@ def test_what_a_change_does_is_found_about_rest(rng):
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
     # Two readings of 3 mK a minute for about twenty hours: 0.1 mK, and rates of minutes.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
-    groups = ('curve', 'now', 'board', 'even', 'change')
+    groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     found, about_0 = (
         fit(bags, FitOptions(gravity=GRAVITY, input='m/s^2', groups=names))
         for names in (groups, groups[:-1])
     )
     kept = {column.group for column in found.calibration.response}
-    assert 'change' in kept
-    assert 'even' not in kept
+    assert 'gradient_even_about_rest' in kept
+    assert 'gradient_even' not in kept
     # Means of a minute; columns even about 0 leave a part of the effect.
     floor = NOISE / np.sqrt(30.0)
     assert found.residuals[-1].fitted.rms < 1.1 * floor
@@ -76,5 +76,5 @@ def test_what_a_change_does_is_found_about_rest(rng):
 
 def test_what_is_forced_takes_part_beside_the_groups_that_may(rng):
     bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(6, 3))]
-    options = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), forced=('now',))
-    assert {column.group for column in fit(bags, options).calibration.response} == {'now'}
+    options = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), forced=('gradient',))
+    assert {column.group for column in fit(bags, options).calibration.response} == {'gradient'}

@@ -146,7 +146,7 @@ def test_sets_and_start_states_by_hand(bags: list[ReducedBag]) -> None:
             assert not data.start[:, k].any()
             continue
         fades = np.exp(-data.time / taus[lag])
-        if column.kind in ('board', 'neighbour') and column.power == 0:
+        if column.kind in ('board', 'gradient_lag') and column.power == 0:
             np.testing.assert_allclose(data.start[:, k], fades, atol=0.15)
         assert np.abs(data.start[-1, k]) <= np.abs(data.start[:, k]).max()
 
@@ -182,7 +182,7 @@ def test_where_a_thermometer_is_lost_nothing_is_known(
 
 def test_each_column_stands_without_the_others(bags: list[ReducedBag]) -> None:
     together = windows_of(bags).data
-    for kind in ('board', 'neighbour', 'square'):
+    for kind in ('board', 'gradient_lag', 'square'):
         number = next(k for k, one in enumerate(bank()) if one.kind == kind and one.tau_s == 960.0)
         alone = windows_of(bags, (bank()[number],)).data
         np.testing.assert_array_equal(alone.columns[:, 6], together.columns[:, 6 + number])
@@ -265,7 +265,7 @@ def states_of(windows: ThermalWindows, calibration: Calibration) -> Floats:
     for (tau, width), place in layout.plays.items():
         states[:, place] = plain['play', 'case', tau, width]
     for (name, tau), place in layout.lags.items():
-        kind = 'board' if name == 'board' else 'neighbour'
+        kind = 'board' if name == 'board' else 'gradient_lag'
         states[:, place] = plain.get((kind, 'case', tau, 0.0), 0.0)
     for place in layout.gradients.values():
         states[:, place] = windows.gradient

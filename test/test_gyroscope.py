@@ -73,7 +73,7 @@ def fitted(unit):
     """Fit a MEMS unit in nine positions; no single column equals the drift of its gyroscope."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
     # Heat flows in and between the parts; half of the columns, and half of the work.
-    options = replace(OPTIONS, groups=('curve', 'now', 'board', 'neighbour', 'product'))
+    options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(one, unit.scale_factor) for one in records], options)
 
 
@@ -123,7 +123,7 @@ def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
     program = parse_cyclogram('20 10min, 35@1.5 10min, 10@1.5 15min')
     stations = [replace(one, program=program) for one in plan('chamber-9', 2)[:2]]
     records = arrays(unit, stations, 2, rate_hz=RATE_HZ)
-    options = replace(OPTIONS, groups=('curve', 'now', 'board'))
+    options = replace(OPTIONS, groups=('curve', 'gradient', 'board'))
     with_rate = fit([source_of(one, unit.scale_factor) for one in records], options)
     silent = [np.zeros((len(one.counts), 3)) for one in records]
     sources = [

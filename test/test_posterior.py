@@ -94,7 +94,7 @@ def test_layout_by_hand():
     value = calibration(
         static=regime_set(axis_set((0.0, 1.0, 2.0)), axis_set(), axis_set(scale=(1.0, 1e-4))),
         dynamic=regime_set(x=replace(axis_set(), bias_function=spline)),
-        response=(term('now'), term('board', tau_s=60.0)),
+        response=(term('gradient'), term('board', tau_s=60.0)),
     )
     layout = parameter_layout(value)
     # x: level t t^2 | level three knots | two weights.

@@ -71,7 +71,7 @@ def record(path: Path, run: SimulatedRun) -> Path:
 def fitted(bags: list[Path]) -> Calibration:
     sources, _ = fit_sources(bags)
     # The effect follows the present temperature of the lid; these columns are a sixth of the bank.
-    groups = ('curve', 'now', 'board')
+    groups = ('curve', 'gradient', 'board')
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups)).calibration
 
 

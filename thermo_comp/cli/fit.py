@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns ``fit`` (bags to a calibration) and ``prior`` (calibrations to a prior)."""
 
+import re
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from ..fitting import FitResult
     from ..fitting.selection import Trial
 
+#: Largest width of a model in a table [characters].
+_MODEL_WIDTH = 46
 Curve = Literal['linear', 'quadratic', 'cubic', 'spline', 'exponential']
 
 
@@ -64,9 +67,10 @@ def fit(
     misalignment. Parameters that the bags do not determine keep their prior
     and its uncertainty. Local gravity must be given.
 
-    Groups: curve, set, now, board, neighbour, product, mixed, square, even,
-    change, play. A group stays if data that took no part are corrected better
-    with it.
+    Groups: curve, set, gradient, board, gradient_lag, product,
+    gradient_x_temperature, square, gradient_even, gradient_even_about_rest,
+    play. A group is kept if it improves the correction of data left out of
+    the fit.
 
     Example:
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
@@ -262,17 +266,14 @@ def _say_models(out: Output, trials: Sequence['Trial']) -> None:
     if not kept or len(trials) < 2:
         return
     names = [list(columns)[k] for k in kept]
+    rows: list[tuple[Cell, ...]] = []
+    for one, row in zip(trials, left, strict=True):
+        first, *more = _wrapped(_named(one.groups))
+        mark = '*' if one.is_chosen else '~' if one.is_near else ''
+        rows.append((mark, *(row[k] for k in kept), first))
+        rows += [('', *[''] * len(kept), line) for line in more]
     out.table(
-        ('', *names, 'model'),
-        [
-            (
-                '*' if one.is_chosen else '~' if one.is_near else '',
-                *(row[k] for k in kept),
-                _named(one.groups),
-            )
-            for one, row in zip(trials, left, strict=True)
-        ],
-        title='models compared on data left out of the fit, RMS in ug',
+        ('', *names, 'model'), rows, title='models compared on data left out of the fit, RMS in ug'
     )
     for name in names:
         out.line(f'{name}: {columns[name]}')
@@ -284,6 +285,16 @@ def _named(groups: tuple[str, ...]) -> str:
     if len(groups) < 2 or groups[0] != 'curve':
         return '+'.join(groups) or 'constants'
     return ''.join(f'+{one}' for one in groups[1:])
+
+
+def _wrapped(name: str) -> list[str]:
+    """Break the name of a model before a group, so that the table fits 80 columns."""
+    lines = ['']
+    for part in re.split(r'(?=\+)', name):
+        if len(lines[-1]) + len(part) > _MODEL_WIDTH:
+            lines.append('  ')
+        lines[-1] += part
+    return lines
 
 
 def _model(trial: 'Trial') -> dict[str, Any]:

@@ -99,7 +99,10 @@ def build_calibration(
     span = temperatures[1] - temperatures[0]
     n_curves = len(model.sets.levels())
     for at, k in enumerate(used):
-        if not state.weights[:, :, n_curves + k].any() and model.columns[k].kind != 'even':
+        if (
+            not state.weights[:, :, n_curves + k].any()
+            and model.columns[k].kind != 'gradient_even'
+        ):
             most = span ** model.columns[k].order
             seen[at] = union((seen[at], (-most, most)))
     columns = [
@@ -278,7 +281,7 @@ def _triple(values: Floats) -> tuple[float, float, float]:
 
 
 def _column_range(column: Column, values: Floats) -> tuple[float, float]:
-    if column.kind == 'even':
+    if column.kind == 'gradient_even':
         return column.range
     return _widened(values, _LINEAR_REACH**column.order, 0.01)
 
