@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from triads import sibling, unit_of
 
 from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.priors import population
@@ -28,7 +29,6 @@ from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording.blocks import Block, Readings
 from thermo_comp.simulation.campaign import plan
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import SimulatedRun, arrays
 from thermo_comp.typing import Floats
 from thermo_comp.unit.calibration import Calibration, parameter_layout
@@ -41,7 +41,7 @@ N_SIBLINGS = 10
 @dataclass(frozen=True)
 class Goal:
     """
-    What must be reached, worst unit: |g| and vector RMS in micro-g, or relative to the floor.
+    Limits for the worst unit: RMS of |g| and of the vector, in micro-g or relative to the floor.
     """
 
     norm: float
@@ -64,7 +64,7 @@ GOALS = {
     'slow-noise': Goal(1.15, 1.15, is_relative=True),
     'plain': Goal(1.05, 1.05, is_relative=True, plan='chamber-9'),
 }
-# Little time in the chamber: alone, and with the prior of siblings.
+# Tests with little time in the chamber: alone, and with the prior of siblings.
 PLAN_GOALS = {
     'chamber-9': (None, None),
     'tumble-3': (Goal(1.5, 2.5), Goal(1.2, 2.1)),
@@ -132,7 +132,7 @@ def fit_and_correct(
         columns = np.column_stack((found.specific_force, found.covariance[:, [0, 4, 8]]))
         size = np.diff(first, append=len(slots))
         mean = np.add.reduceat(columns, first, axis=0)[size == size.max()] / size.max()
-        # White noise and rounding average down, the rest of the published variance does not.
+        # White noise and rounding average out, the rest of the published variance does not.
         white = np.array(compensator.thermal.correction.noise)
         forces.append(mean[:, :3])
         sds.append(np.sqrt(np.maximum(mean[:, 3:] - white, 0.0) + density**2 / WINDOW_S))
@@ -172,7 +172,7 @@ def errors(found: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[Simula
 
 
 def corrected_by_truth(run: SimulatedRun) -> Floats:
-    """Return what a perfect thermal model makes of windows' mean counts, (w, 3), m/s^2."""
+    """Correct the mean counts of windows with the true thermal model, (w, 3), m/s^2."""
     unit = run.truth.unit
     per = round(WINDOW_S / (2.0 * run.truth.cycle_s[0]))
     n = len(run.counts) // per
@@ -189,13 +189,13 @@ def corrected_by_truth(run: SimulatedRun) -> Floats:
 
 
 def floor(tests: Sequence[SimulatedRun]) -> Errors:
-    """Return what the true model leaves on the same noise."""
+    """Return the residual of the true model with the same noise."""
     found = [corrected_by_truth(record) for record in tests]
     return errors(found, [np.ones_like(one) for one in found], tests)
 
 
 def judged(found: Errors, goal: Goal | None, least: Errors) -> str:
-    """Return |g| and vector RMS as a cell, with a mark where they miss the goal."""
+    """Return RMS of |g| and of the vector as a cell, marked if they exceed the limits."""
     cell = f'{found.norm:.2f} / {found.vector:.2f}'
     if goal is None:
         return cell
@@ -209,7 +209,7 @@ def _rms(values: Floats) -> float:
 
 
 def part_kinds(options: argparse.Namespace) -> None:
-    """Units of every kind of physics, on a test that the fit never saw."""
+    """Units of every kind of physics, on a test that was not used by the fit."""
     print(
         '| unit | seed | floor: norm / vector | golovach | fit | peak | error / claimed sd '
         '| fit s |'
@@ -218,7 +218,7 @@ def part_kinds(options: argparse.Namespace) -> None:
     for kind in options.kinds or GOALS:
         goal = GOALS[kind]
         for seed in range(1, options.seeds + 1):
-            unit = unit_preset(kind, seed)
+            unit = unit_of(kind, seed)
             records = arrays(unit, plan(goal.plan, seed), seed, rate_hz=options.rate_hz)
             tests = arrays(unit, plan('held-out', seed), seed + 500, rate_hz=options.rate_hz)
             least = floor(tests)
@@ -242,13 +242,13 @@ def part_plans(options: argparse.Namespace) -> None:
     print('|---|---|---|---|---|---|---|')
     for kind in options.kinds or ('own-lags', 'between', 'products'):
         for seed in range(1, options.seeds + 1):
-            unit = unit_preset(kind, seed)
+            unit = unit_of(kind, seed)
             tests = arrays(unit, plan('held-out', seed), seed + 500, rate_hz=options.rate_hz)
             least = floor(tests)
             siblings = population([
                 fitted(
                     arrays(
-                        unit.sibling(number), plan('chamber-18', number), 100 * seed + number,
+                        sibling(unit, number), plan('chamber-18', number), 100 * seed + number,
                         rate_hz=options.rate_hz,
                     ),
                     serial=f'sibling-{number}',
@@ -271,7 +271,7 @@ def part_plans(options: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    """Run the parts asked for."""
+    """Run the selected parts."""
     parts = {'kinds': part_kinds, 'plans': part_plans}
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

@@ -59,7 +59,7 @@ def read_ours_whole(path: Path) -> int:
 
 
 def read_ours_blocks(path: Path) -> int:
-    """Read block by block, as the compensator does it."""
+    """Read block by block, as for the compensator."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks())
 
@@ -79,7 +79,7 @@ def read_rosbags(path: Path) -> int:
 
 
 def read_mcap(path: Path) -> int:
-    """Read every message, its bytes not decoded."""
+    """Read every message without decoding it."""
     from mcap.reader import make_reader
 
     n = 0

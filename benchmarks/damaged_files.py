@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what can happen to the file of a bag: flipped, wiped, cut off, rows gone, a bomb."""
+"""
+Owns the damages to the file of a bag: bits flipped, parts wiped or cut off, rows removed, a bomb.
+"""
 
 from __future__ import annotations
 
@@ -41,25 +43,25 @@ def wipe(file: Path) -> None:
 
 
 def cut(file: Path) -> None:
-    """Leave a half."""
+    """Keep only the first half."""
     data = file.read_bytes()
     file.write_bytes(data[: len(data) // 2])
 
 
 def delete_rows(file: Path) -> None:
-    """Take rows out of a database."""
+    """Delete rows of a database."""
     with sqlite3.connect(file) as database:
         database.execute('delete from messages where id between 100 and 265')
 
 
 def flip_message(file: Path) -> None:
-    """Flip a bit in the topic number of a message: it belongs to no topic then."""
+    """Flip a bit in the topic number of a message, so that it belongs to no topic."""
     with sqlite3.connect(file) as database:
         database.execute('update messages set topic_id = topic_id + 64 where topic_id = 1')
 
 
 def bomb(file: Path) -> None:
-    """Put 8 GB of zeros into some hundred kB."""
+    """Compress 8 GB of zeros to some hundred kB."""
     with file.open('wb') as out, zstandard.ZstdCompressor(19).stream_writer(out) as packed:
         for _ in range(1 << 13):
             packed.write(bytes(1 << 20))

@@ -63,7 +63,7 @@ TABLES = {'convert'}
 
 @dataclass(frozen=True)
 class Run:
-    """What one command did with one input."""
+    """Result of a command with an input."""
 
     input: str
     command: str
@@ -75,7 +75,7 @@ class Run:
 
 
 def _peak_megabytes(pid: int) -> float:
-    """Largest resident size so far; 0 once the process has ended."""
+    """Largest resident size so far [MB]; 0 once the process has ended."""
     try:
         status = Path(f'/proc/{pid}/status').read_text()
     except OSError:
@@ -85,7 +85,7 @@ def _peak_megabytes(pid: int) -> float:
 
 
 def run(name: str, command: str, path: Path, out: Path) -> Run:
-    """Run one command to its end, or until its time is over."""
+    """Run one command to its end, or until the time limit."""
     program = Path(sys.executable).with_name('thermo_comp')
     log = out / 'said.txt'
     began = time.monotonic()
@@ -100,7 +100,7 @@ def run(name: str, command: str, path: Path, out: Path) -> Run:
     pid = 0
     megabytes = 0.0
     while not pid and time.monotonic() - began < LIMIT_S:
-        # Of what wait4 tells, the memory begins with that of the process which started it.
+        # The memory of wait4 starts with that of the parent process.
         megabytes = max(megabytes, _peak_megabytes(process.pid))
         pid, status, _ = os.wait4(process.pid, os.WNOHANG)
         time.sleep(0.01)

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the degenerate inputs: one recording or table, spoilt in as many ways as there are names.
-"""
+"""Owns the degenerate inputs: a recording or table, with a different defect for each name."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ RATE_HZ, POSITIONS, POSITION_S = 20, 10, 40
 
 @dataclass
 class Columns:
-    """A thermal test in one recording: positions at rest, one after the other, in a ramp."""
+    """A thermal test in one recording: positions at rest one after the other, during a ramp."""
 
     stamp_ns: np.ndarray
     counts: np.ndarray
@@ -41,7 +39,7 @@ class Columns:
 
 
 def whole() -> Columns:
-    """Make the recording that the others are spoilt from."""
+    """Make the recording that the other inputs are derived from."""
     rng = np.random.default_rng(20)
     n = RATE_HZ * POSITIONS * POSITION_S
     row = np.arange(n)
@@ -55,7 +53,7 @@ def whole() -> Columns:
 
 
 def write(folder: Path, columns: Columns, name: str = 'bag.mcap', log: bool = False) -> Path:
-    """Write a bag; with `log`, its log times rise whatever the stamps do."""
+    """Write a bag; with `log` its log times rise, whatever the stamps are."""
     path = folder / name
     rising = START_NS + np.arange(len(columns.stamp_ns)) * (SECOND // RATE_HZ) if log else None
     slow = None if rising is None else rising[:: RATE_HZ // 2][: len(columns.reading_ns)]
@@ -69,7 +67,7 @@ def write(folder: Path, columns: Columns, name: str = 'bag.mcap', log: bool = Fa
 
 
 def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]:
-    """Spoil the stamps."""
+    """Apply a defect to the stamps."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -81,7 +79,7 @@ def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]
 
 
 def spoilt(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
-    """Spoil anything else."""
+    """Apply a defect to any other part."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -94,7 +92,10 @@ def spoilt(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
 def imu(
     change: Callable[[np.ndarray], np.ndarray], claimed: float = 0.0
 ) -> Callable[[Path], Path]:
-    """Write sensor_msgs/Imu with changed samples [m/s^2], their covariance begun by a number."""
+    """
+    Write sensor_msgs/Imu with changed samples [m/s^2]; the first element of the covariance is
+    given.
+    """
 
     def make(folder: Path) -> Path:
         columns, path = whole(), folder / 'bag.mcap'
@@ -108,18 +109,20 @@ def imu(
 
 
 def _by_turns(force: np.ndarray) -> np.ndarray:
-    """Make each second row exactly zero, as a driver does that sends the gyroscope between."""
+    """Make every second row exactly zero, like a driver that sends gyroscope rows between."""
     return force * (np.arange(len(force)) % 2)[:, None]
 
 
 def _without_gravity(force: np.ndarray) -> np.ndarray:
-    """Take off the mean of each position."""
+    """Subtract the mean of each position."""
     own = force.reshape(POSITIONS, -1, 3)
     return (own - own.mean(axis=1, keepdims=True)).reshape(-1, 3)
 
 
 def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Move all the time but for a second now and then, as an arm does, or a car at crossings."""
+    """
+    Keep the unit in motion except for a second now and then, like an arm, or a car at crossings.
+    """
 
     def change(force: np.ndarray) -> np.ndarray:
         rng = np.random.default_rng(9)
@@ -130,12 +133,12 @@ def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _leaning(force: np.ndarray) -> np.ndarray:
-    """Let y read a good part of x, as no triad does."""
+    """Add a large part of x to y, which no real triad has."""
     return force @ np.array([[1.0, 0.6, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
-    """Let the clock jump in the middle, or after every so many stamps."""
+    """Let the clock jump in the middle, or periodically."""
 
     def change(stamp_ns: np.ndarray) -> np.ndarray:
         row = np.arange(len(stamp_ns))
@@ -146,7 +149,7 @@ def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def rosbag2(storage: StoragePlugin, mode: CompressionMode | None) -> Callable[[Path], Path]:
-    """Write the whole recording as another storage."""
+    """Write the whole recording in another storage."""
 
     def make(folder: Path) -> Path:
         bare = write(folder, whole())
@@ -172,7 +175,7 @@ ZSTD = rosbag2(StoragePlugin.MCAP, CompressionMode.FILE)
 
 
 def with_pipe(folder: Path) -> Path:
-    """Put a FIFO beside the files of a bag, and one in the place of its metadata."""
+    """Put a FIFO beside the files of a bag, and another in place of its metadata."""
     bag = DB3(folder)
     (bag / 'metadata.yaml').unlink()
     os.mkfifo(bag / 'metadata.yaml')
@@ -189,7 +192,7 @@ def pipe_as_file(folder: Path) -> Path:
 
 
 def device_as_file(folder: Path) -> Path:
-    """Let the file of a bag lead to an endless device."""
+    """Replace the file of a bag by a link to an endless device."""
     bag = folder / 'bag'
     bag.mkdir()
     (bag / 'bag_0.db3').symlink_to('/dev/zero')
@@ -197,13 +200,13 @@ def device_as_file(folder: Path) -> Path:
 
 
 def other_name(folder: Path) -> Path:
-    """Give a bag a name that is no UTF-8."""
+    """Give a bag a name that is not UTF-8."""
     path = Path(os.fsdecode(os.fsencode(folder) + b'/b\xe9\xff.mcap'))
     return write(folder, whole()).rename(path)
 
 
 def table(change: Callable[[np.ndarray], np.ndarray], kind: str) -> Callable[[Path], Path]:
-    """Write a table with spoilt stamps."""
+    """Write a table with a defect in its stamps."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -246,7 +249,9 @@ def _samples(columns: Columns, n: int) -> None:
 
 @dataclass(frozen=True)
 class Input:
-    """One degenerate input; `is_lost` = something of it cannot be read, so nobody may say 0."""
+    """
+    One degenerate input; with `is_lost` a part of it cannot be read, so that exit code 0 is wrong.
+    """
 
     make: Callable[[Path], Path]
     is_lost: bool = False

@@ -26,10 +26,10 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 def exact_unit(seed: int) -> UnitModel:
     """
-    Make a unit whose drift is a quadratic of the board's temperature, and nothing else.
+    Make a unit whose drift is only a quadratic of the board's temperature.
 
-    It does not heat itself, so that its bags visit the reference, where no heat flows: what a
-    unit's constants are at a state that nobody has seen no bound tells.
+    It has no self-heating, so that its bags contain the reference state, in which no heat flows. A
+    bound on the constants at a state that was not visited would not be meaningful.
     """
     rng = np.random.default_rng(seed)
 
@@ -87,7 +87,7 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
 
     columns = []
     for j in range(len(start)):
-        # Steps of the size that the data could just tell, from the signal itself.
+        # Steps of the size of the standard deviations, from the signal itself.
         step = np.zeros(len(start))
         step[j] = 1e-6 if j >= 9 else 1e-3
         step[j] *= 1e-3 if j < 18 and j % 3 == 2 else 1e-1 if j < 18 and j % 3 == 1 else 1.0

@@ -50,7 +50,7 @@ def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:
 
 
 def measure(task: str, paths: list[Path]) -> dict[str, float]:
-    """Run one task in a process of its own."""
+    """Run one task in a separate process."""
     done = subprocess.run(
         [sys.executable, __file__, '--task', task, *map(str, paths)],
         check=False,
@@ -58,14 +58,14 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
         text=True,
     )
     if done.returncode:
-        # One that the system ended says nothing.
+        # A process that was ended by the system prints nothing.
         said = done.stderr.splitlines() or [f'exit code {done.returncode}']
         sys.exit(f'{task} of {len(paths)} bags failed: {said[-1]}')
     return dict(json.loads(done.stdout))
 
 
 def run_task(task: str, paths: list[Path]) -> dict[str, float]:
-    """Read the bags, or fit them, and say what it took."""
+    """Read the bags, or fit them, and print time and memory."""
     from thermo_comp.fitting import FitOptions, fit
     from thermo_comp.fitting.sources import fit_sources
 

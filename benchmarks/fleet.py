@@ -43,14 +43,14 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 #: An hour over 35 K at a sample per second, so that hundreds of units are simulated in minutes.
 PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2
-#: The smallest thermal test that fits: what a scheduler has the least time for.
+#: The smallest thermal test that can be fitted, which leaves the scheduler the least time.
 SMALL_PROGRAM, SMALL_BAGS = '20 2min, 45@5 8min, 5@5 10min', 6
 N_LOTS = 4
 _REST_S = 4.0
 
 
 def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
-    """Simulate units, one bag per position; those that are there already are kept."""
+    """Simulate units, one bag per position; existing ones are kept."""
     chamber = parse_cyclogram(program)
     for seed in range(1, n_units + 1):
         unit = unit_preset('mems', seed)
@@ -82,7 +82,7 @@ def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
 
 
 def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
-    """Find the units of a fleet; each comes again under another name where there are too few."""
+    """Find the units of a fleet, repeated under other names if there are too few."""
     found = find_units(Storage(str(folder)))
     return [found[i % len(found)] for i in range(n_units)]
 
@@ -118,16 +118,16 @@ class Measured:
 
     @property
     def per_task_s(self) -> float:
-        """Return what one task costs client and scheduler."""
+        """Return the cost of a task for client and scheduler."""
         return max(self.own_cpu_s - self.rest_cpu * self.seconds, 0.0) / len(self.tasks)
 
     def busy(self, n_workers: int) -> float:
-        """Return the part of their time in which the workers had something to do."""
+        """Return the share of time in which the workers were busy."""
         return sum(self.tasks) / (n_workers * self.seconds)
 
 
 def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -> Measured:
-    """Fit units on a cluster that has started and fitted before."""
+    """Fit units on a cluster that is already running and warmed up."""
     units = units_of(folder, n_units)
     with connected(None, n_workers) as client:
         count_bytes()
@@ -156,13 +156,13 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
 
 
 def process_cpu() -> float:
-    """Return this process' processor time, with that of its threads."""
+    """Return the processor time of this process including its threads."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
 
 def count_bytes() -> None:
-    """Count, from now on, what this process writes to its connections."""
+    """Count the bytes that this process writes to its connections from now on."""
     from distributed.comm.tcp import TCP
 
     if hasattr(TCP, 'n_written'):
@@ -179,14 +179,14 @@ def count_bytes() -> None:
 
 
 def bytes_written() -> int:
-    """Return what `count_bytes` has counted."""
+    """Return the number counted by `count_bytes`."""
     from distributed.comm.tcp import TCP
 
     return int(TCP.n_written)
 
 
 def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
-    """Compare one worker with two, on the same units and on twice as many."""
+    """Compare one worker with two, for the same units and for twice as many."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model=model)
     options = FleetOptions(fit, certificates=False)
@@ -199,9 +199,9 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
             measure(folder / 'fleet', units, workers, options)
             for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
         )
-        # What other programs take of the processors slows two workers more than one. Two workers
-        # with a processor each lose only what they wait, and what their fits cost more side by
-        # side (caches, memory); neither depends on who else runs.
+        # Other programs on the processors slow two workers more than one. With a processor each,
+        # two workers only lose waiting time, and time by sharing caches and memory; neither
+        # depends on other programs.
         free = 2.0 * two.busy(2) / one.busy(1) * one.cpu_s / two.cpu_s
         found.append((one.seconds / two.seconds, free, 2.0 * half.seconds / two.seconds))
         print(
@@ -218,7 +218,7 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
 
 def overhead(folder: Path, n_units: int) -> None:
     """
-    Measure what is lost between the tasks of many small units, and what follows for many workers.
+    Measure the overhead between the tasks of many small units, and extrapolate to many workers.
     """
     write_fleet(folder / 'small', 20, SMALL_BAGS, SMALL_PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model='golovach')
@@ -237,7 +237,7 @@ def overhead(folder: Path, n_units: int) -> None:
 
 
 def kill(folder: Path, n_units: int, model: str) -> int:
-    """Kill a worker twice in a run, each time in the middle of a unit; count the rows."""
+    """Kill a worker twice during a run, each time while it fits a unit; count the rows."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fleet = Path(tempfile.mkdtemp(prefix='fleet-', dir=folder))
     for unit in find_units(Storage(str(folder / 'fleet')))[:n_units]:
@@ -272,7 +272,7 @@ def kill(folder: Path, n_units: int, model: str) -> int:
 
 
 def paper(found: Measured) -> None:
-    """Estimate a hundred workers: tasks as measured, one scheduler that sends them one by one."""
+    """Estimate a hundred workers: tasks as measured, sent one by one by one scheduler."""
     kilobytes = found.n_bytes / len(found.tasks) / 1e3
     print('\n| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
     print('|---|---|---|---|---|---|---|')
@@ -296,7 +296,7 @@ def paper(found: Measured) -> None:
 
 
 def makespan(tasks: Sequence[float] | np.ndarray, n_workers: int, per_task: float) -> float:
-    """Play a run: each worker gets the next task when it is free and the scheduler has time."""
+    """Simulate a run: each worker gets the next task once worker and scheduler are free."""
     free = [0.0] * n_workers
     scheduler = end = 0.0
     for task in tasks:

@@ -41,9 +41,9 @@ BAGS = Path(__file__).resolve().parent.parent / 'bags'
 #: Mean radius of the Earth [m]: IUGG, R_1.
 EARTH_RADIUS = 6.371009e6
 ALIGN_S, FREE_S, COAST_S, STANDING_S = 300.0, 1800.0, 300.0, 1500.0
-#: Between two zero-velocity updates, how well they are known [m/s], and from flight to flight.
+#: Interval of zero-velocity updates, their sd [m/s], and interval between starts of flights.
 ZUPT_S, ZUPT_SD, EVERY_S = 60.0, 1e-3, 60.0
-#: How long the accelerometer's error lasts, for the filter: some lags of a board.
+#: Correlation time of the accelerometer's error in the filter: some lags of a board.
 BIAS_S = 1800.0
 COLOURS = {'raw': '#b2182b', 'one set': '#e08214', 'compensated': '#2166ac'}
 
@@ -57,7 +57,7 @@ def turned(angles: Floats) -> Floats:
 
 
 def levelled(force: Floats) -> Floats:
-    """Give the attitude, body to east-north-up, that makes a mean force (..., 3) vertical."""
+    """Return the attitude, body to east-north-up, that makes a mean force (..., 3) vertical."""
     up = force / np.linalg.norm(force, axis=-1, keepdims=True)
     east = np.array([1.0, 0.0, 0.0]) - up[..., :1] * up
     east /= np.linalg.norm(east, axis=-1, keepdims=True)
@@ -66,7 +66,7 @@ def levelled(force: Floats) -> Floats:
 
 @dataclass
 class Navigator:
-    """A strapdown navigator, or many that start together: attitude, velocity, position."""
+    """A strapdown navigator, or many with the same start: attitude, velocity, position."""
 
     attitude: Floats
     gravity: float
@@ -90,7 +90,7 @@ class Navigator:
         self.position = self.position + self.velocity * dt
 
     def correct(self, gain: Floats, innovation: Floats) -> None:
-        """Take the errors p, v, a, b of both level axes off, as a measurement tells them."""
+        """Subtract the estimated errors p, v, a, b of both level axes."""
         level = innovation[..., :2, None] * gain
         up = np.zeros((*level.shape[:-2], 1))
         position, velocity, tilt, bias = (
@@ -105,7 +105,9 @@ class Navigator:
 
 @dataclass(frozen=True)
 class Model:
-    """One way to correct the bag: specific force (n, 3) [m/s^2], and what it claims."""
+    """
+    A correction of the bag: specific force (n, 3) [m/s^2], with its noise density and bias sd.
+    """
 
     force: Floats
     noise_density: float
@@ -114,7 +116,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Flights:
-    """Errors of all flights over time, shape (steps, flights), and the filter's own sigma."""
+    """Errors of all flights over time, shape (steps, flights), and the filter's sigma."""
 
     time_s: Floats
     position: Floats
@@ -124,7 +126,7 @@ class Flights:
 
 
 def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> Flights:
-    """Level, stand with zero-velocity updates for a while, navigate freely; from every minute."""
+    """Level, stand with zero-velocity updates, then navigate freely; start in every minute."""
     n_align = round(ALIGN_S / dt)
     n = round((zupts_s + (COAST_S if zupts_s else FREE_S)) / dt)
     starts = np.arange(0, len(model.force) - n_align - n, round(EVERY_S / dt))
@@ -136,7 +138,7 @@ def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> 
     )  # fmt: skip
     F = np.eye(4) + A * dt + 0.5 * A @ A * dt * dt
     Q = np.diag([0.0, model.noise_density**2, 0.0, 2.0 * model.bias_sd**2 / BIAS_S]) * dt
-    # Levelling turns the accelerometer's error into a tilt that hides it.
+    # Levelling turns the error of the accelerometer into a tilt that compensates it.
     tilt = np.array([0.0, 0.0, 1.0 / gravity, 1.0])
     P = np.outer(tilt, tilt) * model.bias_sd**2
     P[2, 2] += model.noise_density**2 / ALIGN_S / gravity**2
@@ -157,7 +159,10 @@ def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> 
 
 
 def models() -> tuple[dict[str, Model], float, Floats, float]:
-    """Fit the sample bags, correct the held-out one; also its step [s], true up and gravity."""
+    """
+    Fit the sample bags and correct the held-out one; also return its step [s], true up and
+    gravity.
+    """
     bags, held_out = sorted((BAGS / 'fit').glob('*.mcap')), BAGS / 'held_out.mcap'
     full = tc.fit(bags, gravity=9.80665)
     one = tc.fit(bags, gravity=9.80665, groups=('curve',), static_curve='cubic',
@@ -174,7 +179,7 @@ def models() -> tuple[dict[str, Model], float, Floats, float]:
     bias = np.array([axis.bias for axis in axes])
     scale = np.array([axis.scale_factor for axis in axes])
     raw = (recording.counts - bias) / scale @ np.array(full.misalignment).T
-    # It claims nothing, so the filter is told what it is told of the compensated one.
+    # Raw data have no stated uncertainty, so the filter uses that of the compensated data.
     ours = found['compensated']
     truth = json.loads(inspect_recording(held_out).metadata['truth'])
     return (

@@ -25,8 +25,8 @@ that then opens the other's shared memory may stand still for a third of a secon
 to see whether somebody reads there, and sends nothing meanwhile. So nothing is measured until all
 have met.
 
-A core with nothing to do sleeps, and takes its time to wake; a virtual one is given to others
-meanwhile. Where the system allows it (Linux, as root) all cores are therefore kept awake for all
+An idle core sleeps and needs time to wake up, and an idle virtual core may be given away.
+Where the system allows it (Linux, as root) all cores are therefore kept awake for all
 relays alike, by a request for no latency in /dev/cpu_dma_latency, as cyclictest has it;
 `--sleep` leaves them alone. The host may stop a virtual machine all the same; while it does, no
 process gets on. How much of the time that was stands behind each row ("stolen"): latencies say
@@ -56,9 +56,10 @@ import thermo_comp
 ROOT = Path(__file__).resolve().parent.parent
 RATES = (100, 400, 1000, 2000, 5000, 10000)
 ROLES = ROOT / 'benchmarks' / 'relay_roles.py'
-# From one announcement to the next, and three times a third of a second for those who meet.
+# Interval of announcements, and three times a third of a second for processes that discover each
+# other.
 MEETING_S = 4.0
-# Holds for as long as it is open: the longest time to wake, in us, a native 32-bit number.
+# Effective while open: the longest wake-up time in us, as a native 32-bit number.
 LATENCY_REQUEST = Path('/dev/cpu_dma_latency')
 CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
 
@@ -135,7 +136,7 @@ def _calibration_for(rate: int, folder: Path) -> str:
 def _measure(
     relay: str, rate: int, seconds: float, options: list[str], *, reloads: bool = False
 ) -> dict[str, Any]:
-    """Run source, relay and sink as processes once; return the figures."""
+    """Run source, relay and sink once as processes; return the figures."""
     with ExitStack() as stack:
         middle, sink, source = (
             stack.enter_context(_process(role, options)) for role in (relay, 'sink', 'source')
@@ -167,7 +168,7 @@ def _measure(
 
 
 def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Sum up the loss; take the medians of CPU time and latencies."""
+    """Sum the losses, and take the medians of CPU time and latencies."""
     summary = {name: sum(run[name] for run in runs) for name in ('n_sent', 'n_lost')}
     for name in ('cpu_us', 'stolen', 'p50_ms', 'p99_ms', 'p999_ms'):
         summary[name] = statistics.median(run[name] for run in runs)
@@ -176,9 +177,9 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _ratio(runs: list[dict[str, Any]], naive: list[dict[str, Any]]) -> float:
     """
-    Compare each run's CPU time with that of the naive relay just before it; return the median.
+    Divide each run's CPU time by that of the naive relay just before it; return the median ratio.
 
-    A machine changes its pace over minutes, by more than what is to be told apart.
+    The speed of a machine changes over minutes by more than the differences to be measured.
     """
     return statistics.median(
         one['cpu_us'] / other['cpu_us'] for one, other in zip(runs, naive, strict=True)
@@ -205,7 +206,8 @@ def _expect(process: subprocess.Popen[str], word: str) -> None:
 @contextmanager
 def _cores_kept_awake(may_sleep: bool) -> Iterator[bool]:
     """
-    Ask the system for cores that do not sleep while this is open; say whether it took the request.
+    Request from the system that cores do not sleep while this is open; return whether it is
+    possible.
     """
     with ExitStack() as stack:
         asked = False
@@ -220,7 +222,7 @@ def _cores_kept_awake(may_sleep: bool) -> Iterator[bool]:
 @contextmanager
 def _process(role: str, options: list[str]) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, str(ROLES), role, *options]
-    # The very package that is found here, installed or not.
+    # Use the package of this interpreter, installed or not.
     environment = {**os.environ, 'PYTHONPATH': str(Path(thermo_comp.__file__).parents[1])}
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
@@ -234,19 +236,19 @@ def _process(role: str, options: list[str]) -> Iterator[subprocess.Popen[str]]:
         try:
             process.wait(timeout=3)
         except subprocess.TimeoutExpired:
-            # rclpy.spin now and then sleeps through a signal.
+            # rclpy.spin sometimes misses a signal.
             process.kill()
 
 
 def _cpu_time(pid: int) -> float:
-    """CPU time of another process, all threads, to the nanosecond (Linux: clock_getcpuclockid)."""
+    """
+    Return the CPU time of another process with all threads [ns] (Linux: clock_getcpuclockid).
+    """
     return time.clock_gettime((~pid << 3) | 2)
 
 
 def _machine_time() -> tuple[int, int]:
-    """
-    Give the time that the host took from this machine, and all that has passed; of all cores.
-    """
+    """Return the time that the host took from this machine, and the total time, of all cores."""
     file = Path('/proc/stat')
     if not file.is_file():
         return 0, 0

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the table of what a second thermometer is worth: fits with and without the case, on new runs.
+Owns the table of the benefit of a second thermometer: fits with and without the case, on new runs.
 
-    python benchmarks/one_thermometer.py
+python benchmarks/one_thermometer.py
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MICRO_G = 9.80665e-6
 
 
 def command(*arguments: object) -> dict[str, Any]:
-    """Run a command and give what it says as JSON; its exit code 1 is a verdict, too."""
+    """Run a command and return its JSON; exit code 1 is a verdict and accepted."""
     line = [sys.executable, '-m', 'thermo_comp', *map(str, arguments), '--json']
     done = subprocess.run(line, capture_output=True, text=True, check=False, cwd=ROOT)
     if done.returncode not in {0, 1} or not done.stdout:
@@ -36,7 +36,7 @@ def command(*arguments: object) -> dict[str, Any]:
 
 
 def without_case(bag: Path, target: Path) -> Path:
-    """Copy samples and board temperatures."""
+    """Copy samples and board temperatures only."""
     found = read_recording(bag, require=('accel', 'board'))
     columns, board = found.columns, found.columns.temperatures['board']
     with BagWriter(target, metadata=dict(found.info.metadata)) as writer:
@@ -49,7 +49,7 @@ def without_case(bag: Path, target: Path) -> Path:
 
 
 def bags_of(unit: str, folder: Path) -> tuple[list[Path], list[Path]]:
-    """Give the bags of a fit and held-out ones, simulated but for the sample unit's."""
+    """Return the bags of a fit and held-out ones; simulated, except for the sample unit's."""
     if unit == 'sample':
         return sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), [ROOT / 'bags' / 'held_out.mcap']
     common = ('simulate', '--unit', unit, '--rate-hz', RATE_HZ)
@@ -59,7 +59,7 @@ def bags_of(unit: str, folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def left(bags: list[Path], held: list[Path], calibration: Path) -> dict[str, float]:
-    """Fit, and give RMS of |f| - g on the held-out run, raw and corrected [m/s^2]."""
+    """Fit, and return RMS of |f| - g on the held-out run, raw and corrected [m/s^2]."""
     command('fit', *bags, '-o', calibration, '--gravity', '9.80665')
     found: dict[str, float] = command('evaluate', *held, '-c', calibration)['sections_m_s2']['all']
     return found

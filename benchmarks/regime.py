@@ -28,7 +28,7 @@ from regime_scenes import SENSORS, Scene, known_signature_delays, read, temperat
 from thermo_comp.thermal.regime import Regime
 
 SOAK_H = 5.0
-# ramps per scene, by the rate of the readings [Hz]: ten times the readings, ten times the work
+# Ramps per scene, by the rate of the readings [Hz]; the work is proportional to the rate.
 RAMPS = {10.0: 1, 1.0: 6, 0.1: 10}
 
 Rows = list[list[str]]
@@ -36,14 +36,14 @@ Matrix = list[tuple[Scene, Outcome]]
 
 
 def quantiles(delays: list[float]) -> tuple[float, float]:
-    """Median and 95 %; infinite when there is none."""
+    """Median and 95 %; infinite if empty."""
     if not delays:
         return np.inf, np.inf
     return float(np.median(delays)), float(np.percentile(delays, 95))
 
 
 def cost_table() -> Rows:
-    """Cost of a reading beside that of the smallest numpy call."""
+    """Cost of a reading, and of the smallest numpy call for comparison."""
     measured = cost()
     unit = measured['numpy scalar call']
     rows = [['per reading', 'CPU us', 'numpy scalar calls']]
@@ -62,7 +62,7 @@ def table(title: str, rows: Rows) -> None:
 
 
 def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
-    """Delays of the named ramp by sensor, and of the CUSUM that knows it."""
+    """Delays of the named ramp by sensor, and of the CUSUM with known ramp."""
     n, hours = (6, 20.0) if is_quick else (200, 400.0)
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, n, seed, rippled) for scene in scenes for rippled in (False, True)]
@@ -143,7 +143,7 @@ def run_matrix(
 
 
 def rate_table(matrix: Matrix) -> Rows:
-    """Count what the detector made of the ramps, by the rate of the readings."""
+    """Count detections, flips and misses of the ramps, by the rate of the readings."""
     rows = [['readings', 'ramps', 'missed', 'missed of >= 0.2 K/min', 'with a flip']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
         mine = [(scene, one) for scene, one in matrix if scene.rate_hz == rate]
@@ -184,13 +184,13 @@ Tables = Iterator[tuple[str, Rows]]
 
 
 def part_onset(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Run the ramp that the requirement names."""
+    """Run the ramp of the requirement."""
     rows = onset_table(pool, arguments.quick, arguments.seed)
     yield 'Onset of 0.5 K/min behind 15 min at 1 Hz', rows
 
 
 def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Count switches in soak."""
+    """Count switches in soaks."""
     hours = 25.0 if arguments.quick else arguments.soak_hours
     yield 'Switches in soak with ripple and drift, 1 Hz', soak_table(pool, hours, arguments.seed)
 

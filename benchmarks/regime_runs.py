@@ -19,13 +19,13 @@ from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.thermal.thermometer import Thermometer
 from thermo_comp.typing import Bools, Floats
 
-#: Scene, number of ramps, seed, whether the chamber ripples and the unit heats itself.
+#: Scene, number of ramps, seed, whether there are ripple and self-heating.
 Job = tuple[Scene, int, int, bool]
 
 
 @dataclass
 class Outcome:
-    """What the detector made of the ramps of one scene."""
+    """Result of the detector for the ramps of one scene."""
 
     delays: list[float]
     missed: int
@@ -36,19 +36,19 @@ class Outcome:
 
 
 def settings(scene: Scene) -> DetectorSettings:
-    """Shipped defaults, with the sensor and the unit's lags filled in."""
+    """Return the default settings with the sensor and the lags of the unit."""
     case = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s)
     board = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s + BOARD_LAG_S)
     return DetectorSettings(ripple_c=RIPPLE_C, case=case, board=board)
 
 
 def rng_of(seed: int, purpose: int, scene: Scene) -> np.random.Generator:
-    """Make the generator of one scene, the same in whichever order scenes run."""
+    """Make the generator of one scene, independent of the order of scenes."""
     return np.random.default_rng([seed, purpose, *(round(1e6 * v) for v in vars(scene).values())])
 
 
 def ours(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
-    """Flag of the shipped detector at each reading: 1 dynamic, 0 static, -1 unknown."""
+    """Return the flag of the detector at each reading: 1 dynamic, 0 static, -1 unknown."""
     detector_settings = settings(scene)
     case_thermometer = Thermometer(detector_settings.case)
     board_thermometer = Thermometer(detector_settings.board)
@@ -89,7 +89,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
     """Run the shipped detector over ramps of one scene."""
     scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
-    # long enough for three edges of the coarsest sensor
+    # Long enough for three edges of the coarsest sensor.
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
     duration = min(max(edges_s, 2400.0), 7200.0)
     t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)

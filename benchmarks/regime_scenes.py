@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the scenes of benchmarks/regime.py: ramps behind lags, the sensors that read them, the bound.
-"""
+"""Owns the scenes of benchmarks/regime.py: ramps behind lags, sensors, and the CUSUM bound."""
 
 from __future__ import annotations
 
@@ -43,7 +41,7 @@ def first_order(t: Floats, lag: float) -> Floats:
 
 
 def second_order(t: Floats, lag: float, other: float) -> Floats:
-    """Response of two different lags in a row to a unit ramp that starts at 0."""
+    """Response of two different lags in series to a unit ramp that starts at 0."""
     x = np.maximum(t, 0.0)
     decay = lag**2 * np.exp(-x / lag) - other**2 * np.exp(-x / other)
     return x - lag - other + decay / (lag - other)
@@ -52,7 +50,7 @@ def second_order(t: Floats, lag: float, other: float) -> Floats:
 def temperatures(
     scene: Scene, t: Floats, duration: float, rng: np.random.Generator, ripple: float = RIPPLE_C
 ) -> tuple[Floats, Floats]:
-    """Case and board for a ramp from 0 to `duration`; no ramp when the duration is 0."""
+    """Return case and board for a ramp from 0 to `duration`; no ramp if the duration is 0."""
     rate = scene.ramp_k_min / 60.0 * rng.choice((-1.0, 1.0))
     start = 20.0 + rng.uniform(-0.5, 0.5) * max(scene.quantum, 0.1)
     board_lag = BOARD_LAG_S if abs(BOARD_LAG_S - scene.lag_s) > 1.0 else 1.01 * scene.lag_s
@@ -72,7 +70,7 @@ def temperatures(
 
 
 def read(truth: Floats, scene: Scene, rng: np.random.Generator) -> Floats:
-    """Let a sensor read."""
+    """Return the readings of a sensor."""
     reading = truth + rng.normal(0.0, scene.noise_sd, truth.shape)
     return np.round(reading / scene.quantum) * scene.quantum if scene.quantum else reading
 
@@ -81,16 +79,16 @@ def known_signature_delays(
     scene: Scene, per_hour: float, hours: float, n: int, seed: int
 ) -> tuple[float, float]:
     """
-    Median and 95 % delay of the CUSUM that knows the ramp, the baseline and the noise.
+    Return median and 95 % delay of a CUSUM with known ramp, baseline and noise.
 
-    Page's statistic with the signature of the true ramp: the largest log likelihood ratio over
-    the onset times. Its threshold comes from the exceedances counted in noise alone, whose
-    logarithm falls linearly with the level.
+    Page's statistic with the signature of the true ramp: the largest log likelihood ratio over the
+    onset times. Its threshold follows from the exceedances counted in noise alone, whose logarithm
+    falls linearly with the level.
     """
     rng = np.random.default_rng([seed, 9])
     dt = 1.0 / scene.rate_hz
     bend = scene.ramp_k_min / 60.0 / scene.lag_s
-    # an onset collects 4.5 sigma in this time; twice as long sees it surely
+    # An onset accumulates 4.5 sigma in this time; twice the time detects it reliably.
     longest = round(2.0 * (20.0 * dt * (4.5 * scene.noise_sd / bend) ** 2) ** 0.2 / dt)
     signature = scene.ramp_k_min / 60.0 * first_order(np.arange(1, longest + 1) * dt, scene.lag_s)
 

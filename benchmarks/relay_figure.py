@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Draws what `node_relay.py --json` has measured: CPU time per sample and latency over the rate.
+Draws the results of `node_relay.py --json`: CPU time per sample and latency over the rate.
 
-    python benchmarks/relay_figure.py relay.json docs/figures/node_relay.png
+python benchmarks/relay_figure.py relay.json docs/figures/node_relay.png
 
 Several runs at different rates make one figure.
 """

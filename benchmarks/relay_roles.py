@@ -3,7 +3,8 @@
 """
 Owns the processes that `node_relay.py` runs side by side: source, relays, sink, reloader.
 
-They talk to their parent by lines on standard input and output, and to each other by DDS.
+They communicate with their parent by lines on standard input and output, and with each other by
+DDS.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ from typing import Any
 
 RELIABILITIES = ('best_effort', 'reliable')
 DEPTH = 2000
-#: The sink calls it a day when nothing came for this long.
+#: Silence after which the sink ends [s].
 SILENCE_S = 2.0
-#: The first sample may take this long.
+#: Longest wait for the first sample [s].
 PATIENCE_S = 30.0
-#: It looks this often for what has arrived.
+#: Interval of the checks for arrived samples [s].
 SINK_REST_S = 2e-3
 
 COUNTS = struct.Struct('<4siII7s5x3d')
 ENCAPSULATION = b'\0\1\0\0'
-#: The frame_id goes through any relay: it tells the samples that count from those before them.
+#: The frame_id passes through any relay and marks the samples that are counted.
 WARM_UP, SAMPLE = b'warmup\0', b'sensor\0'
 
 
@@ -52,7 +53,7 @@ def _source(arguments: argparse.Namespace) -> None:
 
     rclpy.init()
     node = rclpy.create_node('source')
-    # Reliable, so that it matches either kind of subscription.
+    # Reliable, so that it matches both kinds of subscription.
     qos = _qos('reliable', arguments.depth)
     counts = node.create_publisher(Vector3Stamped, 'accel/counts', qos)
     temperatures = [
@@ -69,7 +70,7 @@ def _source(arguments: argparse.Namespace) -> None:
 
     def publish(index: int, frame: bytes) -> None:
         sec, nanosec = divmod(time.time_ns(), 1_000_000_000)
-        # A unit that stands, with a count or two of noise: anything else the node would doubt.
+        # A unit at rest with a count or two of noise, as the node rejects constant samples.
         x, y, z = 5.0 + index % 3, -3.0 + index % 2, 2950.0 + index % 5
         counts.publish(COUNTS.pack(ENCAPSULATION, sec, nanosec, 7, frame, x, y, z))
 
@@ -88,7 +89,7 @@ def _source(arguments: argparse.Namespace) -> None:
             if wait > 0:
                 time.sleep(wait * 1e-9)
 
-    # Warm up until the sink has seen something, and go on until then at the very rate.
+    # Warm up at the same rate until the sink has received a sample.
     run(sys.maxsize, WARM_UP, lambda: bool(select.select([sys.stdin], [], [], 0)[0]))
     time.sleep(0.5)
     print('start', flush=True)
@@ -99,10 +100,11 @@ def _source(arguments: argparse.Namespace) -> None:
 
 def _sink(arguments: argparse.Namespace) -> None:
     """
-    Receive Imu messages until all are there or silence; print count and latency percentiles.
+    Receive Imu messages until all have arrived or none comes; print number and latency
+    percentiles.
 
-    The middleware notes when each message arrived, so they may wait here: a sink that woke up for
-    each would take the relay's core away.
+    The middleware stores when each message arrived, so messages may wait here; a sink that wakes
+    up for each would use the relay's core.
     """
     import numpy as np
     import rclpy
@@ -138,7 +140,7 @@ def _sink(arguments: argparse.Namespace) -> None:
 
 
 def _naive(arguments: argparse.Namespace) -> None:
-    """Copy Vector3Stamped to Imu as the tutorials do it."""
+    """Copy Vector3Stamped to Imu as in the ROS tutorials."""
     import rclpy
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.executors import ExternalShutdownException
@@ -178,7 +180,8 @@ def _floor(arguments: argparse.Namespace) -> None:
         Vector3Stamped, 'accel/counts', print, _qos(arguments.reliability), raw=True
     )
     take, publish = subscription.handle.take_message, publisher.handle.publish_raw
-    # The frame_id of both kinds of samples is as long, so the values always stand at the end.
+    # The frame_id of both kinds of samples has the same length, so the values are always at the
+    # end.
     head, frame = COUNTS.size - 24, bytearray(COUNTS.size - 24 + 37 * 8)
     with subscription.handle, node.context.handle:
         wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
@@ -206,8 +209,8 @@ def _node(arguments: argparse.Namespace) -> None:
 
 def _reloader(arguments: argparse.Namespace) -> None:
     """
-    Set `calibration_file` again and again, to the calibration and to the largest file that is
-    read to its end and refused; print how long each answer took.
+    Set `calibration_file` repeatedly, to the calibration and to the largest file that is read
+    completely and refused; print the time of each answer.
     """
     import rclpy
     from rcl_interfaces.srv import SetParameters
@@ -249,7 +252,7 @@ ROLES = {
 
 
 def main() -> None:
-    """Play one role."""
+    """Run one role."""
     parser = argparse.ArgumentParser(description='One process of node_relay.py.')
     parser.add_argument('role', choices=tuple(ROLES))
     parser.add_argument('--rate', type=int, required=True)

@@ -49,7 +49,7 @@ def calibration() -> Calibration:
 
 
 def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
-    """Write n counts messages and the temperatures beside them."""
+    """Write n messages of counts with temperatures."""
     rng = np.random.default_rng(1)
     noise = np.round(rng.normal(0.0, 8.0, (BLOCK, 3)))
     with BagWriter(path, compression=compression) as bag:
@@ -80,13 +80,13 @@ def read_and_compensate(path: Path) -> int:
 
 
 def compensate(path: Path) -> tuple[int, float]:
-    """Correct columns; return how many and the CPU seconds that it alone took."""
+    """Correct columns; return their number and the CPU seconds of the correction alone."""
     compensator = Compensator(calibration())
     spent = 0.0
     n = 0
     with open_recording(path) as reader:
         for block in reader.blocks():
-            # The thread's own clock: the reader decompresses ahead in others.
+            # The clock of this thread only, as the reader decompresses ahead in others.
             begin = time.thread_time()
             n += len(process_block(compensator, block).index)
             spent += time.thread_time() - begin
@@ -111,7 +111,7 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
     compensator = Compensator(calibration())
     n = 0
     target = Writer(output, version=9, storage_plugin=StoragePlugin.MCAP)
-    # Chunks compressed as ours are.
+    # Chunks are compressed as in ours.
     target.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with Reader(path) as reader, target as writer:
         out = writer.add_connection('/imu/data_raw', imu_type.__msgtype__, typestore=store)
@@ -154,7 +154,7 @@ def seconds(run: Callable[[], object], repeats: int = 1) -> tuple[float, float]:
 
 
 def pipelines(folder: Path, n: int, repeats: int) -> None:
-    """Compare the whole way, bag to bag, in samples per second."""
+    """Compare the whole process, bag to bag, in samples per second."""
     path, output = folder / 'in.mcap', folder / 'out'
     n_peer = n // 20
     peer = folder / 'peer.mcap'
@@ -175,7 +175,7 @@ def pipelines(folder: Path, n: int, repeats: int) -> None:
 
 
 def day(folder: Path, hours: float, compression: str, repeats: int) -> None:
-    """Measure reading, reading and compensating, and how they grow with the length."""
+    """Measure reading, and reading with compensation, and their growth with the length."""
     print(
         f'{compression}: wall (CPU) seconds; alone = compensation only, million samples per CPU s'
     )
@@ -202,9 +202,9 @@ def day(folder: Path, hours: float, compression: str, repeats: int) -> None:
 
 
 def memory(folder: Path, gigabytes: float) -> None:
-    """Replay a large bag in a process of its own and report its peak memory."""
+    """Replay a large bag in a separate process and print its peak memory."""
     path, output = folder / 'large.mcap', folder / 'large_out.mcap'
-    per_sample = 99  # bytes of one counts message in an uncompressed MCAP, roughly
+    per_sample = 99  # size of a counts message in an uncompressed MCAP [bytes], approximately
     write_bag(path, int(gigabytes * 1e9 / per_sample), 'none')
     size = path.stat().st_size
     code = (

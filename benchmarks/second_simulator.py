@@ -31,7 +31,7 @@ STEP_S, SAMPLE_S, READING_S = 2.0, 1.0, 2.0
 NOISE_UG, READING_SD, READING_STEP = 5.0, 0.005, 0.001
 REFERENCE_C, AIR_S, FULL_SCALE = 20.0, 90.0, 8388607.0
 Program = tuple[float, float, list[tuple[float, float, float]]]
-#: Of each plan the test's program, how long it lasts [s], and the programs held out: start
+#: For each plan: the program of the test, its duration [s], and the held-out programs: start
 #: [degC], first soak [min], then target [degC], rate [K/min] and soak [min] of each ramp.
 PLANS: dict[str, tuple[str, Program, float, str, list[Program]]] = {
     'wide': (
@@ -60,7 +60,7 @@ PLANS: dict[str, tuple[str, Program, float, str, list[Program]]] = {
         ],
     ),
 }  # fmt: skip
-# What was fitted from 5 to 35 degC goes beyond by 5 to 20 K, and comes back.
+# Fitted from 5 to 35 degC, tested 5 to 20 K beyond.
 PLANS['beyond'] = (
     *PLANS['mild'][:3],
     'HB',
@@ -73,7 +73,7 @@ KINDS = ('own', 'products', 'hyst', 'hystm', 'even', 'convection', 'slow', 'plai
 
 
 def seed_of(text: str) -> int:
-    """Make a seed of a name."""
+    """Make a seed from a name."""
     return int(hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()[:12], 16)
 
 
@@ -87,7 +87,7 @@ def unit_of(kind: str, seed: int) -> SimpleNamespace:
     def signed(low: float, high: float) -> Floats:
         return np.asarray(draw.uniform(low, high, 3) * draw.choice([-1, 1], 3))
 
-    # The order of the draws is the unit's identity.
+    # The order of the draws must not change, as it defines the units.
     unit = SimpleNamespace(
         scale_factor=4e5 * (1.0 + 0.01 * draw.standard_normal(3)),
         constant=normal(1500.0),
@@ -130,7 +130,7 @@ def unit_of(kind: str, seed: int) -> SimpleNamespace:
 
 
 def directions(n: int, seed: int) -> Floats:
-    """Spread attitudes over the sphere, turned as a whole by the seed."""
+    """Spread attitudes over the sphere, rotated as a whole by the seed."""
     k = np.arange(n) + 0.5
     polar, around = np.arccos(1.0 - 2.0 * k / n), np.pi * (1.0 + 5.0**0.5) * k
     spiral = np.c_[np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)]
@@ -168,7 +168,7 @@ def states_of(unit: SimpleNamespace, air_c: Floats) -> tuple[Floats, Floats, Flo
         flow = case - board
         carries = 1.0
         if unit.gas:
-            # A gas carries more the warmer it is, and the more the larger the difference.
+            # A gas conducts better at higher temperature and larger differences.
             warm = 0.5 + 0.5 * (1.0 + 0.006 * (board - REFERENCE_C))
             carries = warm * (0.7 + 0.3 * (np.abs(flow) / 3.0) ** 0.25)
         case = case + STEP_S * (air - case + 0.3 * heat - 0.1 * flow) / unit.case_s
@@ -199,7 +199,7 @@ def runs_of(
     lasts_s = lasts_s or float(seconds[-1])
     t = np.arange(round((soaked_s + lasts_s) / STEP_S) + 1) * STEP_S - soaked_s
     first = celsius[0]
-    # Before the recording it comes from another temperature at 2 K/min, then soaks.
+    # Before the recording the unit comes from another temperature at 2 K/min, then soaks.
     before = first + draw.uniform(-5, 5, n_bags) if soaked_c is None else np.full(n_bags, soaked_c)
     coming = np.minimum(np.abs(first - before), (t + soaked_s)[:, None] / 30.0)
     coming = before + np.sign(first - before) * coming
@@ -254,7 +254,7 @@ def runs_of(
 
 
 def plan_of(kind: str, seed: int, plan: str) -> tuple[list[Any], list[Any]]:
-    """Record the test of a unit, and what is held out."""
+    """Record the test of a unit, and the held-out runs."""
     test, program, lasts_s, held, programs = PLANS[plan]
     unit, first = unit_of(kind, seed), seed_of(f'{kind}{seed}{test}') % 2**31
     records = runs_of(unit, program, directions(18, seed), first, lasts_s=lasts_s)
@@ -269,7 +269,7 @@ def plan_of(kind: str, seed: int, plan: str) -> tuple[list[Any], list[Any]]:
 
 
 def floor_of(tests: Sequence[Any]) -> tuple[float, float]:
-    """Return what the noise alone leaves in means of a minute, |f| and vector [ug]."""
+    """Return the noise in means of a minute, of |f| and of the vector [ug]."""
     means = [one.noise[: len(one.noise) // 60 * 60].reshape(-1, 60, 3).mean(1) for one in tests]
     norms = [
         mean @ one.truth.specific_force / STANDARD_GRAVITY

@@ -41,31 +41,31 @@ STAMP = struct.Struct('<iI')
 SECOND_NS = 1_000_000_000
 READINGS_HZ = 10
 RELOAD_S, LATENCY_S, REPORT_S = 2.0, 10.0, 0.25
-#: A ramp, a rest, the ramp back, a rest; lags short enough for the regime to follow.
+#: A ramp, a rest, the ramp back, a rest; the lags are short enough for the regime to follow.
 RAMP_S, REST_S, RAMP_K_S, CASE_LAG_S, BOARD_LAG_S = 30.0, 60.0, 0.1, 5.0, 10.0
 TIMEOUT_S = 30.0
 
 
 class Temperatures:
-    """The case and the board behind it, step by step."""
+    """Case and board temperature, step by step."""
 
     def __init__(self) -> None:
         self.case = self.board = 20.0
 
     def step(self, seconds: float) -> tuple[float, float]:
-        """Go on by one reading; return (board, case)."""
+        """Advance by one reading; return (board, case)."""
         phase = seconds % (2.0 * (RAMP_S + REST_S))
         up = min(phase, RAMP_S) - min(max(phase - RAMP_S - REST_S, 0.0), RAMP_S)
         dt = 1.0 / READINGS_HZ
         self.case += dt / CASE_LAG_S * (20.0 + RAMP_K_S * up - self.case)
         self.board += dt / BOARD_LAG_S * (self.case - self.board)
-        # Noise of a few mK, without which a thermometer is doubted.
+        # Noise of a few mK, as constant thermometers are rejected.
         ripple = 0.003 * ((int(seconds * READINGS_HZ) * 7) % 11 - 5) / 5.0
         return self.board + ripple, self.case - ripple
 
 
 class Soak:
-    """The peer of the node: driver, INS, operator."""
+    """The peer of the node: driver, INS and operator."""
 
     def __init__(self, node: Any, context: Any, rate: int) -> None:
         import rclpy
@@ -145,7 +145,7 @@ class Soak:
             self._news.notify_all()
 
     def send(self, n: int) -> None:
-        """Publish samples, with the temperatures that belong before them."""
+        """Publish samples, each after the temperatures before it."""
         head, frame_length, frame = HEAD
         for index in range(self.n_sent, self.n_sent + n):
             sec, nanosec = divmod(self.start_ns + index * SECOND_NS // self.rate, SECOND_NS)
@@ -159,19 +159,19 @@ class Soak:
         self.n_sent += n
 
     def wait_for(self, condition: Any, what: str, timeout: float = TIMEOUT_S) -> None:
-        """Wait for a condition on what was heard, or end with what the node said."""
+        """Wait for a condition on the received data, or end with the output of the node."""
         with self._news:
             if not self._news.wait_for(condition, timeout) or not self.process.is_alive:
                 raise SystemExit(f'{what} did not come; {self.account}; {self.process.said}')
 
     def meet(self) -> None:
-        """Publish until the first sample comes back; count from there."""
+        """Publish samples until the first of them comes back; count from there."""
         deadline = time.monotonic() + TIMEOUT_S
         while not self.n_heard and time.monotonic() < deadline:
             self.send(self.rate // READINGS_HZ)
             time.sleep(1.0 / READINGS_HZ)
-        # What was sent before both ends knew each other is lost. A report may be here already, and
-        # be the last that says more than the one before.
+        # Samples before discovery are lost. A report may have arrived already, and be the last
+        # with a larger number than the previous one.
         self.wait_for(lambda: int(self.account.get('samples in', 0)) > 0, 'a report')
         n_in = -1
         while n_in != int(self.account['samples in']):
@@ -179,7 +179,7 @@ class Soak:
             time.sleep(2.0 * REPORT_S)
         self.n_sent_before, self.n_in_before = self.n_sent, n_in
         self.n_out_before, self.n_heard_before = int(self.account['samples out']), self.n_heard
-        # The pause is one of the wall, not of the stamps.
+        # A pause of the wall clock, not of the stamps.
         self.latencies.clear()
 
     def reload(self, path: str) -> None:
@@ -195,7 +195,7 @@ class Soak:
         self.client.call_async(request).add_done_callback(count)
 
     def run(self, seconds: float, paths: list[str]) -> dict[str, Any]:
-        """Publish for so long; return the account."""
+        """Publish for this time; return the counts."""
         memory: list[tuple[float, float]] = []
         latency: list[tuple[float, float, float]] = []
         n_reloads = n_sent = 0
@@ -294,7 +294,7 @@ def calibrations(rate: int, folder: Path) -> list[str]:
 
 
 def main() -> int:
-    """Run a soak and print its account."""
+    """Run a soak and print its results."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--minutes', type=float, default=60.0)
     parser.add_argument('--rate', type=int, default=2000, help='samples per second')

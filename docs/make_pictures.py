@@ -31,7 +31,7 @@ BLUE, RED, GREY = '#0072B2', '#D55E00', '#5A5A5A'
 
 
 def draw_chamber(axes: Axes) -> None:
-    """Draw what stands where, without a scale."""
+    """Draw the arrangement, not to scale."""
     axes.set_xlim(0, 10)
     axes.set_ylim(0, 6)
     axes.set_axis_off()
@@ -65,7 +65,7 @@ def draw_chamber(axes: Axes) -> None:
 
 
 def draw_cyclogram(axes: Axes) -> None:
-    """Draw the paper's program, and what two thermometers see of it."""
+    """Draw the paper's program, and the readings of two thermometers."""
     program = parse_cyclogram('chamber')
     run = simulate(unit_preset('thermostatted', 1), program, positions(1, 0)[0], rate_hz=0.2)
     hours = np.array(program.time_s) / 3600.0
@@ -88,7 +88,7 @@ def draw_cyclogram(axes: Axes) -> None:
 
 
 def draw_afternoon(axes: Axes) -> None:
-    """Draw an afternoon at home: what the surroundings do, and the chip behind them."""
+    """Draw an afternoon at home: the temperature of the surroundings and of the chip."""
     legs = [('desk', 22.0, 10.0), ('freezer', -15.0, 30.0), ('desk', 22.0, 40.0)]
     legs += [('dryer', 45.0, 15.0), ('desk', 22.0, 30.0)]
     minute = np.arange(0.0, sum(leg[2] for leg in legs), 0.1)
@@ -114,7 +114,7 @@ def draw_afternoon(axes: Axes) -> None:
 
 
 def series() -> dict[str, tuple[Any, Any]]:
-    """Return what the layout's paths hold, of the held-out sample bag."""
+    """Return the values at the layout's paths in the held-out sample bag."""
     recording = tc.read(ROOT / 'bags' / 'held_out.mcap')
     calibration = tc.fit(sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), gravity=9.80665)
     out = calibration.correct(recording.time_s, recording.counts, **recording.temperatures)
@@ -135,7 +135,7 @@ def series() -> dict[str, tuple[Any, Any]]:
 
 
 def draw_layout(figure: Figure) -> None:
-    """Draw the panels where the layout has them, with the data that it asks for."""
+    """Draw the panels in the positions of the layout, with their data."""
     saved = json.loads(LAYOUT.read_text(encoding='utf-8'))
     data = series()
 
@@ -151,7 +151,7 @@ def draw_layout(figure: Figure) -> None:
             return
         panel = saved['configById'][node]
         title = panel.get('title') or panel.get('foxglovePanelTitle') or node.split('!')[1]
-        # Beside each panel its numbers, below it those of time, above it its title.
+        # Axis labels beside and below each panel, its title above.
         left, below, above = 0.04, 0.048, 0.032
         axes = figure.add_axes(
             (x + left, 1.0 - y - height + below, width - left - 0.016, height - below - above)

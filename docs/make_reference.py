@@ -38,16 +38,16 @@ AXES = ('x', 'y', 'z')
 CALIBRATION_HEAD = """\
 # The calibration file
 
-One file = one unit = one object, in YAML, written by `thermo_comp fit`. An annotated example is
-`config/calibration.example.yaml`, the JSON Schema
-`config/calibration.schema.json`; this page is made from it.
+A calibration file describes one unit. It is YAML, written by `thermo_comp fit`.
+`config/calibration.example.yaml` is an annotated example, `config/calibration.schema.json` the JSON
+Schema; this page is generated from the schema.
 
-The reader refuses, with the file, the key, the value and what was expected: unknown or missing
-keys, texts where numbers belong, NaN and infinity, ranges that do not rise, functions that are not
-normalised at the reference, a scale that could reach zero within its ranges, a posterior of another
-size, a newer `format_version`, YAML aliases and tags, files above 8 MiB. Numbers are written with all
-their digits and the posterior in single precision, so a file that is read and written again is the
-same file.
+A file is refused if it has unknown or missing keys, text in place of a number, NaN or infinity,
+ranges that do not rise, functions that are not normalised at the reference temperature, a scale that
+could reach zero within its ranges, a posterior of the wrong size, a newer `format_version`, YAML
+aliases or tags, or more than 8 MiB. The error names the file, the key, the value and the expected
+value. Numbers are written with all digits and the posterior in single precision, so that reading
+and writing a file again does not change it.
 
 The main keys:
 
@@ -55,38 +55,47 @@ The main keys:
 format_version: 2
 unit: {serial: EXAMPLE-1, input: counts, full_scale: 32767.0, cycle_time_s: 0.01}
 reference_temperature_c: 20.0
-gravity_m_s2: 9.80665                                     # given to the fit
-axes:                                                     # at the reference temperature
-  x: {scale_factor: 299.1, bias: 4.2}                     # counts per m/s^2, counts
-static:                                                   # the set of the static regime
-  temperature_range_c: [4.0, 37.0]                        # outside: along the tangent
+gravity_m_s2: 9.80665                # local gravity, input of the fit
+axes:                                # at the reference temperature
+  x: {scale_factor: 299.1, bias: 4.2}   # counts per m/s^2, counts
+static:                              # the set of the static regime
+  temperature_range_c: [4.0, 37.0]   # outside: along the tangent
   x:
-    bias_function: {kind: polynomial, coefficients: [0.0, 0.0031]}       # Fs(t), 0 at t = 0
-    scale_function: {kind: polynomial, coefficients: [1.0, 7.7e-05]}     # Fc(t), 1 at t = 0
-response:                                                 # columns that both sets share
-  - {kind: now, group: now, range: [-9.0, 9.0],           # T_case - T_board; range: held at edges
-     bias: [0.0021, 0.0014, -0.0006],                     # x, y, z: counts per K
-     scale: [1.1e-06, 9.0e-07, 1.3e-06]}                  # relative, per K
-  - {kind: board, group: board, tau_s: 960.0,             # T_board minus its lag
-     range: [-20.0, 20.0], bias: [0.0008, 0.0, 0.0003], scale: [2.0e-07, 1.0e-07, 0.0]}
-# posterior: the covariance of all parameters; evidence: contribution of each group of columns
+    # Fs(t), 0 at t = 0, and Fc(t), 1 at t = 0
+    bias_function: {kind: polynomial, coefficients: [0.0, 0.0031]}
+    scale_function: {kind: polynomial, coefficients: [1.0, 7.7e-05]}
+response:                            # columns of both sets
+  - kind: gradient                   # T_case - T_board
+    group: gradient
+    range: [-9.0, 9.0]               # held at its edges
+    bias: [0.0021, 0.0014, -0.0006]  # x, y, z: counts per K
+    scale: [1.1e-06, 9.0e-07, 1.3e-06]  # relative, per K
+  - kind: board                      # T_board minus its lag
+    group: board
+    tau_s: 960.0
+    range: [-20.0, 20.0]
+    bias: [0.0008, 0.0, 0.0003]
+    scale: [2.0e-07, 1.0e-07, 0.0]
+# posterior: the covariance of all parameters
+# evidence: contribution of each group of columns
 ```
 
-The parameters of the posterior are, for each axis x, y, z: the bias (level of the static set, free
-coefficients of its Fs, level of the dynamic set, free coefficients of its Fs, weights of the response
-in the order of the file), in input units; then the scale in the same order, relative; at the end
-`M[1][0]`, `M[2][0]`, `M[2][1]`. `covariance = factor @ factor.T + diag(rest)`. That of a `gyroscope` holds the bias alone,
-in rad/s, in the same order; ranges, reference temperature and thermometers are the unit's.
+The parameters of the posterior are, for each axis x, y, z: first the bias in input units (level of
+the static set, free coefficients of its Fs, level of the dynamic set, free coefficients of its Fs,
+weights of the response in the order of the file); then the relative scale in the same order. The
+last three parameters are `M[1][0]`, `M[2][0]` and `M[2][1]`. The covariance is
+`factor @ factor.T + diag(rest)`. The posterior of a `gyroscope` has the bias only, in rad/s and in the
+same order; it uses the ranges, the reference temperature and the thermometers of the unit.
 """
 
 BOUNDS = """\
 ## Bounds
 
-Every number of a calibration is of one of these quantities. The bounds lie beyond any instrument, so that whatever
-keeps them gives finite numbers and a covariance that is positive definite. What belongs to a unit hangs on its own
-full scale: a bias, with its curve anywhere in its range, stays within twice the full scale, a column at its worst and
-what one parameter leaves open within a million times that, and a relative scale, with all its columns at their worst,
-between 0.1 and 10.
+Each number in a calibration belongs to one of these quantities. The bounds are wider than any instrument needs; a file
+within them gives finite results and a positive definite covariance. Further bounds depend on the full scale of the unit.
+The bias including its curve must stay within twice the full scale over the whole temperature range. The largest
+contribution of a column, and of one standard deviation of a parameter, must stay within a million times that. The
+relative scale including the largest contributions of all columns must stay between 0.1 and 10.
 """
 
 INTERFACE = """\
@@ -176,7 +185,7 @@ Every fault with its test: [faults](faults.md).
 
 
 def json_schema(cls: type) -> dict[str, Any]:
-    """Return the JSON Schema of a dataclass and of all that it holds."""
+    """Return the JSON Schema of a dataclass including nested ones."""
     definitions: dict[str, Any] = {}
     top = _schema(cls, definitions)['$ref'].rpartition('/')[2]
     result = definitions.pop(top)
@@ -226,7 +235,7 @@ def _define(cls: Any, definitions: dict[str, Any]) -> None:
     if cls.__name__ in definitions:
         return
     hints, required = fields_of(cls)
-    # It stands before those that it holds.
+    # A schema comes before those of its fields.
     result = definitions[cls.__name__] = {
         'type': 'object',
         'description': inspect.cleandoc(cls.__doc__),
@@ -287,7 +296,7 @@ def _bounds_table() -> list[str]:
             upper = f'{bounds.below if bounds.at_most is None else bounds.at_most:g}'
             unit = bounds.unit
         rows.append(f'| {name} | {lower} | {upper} | {unit} | {bounds.why} |')
-    table = ['| quantity | from | to | unit | why so far |', '|---|---|---|---|---|', *rows]
+    table = ['| quantity | from | to | unit | reason |', '|---|---|---|---|---|', *rows]
     return [BOUNDS, *table, '']
 
 
@@ -303,7 +312,7 @@ def _section(
         if len(default) > 40:
             default = 'see there'
         meaning = value.get('description', '') or _described(value, definitions)
-        # An element of a matrix is no link.
+        # Escaped, as an element of a matrix is not a link.
         meaning = re.sub(r'\w+(\[\d\]){2}', r'`\g<0>`', meaning)
         lines.append(f'| `{key}` | {_type(value)} | {default} | {meaning} |')
     return [*lines, '']

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what the site adds to its pages while it is built: the options of all commands."""
+"""Owns the additions to the pages of the site during its build: the options of all commands."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from thermo_comp.cli.app import app
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Write what every command takes at the end of the page of the command line."""
+    """Append the options of every command to the page of the command line."""
     if page.file.src_uri != 'cli.md':
         return markdown
     command = typer.main.get_command(app)
     said = get_docs_for_click(obj=command, ctx=typer.Context(command), name='thermo_comp')
-    # From the first command on; what stands before is on the page already.
+    # From the first command on; the text before it is already on the page.
     commands = said[said.index('\n## ') :]
     return markdown + re.sub(
         r'^Examples?:\n((?: +.*\n)+)', r'Example:\n\n```sh\n\1```\n', commands, flags=re.MULTILINE

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what is fuzzed through a file of its own: databases, compressed bags, tables."""
+"""Owns the fuzz targets that read a file: databases, compressed bags, tables."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.unit.schema import build
 
-#: One for all inputs of a process.
+#: One folder for all inputs of a process.
 FOLDER = tempfile.TemporaryDirectory(prefix='fuzz-')
 METADATA = """\
 rosbag2_bagfile_information:
@@ -37,7 +37,7 @@ MAP = {
     'accel': {'columns': [1, 2, 3], 'unit': 'counts', 'output': 'counts'},
     'board': {'column': 4},
 }
-#: No message of ours is shorter; zstd makes at most 30 kB of a byte.
+#: No message is shorter than this, and zstd expands a byte to at most 30 kB.
 MOST_PER_BYTE = 1000
 
 
@@ -49,14 +49,14 @@ def _one_line(check: Callable[[], None]) -> None:
 
 
 def check_database(data: bytes) -> None:
-    """Any bytes are a database with messages, or one clear line."""
+    """Any bytes are a database with messages, or give one clear line."""
     path = Path(FOLDER.name, 'bag.db3')
     path.write_bytes(data)
     _one_line(lambda: _read(path, len(data)))
 
 
 def check_compressed(data: bytes) -> None:
-    """Any bytes are a compressed file of a bag, or one clear line."""
+    """Any bytes are a compressed file of a bag, or give one clear line."""
     folder = Path(FOLDER.name, 'bag')
     folder.mkdir(exist_ok=True)
     (folder / 'metadata.yaml').write_text(METADATA, encoding='ascii')
@@ -71,12 +71,12 @@ def _read(path: Path, n_bytes: int) -> None:
 
 
 def check_csv(data: bytes) -> None:
-    """Any bytes are a table that becomes a bag, or one clear line."""
+    """Any bytes are a table that becomes a bag, or give one clear line."""
     _check_table('log.csv', data)
 
 
 def check_parquet(data: bytes) -> None:
-    """Any bytes are a Parquet table that becomes a bag, or one clear line."""
+    """Any bytes are a Parquet table that becomes a bag, or give one clear line."""
     _check_table('log.parquet', data)
 
 
@@ -97,7 +97,7 @@ def _check_table(name: str, data: bytes) -> None:
 
 
 def database(messages: list[tuple[str, str, int, bytes]]) -> bytes:
-    """Make a database of (topic, type, log time, content), as short as it can be."""
+    """Make a database of (topic, type, log time, content), as short as possible."""
     path = Path(FOLDER.name, 'seed.db3')
     path.unlink(missing_ok=True)
     kinds = {topic: (number, kind) for number, (topic, kind, _, _) in enumerate(messages, 1)}

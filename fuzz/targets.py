@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what is fuzzed: the doors through which bytes of strangers come, and what must hold.
+Owns the fuzz targets: the readers of bytes from outside, and the properties that must hold.
 
-Each target takes any bytes and raises where a promise is broken; its seeds are small and whole, so
-that the fuzzer begins behind the first checks.
+Each target takes any bytes and raises if a property is violated; its seeds are small and complete,
+so that the fuzzer starts behind the first checks.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from thermo_comp.unit.functions import Polynomial
 
 START_NS = 1_767_225_600_000_000_000
 MAGIC = b'\x89MCAP0\r\n'
-#: Where the bytes that may be a bag are put.
+#: Folder for files that may be bags.
 BAG = Path(files.FOLDER.name, 'any.mcap')
 
 
 @dataclass(frozen=True)
 class Target:
-    """A door."""
+    """A fuzz target."""
 
     check: Callable[[bytes], None]
     seeds: list[bytes]
@@ -60,14 +60,16 @@ def small_calibration() -> Calibration:
 
 
 UNIT = small_calibration()
-#: More messages in one input tell nothing new.
+#: More messages in one input reveal nothing new.
 MOST_MESSAGES = 6
-#: One for all inputs: to make it takes longer than most inputs.
+#: One for all inputs, as making it takes longer than most inputs.
 COMPENSATOR = Compensator(UNIT)
 
 
 def check_calibration(data: bytes) -> None:
-    """Any bytes are a calibration, or one clear line; a calibration survives its round trip."""
+    """
+    Any bytes are a calibration, or give one clear line; a calibration survives its round trip.
+    """
     try:
         value = parse_calibration(data, 'fuzz.yaml')
     except CalibrationError as error:
@@ -77,11 +79,11 @@ def check_calibration(data: bytes) -> None:
         return
     assert parse_calibration(dump_calibration(value).encode()) == value
     row = Compensator(value).process(START_NS, 1.0, 2.0, 3.0)
-    # There is no temperature yet; constants alone need none.
+    # There is no temperature yet; constants need none.
     assert row is None or not value.needs_temperature
 
 
-#: Every key that is required, and no other: what is short is tried often.
+#: Only the required keys, as short inputs are tried more often.
 _FUNCTIONS = (
     '{bias_function: {kind: polynomial, coefficients: [0]}, '
     'scale_function: {kind: polynomial, coefficients: [1]}}'
@@ -102,13 +104,16 @@ noise_density_m_s2_sqrt_hz: [1, 1, 1]
 
 
 def check_mcap(data: bytes) -> None:
-    """Any bytes are a bag, or one clear line; no more comes out than can have been in it."""
+    """
+    Any bytes are a bag, or give one clear line; the output is not larger than the input can
+    contain.
+    """
     with suppress(RecordingError):
         try:
             BAG.write_bytes(data)
             with open_recording(BAG, require=()) as reader:
                 n = sum(block.n_messages for block in reader.blocks())
-                # A message is 22 bytes at least, and zstd makes at most 30 kB of a byte.
+                # A message has at least 22 bytes, and zstd expands a byte to at most 30 kB.
                 assert n <= 1000 * len(data), n
         except RecordingError as error:
             assert '\n' not in str(error), error
@@ -116,7 +121,7 @@ def check_mcap(data: bytes) -> None:
 
 
 def check_cdr(data: bytes) -> None:
-    """Any messages: what the node would publish is a whole, finite Imu message."""
+    """For any messages the node's output is a complete, finite Imu message."""
     # ROS is needed for this target only.
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.serialization import deserialize_message
@@ -151,7 +156,7 @@ def check_cdr(data: bytes) -> None:
 
 
 def check_parameters(data: bytes) -> None:
-    """Any requests to set parameters: each is answered, with a reason where it is refused."""
+    """Any requests to set parameters are answered; a refusal has a reason."""
     # ROS is needed for this target and the one above only.
     from rcl_interfaces.msg import Parameter, ParameterValue
     from rcl_interfaces.srv import SetParameters
@@ -164,7 +169,7 @@ def check_parameters(data: bytes) -> None:
     try:
         messages = deserialize_message(data, SetParameters.Request).parameters
     except (RuntimeError, ValueError):
-        # No request, but the beginning of a value of the type that the first byte says.
+        # Not a request, but the beginning of a value whose type is the first byte.
         text = data[1:].decode(errors='replace').replace('\0', '')
         value = ParameterValue(type=data[0] if data else 0, string_value=text)
         messages = [Parameter(name=name, value=value) for name in ('frame_id', 'calibration_file')]
@@ -255,7 +260,7 @@ def targets() -> dict[str, Target]:
 
 
 def file_targets() -> dict[str, Target]:
-    """Return the targets that need a file of their own."""
+    """Return the targets that need a file."""
     messages = [
         (topic, kind, START_NS + k, cdr(START_NS + k, *range(k, k + width)))
         for topic, kind, width in _KINDS

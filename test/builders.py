@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the small calibrations and blocks that the tests of the core are built on."""
+"""Owns the small calibrations and blocks for the tests of the core."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ def regime_set(x=None, y=None, z=None, **keys):
 
 
 def calibration(**keys):
-    """Make a unit of 300 counts per m/s^2; with no arguments it only scales."""
+    """
+    Make a unit of 300 counts per m/s^2; without arguments it has no bias and no temperature
+    function.
+    """
     values = {
         'format_version': 2,
         'unit': Unit('T-1', 'counts', 32767.0, 0.01),
@@ -52,18 +55,20 @@ def calibration(**keys):
 
 
 def thermal_calibration():
-    """Make such a unit that needs a temperature all the same: ramps change a last digit."""
+    """Make such a unit whose correction depends on temperature, by a negligible amount."""
     return calibration(dynamic=regime_set(z=axis_set((0.0, 1e-12))))
 
 
 def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
-    """Make a term of the response; its group is its kind, its range wide."""
+    """Make a term of the response, by default of the group of its kind and with a wide range."""
     values = {'group': kind, 'range': (-50.0, 50.0), **keys}
     return ResponseTerm(kind=kind, bias=tuple(bias), scale=tuple(scale), **values)
 
 
 def rich_calibration():
-    """Put every term to work, on every axis, in both regimes, with a posterior."""
+    """
+    Make a calibration with every kind of term, on every axis and in both regimes, and a posterior.
+    """
 
     def one(sign, dynamic):
         size = 2 if dynamic else 1
@@ -80,16 +85,23 @@ def rich_calibration():
         slow_noise_m_s2_sqrt_h=(1e-5, 2e-5, 1e-5),
         sensors=('case', 'frame'),
         response=(
-            term('now', (0.5, -0.5, 0.5), (2e-5, 2e-5, 2e-5)),
-            term('now', (0.1, 0.2, -0.1), (0.0, 1e-6, 0.0), sensor='frame', during='dynamic'),
+            term('gradient', (0.5, -0.5, 0.5), (2e-5, 2e-5, 2e-5)),
+            term('gradient', (0.1, 0.2, -0.1), (0.0, 1e-6, 0.0), sensor='frame', during='dynamic'),
             term(
                 'rate', (3.0, 3.0, -2.0), (1e-3, -1e-3, 1e-3), during='static', range=(-0.1, 0.1)
             ),
             term('board', (0.1, 0.1, 0.2), (1e-6, 2e-6, 1e-6), tau_s=600.0),
             term('board', (-0.05, 0.02, 0.0), (2e-6, -2e-6, 2e-6), tau_s=2400.0),
-            term('neighbour', (0.2, -0.1, 0.1), (1e-6, 0.0, -1e-6), tau_s=240.0),
+            term('gradient_lag', (0.2, -0.1, 0.1), (1e-6, 0.0, -1e-6), tau_s=240.0),
             term('board', (1e-3, -2e-3, 1e-3), group='product', tau_s=600.0, power=1),
-            term('even', (0.3, 0.2, 0.1), (1e-6,) * 3, width_k=1.5, power=1, range=(0.0, 1.0)),
+            term(
+                'gradient_even',
+                (0.3, 0.2, 0.1),
+                (1e-6,) * 3,
+                width_k=1.5,
+                power=1,
+                range=(0.0, 1.0),
+            ),
             term('play', (0.1, 0.05, -0.1), (1e-6,) * 3, width_k=0.8, range=(-1.0, 1.0)),
             term('bend', (0.2, -0.1, 0.1), tau_s=600.0, knee_k=4.0, range=(0.0, 40.0)),
             term('bend', (0.1, 0.1, 0.2), knee_k=-3.0, range=(0.0, 40.0)),
@@ -105,7 +117,7 @@ def rich_calibration():
 
 
 def rich_gyroscope():
-    """Make a gyroscope with columns of its own beside some of `rich_calibration`'s."""
+    """Make a gyroscope with some columns of `rich_calibration` and others of its own."""
 
     def one(size):
         curve = RateCurve(Polynomial((0.0, *(size / k for k in (1e4, 1e6)))), delta=size * 1e-5)
@@ -115,10 +127,10 @@ def rich_gyroscope():
         return RateTerm(group=kind, kind=kind, bias=bias, range=(-50.0, 50.0), **keys)
 
     response = (
-        of('now', (1e-4, -2e-4, 3e-4)),
+        of('gradient', (1e-4, -2e-4, 3e-4)),
         of('board', (3e-4, 1e-4, -1e-4), tau_s=600.0),
         of('board', (-2e-4, 1e-4, 1e-4), tau_s=120.0),
-        of('neighbour', (1e-4, 0.0, 1e-4), tau_s=240.0, sensor='frame'),
+        of('gradient_lag', (1e-4, 0.0, 1e-4), tau_s=240.0, sensor='frame'),
     )
     n = 3 * (2 + len(response)) + 2 * (2 + 1 + 2)
     return Gyroscope(
@@ -135,7 +147,7 @@ def rich_gyroscope():
 
 @dataclass
 class Columns:
-    """Columns in file order, as a recording gives them."""
+    """Columns in file order, as a recording contains them."""
 
     accel_stamp_ns: np.ndarray
     accel: np.ndarray
@@ -171,7 +183,7 @@ def columns_from_events(events):
 
 @dataclass(frozen=True)
 class ArrayBlock:
-    """A block made of arrays at hand."""
+    """A block built from arrays."""
 
     accel_stamp_ns: np.ndarray
     accel: np.ndarray

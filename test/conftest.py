@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what every test shares: an own DDS domain per test process, seeds, the command line's door.
+Owns what all tests share: a DDS domain per test process, seeds, and the command line's fixtures.
 """
 
 from __future__ import annotations
@@ -34,64 +34,61 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# Threads of their own for many small matrices wait for each other on a machine that is busy. What
-# reads this is numpy, which is imported behind it.
+# One BLAS thread, as several threads for many small matrices wait for each other on a busy
+# machine. Set before numpy is imported, which reads it.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-# Every worker of every test run on this machine talks in a DDS domain of its own, and none of them
-# beyond this machine. The run id keeps two runs apart, the worker's number two workers. Domain 0
-# is the user's, those from 81 on the benchmarks'.
+# Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
+# The run id separates runs, the worker's number separates workers. Domain 0 is the user's, domains
+# from 81 are the benchmarks'.
 _RUN = os.environ.get('PYTEST_XDIST_TESTRUNUID', str(os.getpid()))
 _WORKER = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
 os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WORKER % 4)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.pop('ROS_STATIC_PEERS', None)
 
-# A shell starts what runs in the background deaf to SIGINT, and children inherit that.
+# A shell starts background processes with SIGINT ignored, and children inherit that.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# How long an example takes is the machine's business, not a test's.
+# No deadline, as the duration of an example depends on the machine.
 settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
-# For `make nightly`; tests that say how often they run are not touched.
+# For `make nightly`; tests with a stated number of examples are unchanged.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
-#: Files that take longest, the longest first: whoever works in parallel begins with them, so that
-#: no worker is left alone with one at the end (`make test` keeps this order).
+#: The longest files first: parallel workers begin with them, so that no worker is left with a long
+#: one at the end (`make test` keeps this order).
 _LONG = (
-    *('test_fitting_selection', 'test_fitting', 'test_priors', 'test_fitting_change'),
-    *('test_gyroscope', 'test_cli_help', 'test_third_thermometer', 'test_real_data'),
-    *('test_report_certificate', 'test_offset', 'test_fitting_windows', 'test_record'),
-    *('test_docs', 'test_cli_demo', 'test_fleet_unit', 'test_node_startup'),
-    *('test_convert', 'test_simulation_presets', 'test_readme'),
-    *('test_properties', 'test_text', 'test_recording_damage'),
-    *('test_report_figures', 'test_stillness', 'test_cli_errors', 'test_recording_walk'),
-    *('test_fault_files', 'test_allow', 'test_faults', 'test_cli', 'test_degenerate'),
-    *('test_layers', 'test_rests', 'test_compensator', 'test_sample_checks', 'test_report'),
-    *('test_judging', 'test_report_browser', 'test_one_position', 'test_recording_promises'),
-    *('test_fitting_regression', 'test_recording_read', 'test_fault_process'),
-    *('test_node_reload', 'test_ins', 'test_middleware', 'test_regime', 'test_least_known'),
-    *('test_one_judge', 'test_fleet_run', 'test_plausibility', 'test_fleet_summary'),
-    *('test_acquisition', 'test_thermometer'),
+    *('real_data', 'cli_help', 'fitting', 'faults', 'fault_process', 'priors', 'fault_files'),
+    *('cli_demo', 'gyroscope', 'degenerate', 'fitting_selection', 'fleet_run', 'record'),
+    *('regime', 'drivers', 'few_positions', 'fitting_closing', 'properties', 'judging'),
+    *('node_parity', 'node_defence', 'report', 'compensator', 'allow', 'replay', 'attacks'),
+    *('fitting_regression', 'fitting_change', 'fitting_windows', 'docs', 'node_startup'),
+    *('report_certificate', 'fleet_unit', 'acquisition', 'third_thermometer', 'api', 'player'),
+    *('middleware', 'correction', 'plausibility', 'node_sources', 'recording_read', 'soak'),
+    *('node_reload', 'cli', 'recording_damage', 'node', 'cli_errors', 'ins', 'sample_checks'),
+    *('files', 'fleet_storage', 'calibration', 'readme', 'recording_walk', 'recording_write'),
 )
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    rank = {name: place for place, name in enumerate(_LONG)}
+    rank = {f'test_{name}': place for place, name in enumerate(_LONG)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(_LONG)))
 
 
 def pytest_collection_finish() -> None:
-    """Keep the collector from walking through what was imported, again and again."""
+    """
+    Exclude imported objects from garbage collection, which would otherwise scan them repeatedly.
+    """
     gc.freeze()
 
 
 def parsed(text: str) -> dict[str, Any]:
-    """Parse what a command prints for machines: one object, and no NaN, which JSON has not."""
+    """Parse JSON printed by a command: it must be one object, without NaN, which is not JSON."""
 
     def no_nan(text: str) -> None:
         raise AssertionError(f'{text} is not JSON')
@@ -102,7 +99,7 @@ def parsed(text: str) -> dict[str, Any]:
 
 
 class Cli(Protocol):
-    """Run ``thermo_comp`` as a user does."""
+    """Run ``thermo_comp`` with arguments and return the finished process."""
 
     def __call__(
         self, *args: str | Path, code: int | None = 0, cwd: Path | None = None, **env: str
@@ -123,7 +120,7 @@ def root() -> Path:
 
 @pytest.fixture(scope='session')
 def real_data() -> Path:
-    """Return the folder of real recordings made by others, which the project may not ship."""
+    """Return the folder of real recordings, which this project may not distribute."""
     folder = Path(os.environ.get('THERMO_COMP_DATA', ROOT.parent / 'shared' / 'data'))
     if not folder.is_dir():
         pytest.skip(f'the real recordings are not in {folder} (set THERMO_COMP_DATA)')
@@ -141,7 +138,7 @@ def _checked(
 
 @pytest.fixture(scope='session')
 def program() -> Cli:
-    """Return the command line as a process of its own."""
+    """Return a function that runs the command line in a separate process."""
 
     def run(
         *args: str | Path, code: int | None = 0, cwd: Path | None = None, **env: str
@@ -162,7 +159,7 @@ def program() -> Cli:
 
 @contextmanager
 def _caught(name: str, descriptor: int) -> Iterator[Callable[[], str]]:
-    """Lead a standard stream into a file, and with it what libraries in C write there."""
+    """Redirect a standard stream to a file, including output of C libraries."""
     before = getattr(sys, name)
     before.flush()
     kept = os.dup(descriptor)
@@ -187,10 +184,10 @@ def _caught(name: str, descriptor: int) -> Iterator[Callable[[], str]]:
 
 @contextmanager
 def _as_a_process(cwd: Path | None) -> Iterator[None]:
-    """Give a command what a process begins with, and take back what it does to this one."""
+    """Give a command the state of a new process, and restore the state of this one afterwards."""
     folder, environment = Path.cwd(), dict(os.environ)
     log = logging.getLogger()
-    handlers, log.handlers = log.handlers, []  # pytest's keep from stderr what is logged
+    handlers, log.handlers = log.handlers, []  # pytest's handlers keep log messages from stderr
     os.chdir(cwd or folder)
     os.environ['COLUMNS'] = '80'
     try:
@@ -211,7 +208,9 @@ def _as_a_process(cwd: Path | None) -> Iterator[None]:
 
 @pytest.fixture(scope='session')
 def cli(program: Cli) -> Cli:
-    """Return the command line in this process; with variables, in a process that finds them."""
+    """
+    Return a function that runs the command line in this process, or in a new one with variables.
+    """
     from thermo_comp.cli.app import run as run_command
 
     def run(
@@ -230,7 +229,7 @@ def cli(program: Cli) -> Cli:
 
 @pytest.fixture
 def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
-    """Mount a file system of 4 KiB, or as many as the test says."""
+    """Mount a file system of 4 KiB, or of the size that the test gives."""
     disk = tmp_path / 'disk'
     disk.mkdir()
     size = f'size={getattr(request, "param", 4)}k'
@@ -246,13 +245,35 @@ def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]
 
 
 @pytest.fixture
+def peer() -> Iterator[Any]:
+    """Return the other end of a node, a peer on DDS."""
+    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    from ros_helpers import Peer
+
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    """Write the calibration of a unit without temperature functions; return its path."""
+    from builders import calibration
+
+    from thermo_comp.unit.calibration_file import save_calibration
+
+    save_calibration(calibration(), tmp_path / 'unit.yaml')
+    return tmp_path / 'unit.yaml'
+
+
+@pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make pages without what takes long: their figures, which test_report.py draws."""
+    """Make pages without figures, whose drawing is slow; test_report.py draws them."""
     monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: [])
 
 
 class Once(Protocol):
-    """Make a folder once in a run of the tests, whichever worker asks for it first."""
+    """Make a folder once per test run, in the first worker that requests it."""
 
     def __call__(self, name: str, make: Callable[[Path], object]) -> Path: ...
 
@@ -268,7 +289,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
         with (shared / f'.{name}.lock').open('w') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not folder.exists():
-                # What a maker that failed has left is no beginning for the next.
+                # Remove what a failed attempt has left.
                 shutil.rmtree(partial, ignore_errors=True)
                 partial.mkdir()
                 make(partial)
@@ -279,7 +300,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
 
 
 class _Pickler(pickle.Pickler):
-    """Leave out what reads the bags of a fit again: nobody does once it is fitted."""
+    """Leave out the functions that read the bags of a fit; they are not needed after it."""
 
     def persistent_id(self, value: object) -> str | None:
         is_local = isinstance(value, FunctionType) and '<' in value.__qualname__
@@ -293,9 +314,7 @@ class _Unpickler(pickle.Unpickler):
 
 @pytest.fixture(scope='session')
 def equal_fits_once(once: Once) -> Iterator[None]:
-    """
-    Fit equal bags with equal options once: pages and examples have the same fit again and again.
-    """
+    """Fit equal bags with equal options once, as many pages and examples need the same fit."""
     from thermo_comp import fitting
 
     fit = fitting.fit

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A user's desk: a folder with every file that an example in a help text or a page names."""
+"""A folder with every file that an example in a help text or a page names."""
 
 from __future__ import annotations
 
 import itertools
 import os
-import re
 import shlex
 import shutil
 import signal
@@ -19,7 +18,7 @@ import pytest
 from conftest import ROOT, Cli, Once
 from readme_helpers import shown
 
-#: What is made when an example asks for it; all else an example itself writes, or it lies ready.
+#: Files that are made when an example needs them; all others are written by an example or present.
 MADE = (
     *('unit.yaml', 'unit42.yaml', 'unit01.yaml', 'unit02.yaml', 'unit03.yaml', 'map.yaml'),
     *('autopilot.params', 'xsens_acc.calib', 'accel_calib.yaml', 'chamber.mcap', 'unit42_p01'),
@@ -34,7 +33,9 @@ _EXPORTS = {
 
 
 def write_fit_of_the_readme(path: Path, cli: Cli) -> None:
-    """Write the calibration of the sample bags, and beside it what the README's command says."""
+    """
+    Write the calibration of the sample bags, and the output of the README's command beside it.
+    """
     words, _ = shown()['fit']
     bags = ROOT / 'bags' / 'fit'
     assert words[1] == 'bags/fit/*.mcap'
@@ -73,7 +74,7 @@ class Desk:
         (self._ready / 'config').symlink_to(ROOT / 'config')
 
     def _make(self, name: str) -> Path:
-        """Make one file, when the first desk asks for it; return where it lies here."""
+        """Make a file when it is first needed; return its path."""
         made = self._ready / name
         if not made.exists():
             file = Path(name).name
@@ -87,15 +88,15 @@ class Desk:
         elif name == 'unit.yaml':
             shutil.copy(self._make('unit42.yaml'), path)
         elif name in ('unit01.yaml', 'unit02.yaml', 'unit03.yaml'):
-            text = self._make('unit42.yaml').read_text()
-            path.write_text(
-                re.sub(r'serial: .*?([,}\n])', rf'serial: {path.stem}\1', text, count=1)
-            )
+            # The paper's model is small: the population of three responses takes ten seconds.
+            bags = sorted(self._make('bags/unit42').iterdir())
+            given = ('--gravity', '9.8154', '--model', 'golovach', '--serial', path.stem)
+            self._cli('fit', *bags, *given, '-o', path, '-q')
         elif name in _EXPORTS:
             to = ('--to', _EXPORTS[name])
             self._cli('export', self._make('unit42.yaml'), *to, '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
-            # Short: some examples play it as slowly as it was recorded.
+            # Short, as some examples play it in real time.
             self._cli('simulate', '--profile', '20 1s', '-o', path, '-q')
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
@@ -124,7 +125,7 @@ class Desk:
             rng = np.random.default_rng(5)
             rests = np.repeat(9.8154 * positions(12, 2) + (0.1, -0.2, 0.3), 500, axis=0)
             rests += 0.02 * rng.standard_normal(rests.shape)
-            # Turned between two rests.
+            # The unit is turned between two rests.
             moves = np.arange(len(rests)) % 500 < 100
             rests[moves] += 5.0 * rng.standard_normal((int(moves.sum()), 3))
             time = 0.01 * np.arange(len(rests))
@@ -168,7 +169,7 @@ class Desk:
         assert words.pop(0) == 'thermo_comp'
         outputs = {after for word, after in itertools.pairwise(words) if word == '-o'}
         self._n += 1
-        # A fleet goes on where it was: asked again, it tells what is there.
+        # A fleet is continued in its folder; a second run reports the existing results.
         here = self._folder / ('fleet' if words[0] == 'fleet' else f'run{self._n}')
         (here / 'bags').mkdir(parents=True, exist_ok=True)
         for word in words:
@@ -191,14 +192,16 @@ class Desk:
         ]
         if arguments[0] == 'play':
             pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-            # Nobody listens here, whom it would wait for.
+            # There is no subscriber to wait for.
             arguments[1:1] = ['--wait', '0.5']
         if arguments[:2] == ['record', '--positions']:
             return self._interrupted(arguments, here)
         return (cli or self._cli)(*arguments, cwd=here)
 
     def _interrupted(self, arguments: list[str], here: Path) -> subprocess.CompletedProcess[str]:
-        """Start a command that serves until Ctrl-C, and press Ctrl-C once it says where."""
+        """
+        Start a command that runs until Ctrl-C, and send Ctrl-C once it has printed its first line.
+        """
         process = subprocess.Popen(
             [sys.executable, '-m', 'thermo_comp', *arguments],
             cwd=here,

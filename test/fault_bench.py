@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the fault bench: messages over DDS into the real node process, and what comes out of it.
+Owns the fault bench: it sends messages over DDS to the real node process and collects the output.
 
-Messages go in at full speed, some hundred at a time; after each lot the bench waits until the
-node's diagnostics account for every sample. So nothing is lost that is not to be lost, a fault
-shows in at least one report, and the result does not depend on the machine.
+Messages are sent at full speed in lots of some hundred; after each lot the bench waits until the
+node's diagnostics account for every sample. So no message is lost by accident, a fault shows in at
+least one report, and the result does not depend on the machine.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from sensor_msgs.msg import Imu, Temperature
 from thermo_comp.ros.player import lossless
 from thermo_comp.ros.waitloop import WaitLoop
 
-#: Longest wait for anything [s]; only a broken bench ever waits as long.
+#: Longest wait for any event [s]; reached only if the bench is broken.
 TIMEOUT_S = 60.0
-#: A lot is this much of the bag [s], and at most so many messages: shared memory of Fast DDS holds
-#: 512, and what does not get in is sent again seconds later, out of order.
+#: A lot covers this part of the bag [s], with at most this number of messages: the shared memory
+#: of Fast DDS holds 512, and further messages are repeated seconds later, out of order.
 LOT_S, LOT_SIZE = 10.0, 400
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 FRAME = b'sensor\0'
 _REST = np.array([20.0])
-#: Counts of the unit at rest, at the reference temperature.
+#: Counts of the unit at rest at the reference temperature.
 _STANDING = counts_of(force_at(np.array([STANDS_S])), _REST, _REST, 0.0 * _REST)[0]
 _HEAD = '<4siII7s5x'
 _COUNTS, _READING = struct.Struct(_HEAD + '3d'), struct.Struct(_HEAD + '2d')
@@ -68,27 +68,27 @@ PARAMETERS = (
 
 @dataclass
 class Heard:
-    """What the node said while one bag played."""
+    """The node's output for one bag."""
 
     stamp_ns: np.ndarray
     force: np.ndarray
     covariance: np.ndarray
-    #: (level, message) of each report, and all key values of the last one.
+    #: (level, message) of each report, and all key values of the last report.
     reports: list[tuple[int, str]] = field(default_factory=list)
     values: dict[str, str] = field(default_factory=dict)
 
     def says(self, text: str, level: int) -> bool:
-        """Whether a report at least that severe contains a text."""
+        """Whether a report of at least this level contains a text."""
         return any(level <= found and text in message for found, message in self.reports)
 
 
 class Bench:
-    """A peer of the node: three drivers and an INS in one."""
+    """A peer of the node that acts as three drivers and an INS."""
 
     def __init__(self, node: NodeProcess, context: Context) -> None:
         self.process = node
         self.node = rclpy.create_node('fault_bench', context=context)
-        # The loop serves no clients.
+        # The wait loop does not serve clients.
         self._operator = Peer()
         self._client = self._operator.node.create_client(
             SetParameters, 'thermo_comp/set_parameters'
@@ -101,7 +101,7 @@ class Bench:
         self._reports: list[tuple[int, str]] = []
         self._values: dict[str, str] = {}
         self.n_sent = self._n_taken = self._n_reports = 0
-        #: Whether the test itself has ended the node.
+        #: Whether the test itself has ended the node process.
         self.is_ended = False
         self._publishers: list[Publisher] = []
         self._open_publishers()
@@ -116,7 +116,7 @@ class Bench:
             self._publish[name] = publisher.handle.publish_raw
 
     def restart_publishers(self) -> None:
-        """End the drivers and start others, which the node has to find first."""
+        """End the drivers and start new ones, and wait until the node has discovered them."""
         for publisher in self._publishers:
             self.node.destroy_publisher(publisher)
         self._publishers.clear()
@@ -126,7 +126,7 @@ class Bench:
             while not publisher.get_subscription_count():
                 pause.wait(0.01)
                 assert self.process.is_alive, self.process.said
-        # The node's reader knows the writer once it has acknowledged that it has nothing.
+        # The node's reader knows the new writer once it has acknowledged that nothing is missing.
         pause.wait(0.5)
 
     def close(self) -> None:
@@ -174,7 +174,7 @@ class Bench:
         return future.result().results[0]
 
     def send(self, events: Iterable[Event]) -> int:
-        """Publish messages; return how many samples."""
+        """Publish messages; return the number of samples."""
         n = 0
         for topic, stamp_ns, value in events:
             sec, nanosec = divmod(stamp_ns, 1_000_000_000)
@@ -188,19 +188,19 @@ class Bench:
         return n
 
     def meet(self) -> None:
-        """Send samples of another time until the first one comes back."""
+        """Send samples with later stamps until the first of them comes back."""
         pause = threading.Event()
         standing = _STANDING.copy()
         for k in range(1000):
             stamp_ns = START_NS + (100_000 + k) * 1_000_000_000
-            # A unit at rest, at one temperature: however long this takes, there is nothing here
-            # for the node's checks to refute, nor for its thermometers to learn.
+            # A unit at rest at constant temperature: even a long wait gives the node's checks
+            # nothing to reject, and its thermometers nothing to learn.
             standing[2] += 1.0
             self.send([('board', stamp_ns, _REST[0]), ('counts', stamp_ns, tuple(standing))])
             pause.wait(0.02)
             if self._frames:
                 break
-        # What was sent before both ends knew each other is lost, and is not counted from here.
+        # Messages sent before discovery are lost; count from here.
         last_ns = stamp_ns + 1_000_000_000
         standing[2] += 1.0
         self.send([('counts', last_ns, tuple(standing))])
@@ -211,7 +211,7 @@ class Bench:
         self._n_taken = int(self._values['samples out']) - len(self._frames)
 
     def settle(self) -> None:
-        """Wait until the node accounts for every sample, and all that it published is here."""
+        """Wait until the node has counted every sample and all of its output has arrived."""
 
         def is_done() -> bool:
             values = self._values
@@ -223,7 +223,7 @@ class Bench:
         self.wait_for(is_done, f'{self.n_sent} samples')
 
     def play(self, events: list[Event]) -> Heard:
-        """Play messages in the order of arrival; return what the node made of them."""
+        """Play messages in order of arrival; return the node's output."""
         self.take()
         for lot in lots(events):
             if self.send(lot):
@@ -235,7 +235,7 @@ class Bench:
         return self.take()
 
     def take(self) -> Heard:
-        """Return what has been heard since the last call."""
+        """Return the output received since the last call."""
         with self._news:
             frames, self._frames = self._frames, []
             reports, self._reports = self._reports, []
@@ -253,7 +253,7 @@ def _stamp_of(frame: bytes) -> int:
 
 
 def lots(events: list[Event]) -> Iterator[list[Event]]:
-    """Cut messages into lots."""
+    """Divide messages into lots."""
     lot: list[Event] = []
     edge = None
     for event in events:
@@ -270,7 +270,7 @@ def lots(events: list[Event]) -> Iterator[list[Event]]:
 
 @contextmanager
 def bench(calibration: Path, *parameters: str) -> Iterator[Bench]:
-    """Start a node process and a peer that has met it."""
+    """Start a node process and a peer, and wait until they have discovered each other."""
     overrides = [f'calibration_file:={calibration}', *PARAMETERS, *parameters]
     arguments = [word for one in overrides for word in ('-p', one)]
     context = Context()

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the simulated bag of the fault bench: a unit in a soak, a ramp and a soak, with its truth,
-and what may be done to its messages.
+Owns the simulated bag of the fault tests (a unit in a soak, a ramp and a soak) with its truth, and
+the functions that change its messages.
 
-The unit is described by what its calibration can describe, so that every error beyond noise is the
-fault's: any published number can be held against the truth with the covariance it came with. Time
-is short: the lags are seconds where those of a real unit are minutes.
+The unit has only effects that its calibration contains, so that any error beyond the noise is due
+to the fault, and every published number can be compared with the truth. The lags are seconds
+instead of minutes, so that the bag is short.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set, term
 
+from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.unit.calibration import Axes, AxisReference, Calibration, Unit
@@ -28,7 +29,7 @@ START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5
 READINGS_HZ = 2.5
 DURATION_S = 320.0
-#: The platform turns until here and stands from here on.
+#: The platform turns until this time and is at rest afterwards.
 STANDS_S = 40.0
 RAMP_S = (60.0, 120.0)
 RAMP_K_S = 0.1
@@ -44,7 +45,7 @@ BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K: 100 ug/K
 SCALE_SLOPE = 7e-5
 BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
 
-#: What the static set may leave while a ramp is not detected yet; it is in the covariance.
+#: Residual of the static set while a ramp is not detected yet; part of the covariance.
 STATIC_RESIDUAL = 1.5e-4
 DYNAMIC_RESIDUAL = 3e-5
 
@@ -55,7 +56,7 @@ CONFIG = CompensatorConfig(
     gravity_tolerance_m_s2=0.02,
 )
 
-# One message: topic, stamp, value; a list of them is the order of arrival.
+# A message: topic, stamp, value. A list of messages is in order of arrival.
 Event = tuple[str, int, Any]
 Inject = Callable[[list[Event]], list[Event]]
 
@@ -79,7 +80,7 @@ def unit(**changes: Any) -> Calibration:
         'dynamic': regime_set(*[one(True)] * 3, **ranges),
         'noise_density_m_s2_sqrt_hz': (NOISE_SD / math.sqrt(RATE_HZ),) * 3,
         'response': (
-            term('now', (BY_GRADIENT,) * 3, during='dynamic', range=(-6.0, 6.0)),
+            term('gradient', (BY_GRADIENT,) * 3, during='dynamic', range=(-6.0, 6.0)),
             term('board', (BY_MEMORY,) * 3, tau_s=MEMORY_S),
         ),
         'board_lag_s': BOARD_LAG_S,
@@ -104,7 +105,7 @@ def force_at(seconds: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Truth:
-    """The unit's thermal truth on a fine grid."""
+    """The true temperatures of the unit on a fine grid."""
 
     time: np.ndarray
     case: np.ndarray
@@ -118,7 +119,7 @@ class Truth:
 
 
 def truth(ramp_s: tuple[float, float] = RAMP_S, duration_s: float = DURATION_S) -> Truth:
-    """Solve air -> case -> board -> memory through their lags."""
+    """Compute the temperatures of case, board and memory from the air's, each through its lag."""
     step = 0.01
     time = np.arange(0.0, duration_s + 1.0, step)
     air = 15.0 + RAMP_K_S * (np.clip(time, *ramp_s) - ramp_s[0])
@@ -138,7 +139,7 @@ def truth(ramp_s: tuple[float, float] = RAMP_S, duration_s: float = DURATION_S) 
 
 
 def counts_of(force: np.ndarray, case: np.ndarray, board: np.ndarray, memory: np.ndarray) -> Any:
-    """Return what the converter gives for a specific force (Eq. (6) to (9))."""
+    """Return the counts of the converter for a specific force (Eq. (6) to (9))."""
     t = board - 20.0
     drift = BIAS_SLOPE * t + BIAS_CURVE * t**2
     drift += BY_GRADIENT * (case - board) + BY_MEMORY * memory
@@ -175,6 +176,21 @@ def bag(
     return sorted(events, key=lambda event: event[1])
 
 
+def corrected(
+    events: list[Event], compensator: Compensator | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps and rows (force, covariance) of the published samples, without DDS."""
+    compensator = compensator or Compensator(unit(), CONFIG)
+    stamps, rows = [], []
+    for topic, stamp_ns, message in events:
+        if topic != 'counts':
+            compensator.push(topic, stamp_ns, message)
+        elif row := compensator.process(stamp_ns, *message):
+            stamps.append(stamp_ns)
+            rows.append(row)
+    return np.array(stamps, np.int64), np.array(rows).reshape(-1, 9)
+
+
 def seconds_of(stamp_ns: int) -> float:
     return (stamp_ns - START_NS) * 1e-9
 
@@ -183,7 +199,7 @@ def changed(topic: str, begin_s: float, end_s: float, change: Callable[..., Any]
     """
     Change the messages of a topic within a span.
 
-    `change(event)` returns the events that come instead.
+    `change(event)` returns the events that replace it.
     """
 
     def inject(events: list[Event]) -> list[Event]:
@@ -204,12 +220,12 @@ def value(topic: str, begin_s: float, end_s: float, change: Callable[[Any], Any]
 
 
 def stop(topic: str, begin_s: float, end_s: float) -> Inject:
-    """Lose the messages of a topic within a span."""
+    """Drop the messages of a topic within a span."""
     return changed(topic, begin_s, end_s, lambda _: [])
 
 
 def frozen(topic: str, begin_s: float, end_s: float) -> Inject:
-    """Repeat the last value of a topic throughout a span, with living stamps."""
+    """Repeat the last value of a topic throughout a span, with new stamps."""
     last: list[Any] = []
 
     def hold(event: Event) -> list[Event]:
@@ -220,7 +236,7 @@ def frozen(topic: str, begin_s: float, end_s: float) -> Inject:
 
 
 def late(topic: str, delay_s: float, begin_s: float, end_s: float) -> Inject:
-    """Deliver the messages of a topic later than they were stamped."""
+    """Deliver the messages of a topic later than their stamps."""
 
     def inject(events: list[Event]) -> list[Event]:
         def arrival(event: Event) -> float:
@@ -234,7 +250,7 @@ def late(topic: str, delay_s: float, begin_s: float, end_s: float) -> Inject:
 
 
 def shuffled(topic: str, begin_s: float, end_s: float) -> Inject:
-    """Exchange each message of a topic with its neighbour."""
+    """Exchange each message of a topic with the next one."""
 
     def inject(events: list[Event]) -> list[Event]:
         result = list(events)
@@ -251,7 +267,7 @@ def shuffled(topic: str, begin_s: float, end_s: float) -> Inject:
 
 
 def chain(*steps: Inject) -> Inject:
-    """Inject one after the other."""
+    """Apply several changes one after the other."""
 
     def inject(events: list[Event]) -> list[Event]:
         for step in steps:
@@ -262,7 +278,7 @@ def chain(*steps: Inject) -> Inject:
 
 
 def shifted(begin_s: float, by_s: float) -> Inject:
-    """Let the clock of all topics jump."""
+    """Let the stamps of all topics jump."""
 
     def inject(events: list[Event]) -> list[Event]:
         by_ns = round(by_s * 1e9)

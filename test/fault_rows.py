@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the rows of faults: what is injected, what must come out, what the diagnostics must say.
+Owns the rows of faults: the fault, the required output and the required diagnostics.
 
-Times are seconds of the bag of `fault_rig`: it turns until 40, ramps from 60 to 120, and the lag
-of the board has died by 270. docs/faults.md says of each row what is
-injected and what comes of it.
+Times are seconds of the bag of `fault_rig`: the unit turns until 40, the ramp is from 60 to 120,
+and the lag of the board has decayed by 270. docs/faults.md describes each row.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from fault_rig import (
 )
 
 OK, WARN, ERROR = 0, 1, 2
-#: Samples of the undisturbed bag.
+#: Number of samples of the undisturbed bag.
 N_SAMPLES = round(RATE_HZ * DURATION_S)
 
 
@@ -44,19 +43,19 @@ class Row:
 
     fault: str
     inject: Inject
-    #: (level, part of the message) of reports that must come.
+    #: (level, part of the message) of the required reports.
     says: tuple[tuple[int, str], ...]
-    #: Published samples at least.
+    #: Smallest number of published samples.
     n_least: int
     #: Spans in which nothing may be published.
     silent: tuple[tuple[float, float], ...] = ()
-    #: Span until the fault can be known, in which numbers are wrong.
+    #: Span before the fault can be detected, in which the output may be wrong.
     blind: tuple[float, float] = (0.0, 0.0)
-    #: From here on the output is that of the undisturbed run within 1 ug; None: never disturbed.
+    #: Time from which the output is within 1 ug of the undisturbed one; 0: always; inf: never.
     recovered: float = 0.0
-    #: By how much stamps run ahead of the truth, from when on [s].
+    #: Time from which stamps are ahead of the truth, and by how much [s].
     shift: tuple[float, float] = (math.inf, 0.0)
-    #: What plays when it is not the usual bag.
+    #: The bag, if it is not the usual one.
     source: list[Event] | None = field(default=None, repr=False)
 
 
@@ -71,7 +70,7 @@ def lose(share: float) -> Inject:
 
 
 def faster(begin_s: float, end_s: float, factor: int) -> Inject:
-    """Convert faster: a sample becomes `factor` samples of a shorter cycle, with less charge."""
+    """Shorten the conversion cycle: a sample becomes `factor` samples with fewer counts each."""
     step_ns = round(1e9 / RATE_HZ / factor)
 
     def split(event: Event) -> list[Event]:
@@ -86,12 +85,12 @@ def faster(begin_s: float, end_s: float, factor: int) -> Inject:
 
 
 def half_time(begin_s: float) -> Inject:
-    """Let a whole bag loop: play its beginning, then all of it."""
+    """Let a bag restart: play its beginning, then the whole bag."""
     return lambda events: [e for e in events if seconds_of(e[1]) < begin_s] + events
 
 
 def sensor_rows(name: str) -> list[Row]:
-    """Return the rows of one thermometer; only the board's faults stop the output."""
+    """Return the rows of one thermometer; only faults of the board stop the output."""
     is_board = name == 'board'
     lost = 'nothing is published' if is_board else 'the board sensor decides the regime'
     level = ERROR if is_board else WARN
@@ -336,7 +335,7 @@ ROWS = [*SENSOR_ROWS, *BOTH_ROWS, *SAMPLE_ROWS, *TIME_ROWS]
 
 
 def true_seconds(row: Row, stamps: np.ndarray) -> np.ndarray:
-    """Return the time of the bag that stamps stand for."""
+    """Return the times of the bag that belong to stamps."""
     seconds = (stamps - START_NS) * 1e-9
     at, by = row.shift
     return np.where(seconds >= at + by, seconds - by, seconds)

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns window tables with known truth for the tests of the regression, without samples or sensors.
-"""
+"""Owns window tables with known truth for tests of the regression, without samples or sensors."""
 
 from __future__ import annotations
 
@@ -22,7 +20,7 @@ from thermo_comp.typing import Floats, Ints
 
 GRAVITY = 9.81
 NOMINAL = np.array([1000.0, 1010.0, 990.0])
-#: Groups of the table's columns: a curve t, t^2; two lags; two columns that nothing needs.
+#: Groups of the table's columns: a curve t, t^2; two lags; two columns without effect.
 GROUPS = ('curve', 'curve', 'board', 'board', 'idle', 'idle')
 TAUS = np.array([400.0, 2500.0])
 START = np.array([[0.25, 0.1], [0.1, 1.0]])
@@ -44,7 +42,7 @@ class Truth:
     misalignment: Floats = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
     start_sd: float = 0.0
     sigma: Floats = field(default_factory=lambda: np.full(3, 2.0 * MICRO))
-    #: Gauss-Markov noise of the bias beside the white noise.
+    #: Gauss-Markov noise of the bias, in addition to the white noise.
     noise: Noise = WHITE
     offset_sd: float = 0.0
     #: Sd of the supports' tilts [rad per RMS of a temperature].
@@ -56,7 +54,7 @@ class Truth:
         return np.stack((self.on_bias, self.on_scale))
 
     def errors(self, regression: Regression, found: Posterior) -> dict[str, Floats]:
-        """Return errors over claimed standard deviations, of each kind of unknown."""
+        """Return errors divided by claimed standard deviations, for each kind of unknown."""
         errors, sd = {}, np.sqrt(found.variance)
         for name in ('kappa', 'bias', 'misalignment', 'weights'):
             true = getattr(self, name) * (regression.rms if name == 'weights' else 1.0)
@@ -78,7 +76,7 @@ def table_of(
     """Draw a table of windows, one bag per position; also return the true directions."""
     up = positions(n_positions, 3) if up is None else up
     time = step_s * (np.arange(n_windows) + 0.5)
-    # Once up and down in each bag, each time a little otherwise.
+    # Once up and down in each bag, slightly different each time.
     shapes = [_columns(time, step_s, 0.7 + 0.05 * p) for p in range(n_positions)]
     share = np.zeros((n_windows, len(GROUPS)))
     share[:, 2:4] = np.exp(-time[:, None] / TAUS)
@@ -144,7 +142,7 @@ def _columns(time: Floats, step_s: float, turns: float) -> Floats:
 
 
 def rows_of(windows: Windows, rows: Ints) -> Windows:
-    """Take rows of a table, position by position; positions and bags count as they appear."""
+    """Select rows of a table, position by position; positions and bags are renumbered."""
     names = ('section', 'time', 'weight', 'mean', 'columns', 'start', 'tilt')
     taken = {name: getattr(windows, name)[rows] for name in names}
     for name in ('position', 'bag'):
@@ -156,7 +154,7 @@ def rows_of(windows: Windows, rows: Ints) -> Windows:
 
 
 def without_starts(windows: Windows) -> Windows:
-    """Take the unknown start states away: their products with the weights are not linear."""
+    """Remove the unknown start states, as their products with the weights are not linear."""
     return replace(
         windows, lag=np.full_like(windows.lag, -1), start=np.zeros_like(windows.start),
         start_covariance=np.zeros((0, 0)),
@@ -164,12 +162,12 @@ def without_starts(windows: Windows) -> Windows:
 
 
 def column_sd(names: tuple[str, ...], bias_sd: float, scale_sd: float) -> Floats:
-    """Prior sd of each column in bias and scale: 0 where it takes no part."""
+    """Prior sd of each column in bias and scale; 0 excludes a column."""
     return np.outer((bias_sd, scale_sd), np.isin(GROUPS, names))
 
 
 def prior_of(truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: Any) -> Prior:
-    """Return a wide prior with the true noises."""
+    """Return a wide prior with the true noise parameters."""
     known: dict[str, Any] = {
         'bias_mean': np.zeros(3),
         'bias_sd': np.full(3, 1.0),
@@ -185,7 +183,7 @@ def prior_of(truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **change
 
 
 def candidates_of(windows: Windows, forced: tuple[str, ...] = ()) -> Candidates:
-    """Let all columns take part, with slopes of some ug/K."""
+    """Include all columns, with slopes of some ug/K."""
     none = np.zeros((2, len(windows.groups)), dtype=bool)
     typical, largest = (
         np.outer(slope, windows.kelvins) * windows.parts
@@ -195,7 +193,7 @@ def candidates_of(windows: Windows, forced: tuple[str, ...] = ()) -> Candidates:
 
 
 def begin(windows: Windows, up: Floats) -> tuple[Regression, State]:
-    """Return a regression and a state a little beside the truth."""
+    """Return a regression and a state close to the truth."""
     regression = Regression(windows, GRAVITY, NOMINAL)
     turned = up + np.array([2e-3, -1e-3, 3e-3])
     turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
@@ -203,7 +201,7 @@ def begin(windows: Windows, up: Floats) -> tuple[Regression, State]:
 
 
 def mode_of(regression: Regression, state: State, prior: Prior) -> Posterior:
-    """Find the mode to the last digits: Newton steps from where a fit would end."""
+    """Find the mode to full precision: Newton steps from the result of a fit."""
     found = regression.solve(state, prior, n_steps=12)
     state, grams = found.state, regression.products(found.layout.used).whole
     for _ in range(6):

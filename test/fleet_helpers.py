@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns small fleets: units that are simulated in a hundredth of a second, and fitted in a half."""
+"""Owns small fleets of units that are quick to simulate (10 ms) and to fit (0.5 s)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from thermo_comp.simulation.run import simulate
 from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
-#: Half an hour over 36 K; the ramps of a freezer, not of a chamber.
+#: Half an hour over 36 K, with the fast ramps of a freezer.
 PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')
-#: The two sets alone: the smallest fit there is, for tests about everything around it.
+#: The paper's model is the fastest fit, for tests of everything around a fit.
 OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='golovach'), certificates=False)
 
 
@@ -38,7 +38,7 @@ def write_unit(
     counts: str = 'accel/counts',
 ) -> list[Path]:
     """
-    Simulate one thermal test of one unit, one bag per position; its thermometers may be exchanged.
+    Simulate a thermal test of a unit, one bag per position; its thermometers may be exchanged.
     """
     unit = unit or preset('mems', seed)
     folder.mkdir(parents=True, exist_ok=True)
@@ -65,7 +65,7 @@ def write_unit(
 
 
 def damage(path: Path) -> None:
-    """Overwrite some bytes in the middle of a bag, as a bad disk does."""
+    """Overwrite some bytes in the middle of a bag, as a damaged disk does."""
     content = bytearray(path.read_bytes())
     middle = len(content) // 3
     content[middle : middle + 64] = bytes(64)

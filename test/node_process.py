@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the node as a process of its own, for tests and benchmarks."""
+"""Owns the node as a separate process, for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-_STOPPING_S = 10.0  # how long the node may take to end [s]
+_STOPPING_S = 10.0  # time for the node to end [s]
 
 
 class NodeProcess:
-    """The node as a process of its own, for as long as the context lasts."""
+    """The node in a separate process, which ends with the context."""
 
     def __init__(self, *ros_args: str) -> None:
         self._ros_args = ros_args
@@ -23,7 +23,7 @@ class NodeProcess:
     def __enter__(self) -> NodeProcess:
         self._log = tempfile.TemporaryFile()
         command = [sys.executable, '-m', 'thermo_comp.ros.node', '--ros-args', *self._ros_args]
-        # The very package that runs here, wherever it lies.
+        # Run this source tree, not an installed package.
         paths = [str(Path(__file__).resolve().parents[1]), os.environ.get('PYTHONPATH', '')]
         environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, paths))}
         self.process = subprocess.Popen(
@@ -43,13 +43,13 @@ class NodeProcess:
 
     @property
     def said(self) -> str:
-        """What it has written to its standard output and error."""
-        # Without moving the place where it writes.
+        """The text on its standard output and error."""
+        # Read without changing the position at which the process writes.
         return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors='replace').strip()
 
     def stop(self, number: int = signal.SIGTERM) -> int:
         """Send a signal, wait for the end, return the exit code."""
-        # Popen sends nothing to a process that has ended.
+        # Popen sends no signal to a process that has ended.
         self.process.send_signal(number)
         try:
             return self.process.wait(timeout=_STOPPING_S)

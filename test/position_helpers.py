@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the simulated positions that the tests of the partial fits are built on."""
+"""Owns the simulated positions for the tests of partial fits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass
 class Imu:
-    """The columns of a recording's Imu that a jump is checked against."""
+    """The Imu columns of a recording that are needed to check a jump."""
 
     angular_velocity: np.ndarray
 
@@ -30,14 +30,16 @@ class Imu:
 
 @dataclass(frozen=True)
 class ImuBlock(ArrayBlock):
-    """A block with a gyroscope, as a recording's is."""
+    """A block with a gyroscope, as from a recording."""
 
     imu: Imu | None = None
 
 
 @dataclass
 class Rest:
-    """Samples of a sensor at rest: noise on `level`, a board that cools from `warm` by `fall`."""
+    """
+    Samples of a sensor at rest: noise about `level`, and a board that cools from `warm` by `fall`.
+    """
 
     rng: np.random.Generator
     duration_s: float = 600.0

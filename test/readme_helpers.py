@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the outputs that the README and the page of the command line show, and how alike is alike.
+Owns the outputs shown in the README and on the page of the command line, and their comparison.
 
-``python test/readme_helpers.py`` runs the commands of that page, writes what they print into it,
-and the picture of the demonstration into docs/images; look at the difference before you commit it.
+``python test/readme_helpers.py`` runs the commands of that page and writes their output into it,
+and the picture of the demonstration into docs/images.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
 def shown() -> dict[str, tuple[list[str], str]]:
-    """Return what the page shows: sub-command -> (words of the command line, output)."""
+    """
+    Return the console examples of the page: sub-command -> (words of the command line, output).
+    """
     found = {}
     for kind, text in FENCE.findall(SESSION.read_text(encoding='utf-8')):
         if kind == 'console':
@@ -38,17 +40,17 @@ def shown() -> dict[str, tuple[list[str], str]]:
 
 
 def shown_of_demo() -> list[str]:
-    """Return the lines of the demonstration that the README shows."""
+    """Return the output of the demonstration in the README."""
     (text,) = (text for kind, text in FENCE.findall(README) if kind == 'text')
     return str(text).splitlines()
 
 
 def is_alike(got: str, expected: str) -> bool:
     """
-    Compare two outputs: words exactly, numbers by a third.
+    Compare two outputs: words exactly, numbers within a third.
 
-    A figure may differ on another processor (last bits) or another day (speed); its order of
-    magnitude may not.
+    Figures may differ on another processor (last bits) or day (speed), but not in order of
+    magnitude.
     """
     if _NUMBER.sub('#', got).split() != _NUMBER.sub('#', expected).split():
         return False
@@ -57,7 +59,7 @@ def is_alike(got: str, expected: str) -> bool:
 
 
 def refresh() -> None:
-    """Write the real output of the shown commands into their page."""
+    """Write the real output of the console examples into their page."""
     environment = {**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80'}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, 'bags').symlink_to(ROOT / 'bags')

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns bags made by other tools, and the plain-Python account of what a reader must make of them.
-"""
+"""Owns bags made by other tools, and the plain-Python result that a reader must give for them."""
 
 from __future__ import annotations
 
@@ -40,7 +38,7 @@ START_NS = 1_600_000_000_000_000_000
 
 @dataclass
 class Message:
-    """One message of a test bag: what is put into it."""
+    """Content of one message of a test bag."""
 
     topic: str
     log_ns: int
@@ -161,7 +159,7 @@ def write_rosbag1(path: Path, messages: list[Message]) -> None:
 
 
 def read_with_rosbags(path: Path) -> list[tuple[str, int, Any]]:
-    """Topic, log time and content of each message, in the order that `rosbags` gives."""
+    """Return topic, log time and content of each message, in the order of `rosbags`."""
     with Reader2(path) as reader:
         return [
             (c.topic, log_ns, typestore().deserialize_cdr(data, c.msgtype))
@@ -170,7 +168,7 @@ def read_with_rosbags(path: Path) -> list[tuple[str, int, Any]]:
 
 
 def columns_of(messages: list[Message]) -> dict[str, list[Any]]:
-    """Make the columns that a bag with these messages, in reading order, must give."""
+    """Build the columns that a reader must give for messages in reading order."""
     columns: dict[str, list[Any]] = {
         f'{role}_{name}': []
         for role in ('accel', 'board', 'case')
@@ -202,14 +200,14 @@ def assert_columns(block: Block, messages: list[Message]) -> None:
             assert found.tolist() == expected[f'{role}_{name}'], (role, name)
         assert after.tolist() == expected[f'{role}_after']
         assert values.dtype == np.float64
-        # Bits, not values: a NaN with its payload must come through.
+        # Compare bits, so that the payload of a NaN must be kept.
         shape = (-1, 3) if role == 'accel' else (-1,)
         wanted = np.array(expected[f'{role}_values'], np.float64).reshape(shape)
         assert np.ascontiguousarray(values).tobytes() == wanted.tobytes(), role
 
 
 def regular_messages(n: int = 40, accel: str = ACCEL, every: int = 8) -> list[Message]:
-    """Make a small well-behaved bag: counts, and both temperatures each some counts."""
+    """Make a small regular bag: counts, and both temperatures after every few counts."""
     messages: list[Message] = []
     width = 3 if accel == ACCEL else 37
     for row in range(n):

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the small thermal tests that the report's tests look at: simulated, so that truth is known.
-"""
+"""Owns the small simulated thermal tests of the report's tests."""
 
 from __future__ import annotations
 
@@ -64,16 +62,16 @@ def fitted() -> FitResult:
                 serial='thermostatted-0001',
             )
         )
-    # Without products the bank is a third of the whole.
-    groups = ('curve', 'set', 'now', 'board')
+    # Without products the bank of columns is a third as large.
+    groups = ('curve', 'set', 'gradient', 'board')
     return fitting.fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))
 
 
 @cache
 def evidence() -> Evidence:
     """
-    Gather what that fit has to show, as if it could do without all positions but the last: they
-    would leave one micro-g of the first, two of the second and so on.
+    Gather the evidence of that fit, with assumed left-out residuals of 1, 2, ... ug for all
+    positions but the last.
     """
     *others, last = fitted().positions
     left_out = [
@@ -85,12 +83,12 @@ def evidence() -> Evidence:
 
 @cache
 def certificate() -> str:
-    """Make the page of that fit; drawing takes seconds, so it is done once."""
+    """Render the page of that fit once, as drawing takes seconds."""
     return render_report(evidence())
 
 
 def write_bag(path: Path, position: int = 0, frame_id: str = 'imu_link', **metadata: str) -> Path:
-    """Write a position's run as a bag."""
+    """Write the run of a position as a bag."""
     one = run(position)
     facts = {'serial': 'thermostatted-0001', 'truth': '{}', **metadata}
     with BagWriter(path, metadata=facts) as writer:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the other end of the node in tests: a peer on real DDS that publishes, listens and calls.
+Owns the other end of the node in tests: a peer on real DDS that publishes, listens and calls
+services.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from sensor_msgs.msg import Imu, Temperature
 from thermo_comp.ros.node import CompensationNode, node_in_thread  # noqa: F401 - for the tests
 
 SECOND_NS = 1_000_000_000
-#: Of the first of the samples that a test sends, and from one to the next [ns].
+#: Stamp of the first sample of a test, and interval between samples [ns].
 START_NS, CYCLE_NS = 1_767_225_600 * SECOND_NS, 10_000_000
-#: Longest wait for anything on DDS [s]; only a broken test ever waits as long.
+#: Longest wait for any event on DDS [s]; reached only if a test is broken.
 TIMEOUT = 30.0
 DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -45,12 +46,12 @@ def stamp_of(message: Any) -> int:
 
 
 def standing(k: int) -> tuple[float, float, float]:
-    """Give counts of a unit of 300 per m/s^2 that stands: |f| is g, and no two are equal."""
+    """Return distinct counts of a unit of 300 counts per m/s^2 at rest, with |f| close to g."""
     return 30.0 + k % 3, -20.0 + k % 2, 2941.0 + k % 5
 
 
 class Peer:
-    """A node with a thread of its own; everything received wakes `wait_for`."""
+    """A node with a separate thread; every received message wakes `wait_for`."""
 
     def __init__(self) -> None:
         self.context = Context()
@@ -77,7 +78,7 @@ class Peer:
     def listen(
         self, kind: Any, topic: str, qos: QoSProfile = DEEP, raw: bool = False
     ) -> list[Any]:
-        """Collect what comes on a topic into the list that is returned."""
+        """Collect the messages of a topic in the returned list."""
         heard: list[Any] = []
 
         def hear(message: Any) -> None:
@@ -93,7 +94,7 @@ class Peer:
             assert self._news.wait_for(condition, TIMEOUT), f'{what} did not come true'
 
     def poll(self, condition: Callable[[], Any], what: str) -> None:
-        """Wait for something that no message announces, such as a match."""
+        """Wait by polling for a condition without a message, such as a discovery."""
         pause = threading.Event()
         for _ in range(int(TIMEOUT / 0.02)):
             if condition():
@@ -107,10 +108,12 @@ class Peer:
         return publisher
 
     def join(self, node: CompensationNode) -> None:
-        """Wait until both ends of every topic know each other: nothing sent is lost from then."""
+        """
+        Wait until both ends of every topic have discovered each other, so that nothing is lost.
+        """
         topics = {one.topic_name for one in self.node.subscriptions}
         outputs = [one for one in node.node.publishers if one.topic_name in topics]
-        # Not each thermometer of the unit is there in each test.
+        # Not every test has all thermometers of the unit.
         sent = {one.topic_name for one in self.node.publishers}
         inputs = [one for one in node.node.subscriptions if one.topic_name in sent]
         self.poll(
@@ -123,7 +126,7 @@ class Peer:
         )
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
-        # Kept: to find a service takes longer than its answer.
+        # Clients are kept, as discovering a service takes longer than its answer.
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]
@@ -155,7 +158,7 @@ def _messages(values: dict[str, Any]) -> list[ParameterMessage]:
 
 
 class Driver:
-    """Publishes samples and temperatures as a unit's drivers do, and knows what it sent."""
+    """Publishes samples and temperatures like a unit's drivers, and records what it sent."""
 
     def __init__(
         self,
@@ -189,20 +192,20 @@ def drive(
     topic: str = 'accel/counts',
     qos: QoSProfile = DEEP,
 ) -> Driver:
-    """Connect drivers to a node of this process."""
+    """Connect drivers to a node in this process."""
     driver = Driver(peer, kind, topic, qos)
     peer.join(node)
     return driver
 
 
 def node_arguments(unit: Path, *overrides: str) -> list[str]:
-    """Make the arguments of a node that reports 20 times a second."""
+    """Make the arguments of a node with 20 reports a second."""
     words = [f'calibration_file:={unit}', 'diagnostics_period:=0.05', *overrides]
     return [word for override in words for word in ('-p', override)]
 
 
 class Samples:
-    """Sends samples of a unit that stands and hears what comes of them."""
+    """Sends samples of a unit at rest and collects the node's output."""
 
     def __init__(self, peer: Peer, node: CompensationNode) -> None:
         self._peer = peer
@@ -218,14 +221,14 @@ class Samples:
         self.n_sent += n
 
     def go_on(self) -> None:
-        """All samples of a further burst come out."""
+        """Check that all samples of a further burst are published."""
         before = len(self.heard)
         self.send()
         self._peer.wait_for(lambda: len(self.heard) >= before + 20, '20 further samples')
 
 
 def status_with(peer: Peer, heard: list[DiagnosticArray], text: str) -> DiagnosticStatus:
-    """Wait for the next status whose message holds a text."""
+    """Wait for the next status whose message contains a text."""
     del heard[:]
     found: list[DiagnosticStatus] = []
 

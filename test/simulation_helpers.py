@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what tests ask of a simulated run beyond its columns."""
+"""Owns functions for simulated runs that only tests need."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from thermo_comp.typing import Bools, Floats
 
 
 def of_part(truth: Truth, node: str) -> Floats:
-    """Give the temperature [degC] of one part on the thermal grid."""
+    """Return the temperature [degC] of a part on the thermal grid."""
     return truth.temperatures[:, truth.unit.network.nodes.index(node)]
 
 
 def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> Bools:
-    """Tell where, on the thermal grid, the board really takes up or gives off heat."""
+    """Return where, on the thermal grid, the board's temperature really changes."""
     truth = run.truth
     rate = np.gradient(of_part(truth, truth.unit.board.node), truth.grid_s)
     return np.asarray(np.abs(rate) * 60.0 > threshold_k_min)
 
 
 def noiseless(unit: UnitModel) -> UnitModel:
-    """Return the unit with no white noise on the axes and the thermometers."""
+    """Return the unit without white noise on axes and thermometers."""
     return replace(unit.with_thermometers(noise_sd=0.0), noise_density=(0.0, 0.0, 0.0))
 
 
@@ -39,8 +39,8 @@ def rates_k_min(program: Cyclogram) -> Floats:
 def rippled(
     program: Cyclogram, seed: int = 1, amplitude: float = 0.1, period: float = 300.0
 ) -> Cyclogram:
-    """Return a program with what a chamber's regulation leaves on it: a sine that wanders."""
-    # Twelve straight lines per period; the phase walks by half a radian per root of a period.
+    """Return a program with the ripple of a chamber's control: a sine with a random-walk phase."""
+    # Twelve lines per period; sd of the phase after one period: half a radian.
     time = np.arange(0.0, program.duration_s, period / 12.0)
     rng = np.random.default_rng(seed)
     phase = rng.uniform(0.0, 2.0 * np.pi) + np.cumsum(

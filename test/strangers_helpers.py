@@ -4,13 +4,7 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
-from conftest import ROOT
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
 from strangers_units import Unit
 
 ZEROS = np.zeros((1, 3))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The account of a test while it is recorded: known positions, in blocks of any length."""
+"""Owns the tests of the state of a recording: known positions, in blocks of any length."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UPS = [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, 1, 0), (0.8, 0.6, 0), (0, -1, 0)]
 
 
 class Stream:
-    """Samples of a unit of 300 counts per m/s^2, as somebody turns it."""
+    """Samples of a unit of 300 counts per m/s^2 that a person turns."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -49,7 +49,7 @@ class Stream:
         size = round(seconds * RATE)
         for begin in range(0, len(accel), size):
             own = slice(begin, begin + size)
-            # A reading a second.
+            # One reading per second.
             places = np.arange(begin, min(begin + size, len(accel)))
             at = places[places % round(RATE) == 0]
             board = Readings(stamp_ns[at], celsius[at], at - begin)
@@ -82,7 +82,7 @@ def test_positions_are_found_however_the_blocks_fall(stream: Stream, seconds: fl
     account = test.account()
     assert account.is_complete
     for position, up in zip(account.positions, UPS, strict=True):
-        # A bias of 0.04 g turns what is read by up to 2 degrees.
+        # A bias of 0.04 g changes the measured direction by up to 2 degrees.
         assert position.up @ up > np.cos(np.radians(2.5))
         assert position.still_s == pytest.approx(60.0, abs=2.0)
         board = position.thermometers['board']
@@ -109,7 +109,7 @@ def test_a_position_grows_until_it_is_good(stream: Stream) -> None:
     assert told[-1] == ('', True)
     assert 'positions are missing' in account.findings[0]
     assert not account.is_complete
-    # Turned upside down from here.
+    # Turned upside down from this time.
     assert account.next_deg == pytest.approx(np.degrees(np.arccos(account.next_up @ account.now)))
 
 
@@ -124,7 +124,7 @@ def test_what_is_wrong_with_a_position_is_said(stream: Stream) -> None:
     stream.turn()
     stream.rest((0, -1, 0), 30.0)
     stream.turn()
-    # Knocked, and back in its place.
+    # Knocked, then back in its place.
     stream.rest((0, -1, 0), 30.0)
     test = Acquisition(5, 50.0)
     for block in stream.blocks(0.5):

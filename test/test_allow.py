@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is refused by name can be allowed by that name, and then there is a calibration."""
+"""Each refusal that has a name can be overridden by it, and then gives a calibration."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.options import REFUSALS
 from thermo_comp.simulation.campaign import positions
 
-# The response is none of the matter, and takes its time.
-COUNTS = FitOptions(gravity=GRAVITY, groups=('curve',))
+# The model does not matter here; this one is the fastest to fit.
+COUNTS = FitOptions(gravity=GRAVITY, model='golovach')
 FORCE = replace(COUNTS, input='m/s^2')
 
 
@@ -40,7 +40,7 @@ def as_it_is(rest: Rest) -> None:
 
 
 def swapped(source: FitSource, rest: Rest) -> FitSource:
-    """Let the board cool at once and the case through a lag of two minutes."""
+    """Replace the thermometers: the board cools at once, the case with a lag of two minutes."""
     (block,) = source.blocks()
     time = (block.board_stamp_ns - block.board_stamp_ns[0]) * 1e-9
     late = np.empty_like(block.board)
@@ -60,7 +60,7 @@ def swapped(source: FitSource, rest: Rest) -> FitSource:
         ('units', as_it_is, COUNTS, 7),
         ('jump', jumped, FORCE, 1),
         ('jump', jumped, FORCE, 7),
-        # Ten minutes are too short to see which one leads.
+        # Ten minutes are too short to determine which thermometer leads.
         ('swapped', as_it_is, FORCE, 7),
         ('compensated', compensated, FORCE, 12),
     ],
@@ -126,7 +126,7 @@ def in_kelvins(rest: Rest) -> None:
     ],
 )
 def test_what_gives_no_numbers_is_a_sentence(rng, spoil, said):
-    # WHY: each of these once ended in a traceback, or its readings fell silently.
+    # WHY: each of these once ended in a traceback, or its readings were dropped silently.
     with pytest.raises(FitError, match=said):
         fit(spoilt(rng, spoil), FORCE)
 
@@ -149,7 +149,7 @@ def test_what_is_likely_a_mistake_is_said(rng, spoil, name, said):
 
 
 def test_an_axis_that_is_dead_in_one_position_is_named(rng):
-    # WHY: y read 3000 to the bit for hours, and its drift went into all others.
+    # WHY: y read exactly 3000 for hours, and its drift was attributed to all other positions.
     rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
     rests[4].accel[:, 1] = rests[4].level[1]
     sources = [rest.source(name=f'bag{number}') for number, rest in enumerate(rests)]
@@ -158,7 +158,7 @@ def test_an_axis_that_is_dead_in_one_position_is_named(rng):
 
 
 def spoilt(rng, spoil):
-    """Spoil seven positions alike."""
+    """Apply the same defect to seven positions."""
     rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
     for rest in rests:
         spoil(rest)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The linters of a ROS installation, which package.xml declares, have nothing to say."""
+"""The linters of a ROS installation, declared in package.xml, find nothing."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from conftest import ROOT
 
 SOURCES = [str(ROOT / name) for name in ('thermo_comp', 'test', 'setup.py')]
-#: As in setup.cfg: the summary of a docstring stands on its second line and may take two.
+#: As in setup.cfg: the summary of a docstring is on its second line and may have two lines.
 STYLE = ['D200', 'D205', 'D400', 'D403']
 pytestmark = pytest.mark.filterwarnings('ignore')
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The library as a script uses it: arrays in and out, with the bits of the compensator."""
+"""The library as a script uses it: arrays in and out, equal to the compensator bit for bit."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def fitted(root: Path) -> tc.Calibration:
 
 @pytest.fixture
 def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Make two minutes at 10 Hz with a reading of each thermometer beside every tenth sample."""
+    """Make two minutes at 10 Hz, with a reading of each thermometer at every tenth sample."""
     time_s = np.arange(1200) * 0.1
     given = np.arange(1200) % 10 == 0
     board = np.where(given, 20.0 + 0.01 * time_s + rng.normal(0.0, 0.01, 1200), np.nan)
@@ -42,7 +42,7 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 
 def test_the_root_is_light_and_knows_its_names() -> None:
-    # What a script imports first must not cost it the libraries of a fit.
+    # The first import of a script must not load the libraries of a fit.
     heavy = ('numpy', 'scipy', 'yaml', 'rosbags', 'mcap', 'matplotlib')
     assert loaded_after('import thermo_comp', *heavy) == []
     assert all(getattr(tc, name) is not None for name in tc.__all__)
@@ -87,7 +87,7 @@ def test_arrays_have_the_bits_of_the_compensator(arrays: dict[str, np.ndarray]) 
 
 
 def test_no_reading_is_lost_however_many(rng: np.random.Generator) -> None:
-    # All of them once waited together, and what waits is bounded.
+    # All readings once waited at the same time, and the queue is limited.
     time_s = np.arange(5000) * 0.1
     readings = {name: 20.0 + rng.normal(0.0, 0.01, 5000) for name in ('board', 'case')}
     counts = rng.normal([5.0, -3.0, 2940.0], 2.0, (5000, 3)).round()
@@ -107,7 +107,7 @@ def test_readings_beside_the_samples_are_those_at_times_of_their_own(
         for here in [~np.isnan(arrays[name])]
     }
     again = unit.correct(arrays['time_s'], arrays['counts'], **pairs)
-    # Filled up between the readings, as a table that was merged has it.
+    # Values held between the readings, as in a merged table.
     filled = {
         name: np.repeat(arrays[name][~np.isnan(arrays[name])], 10) for name in ('board', 'case')
     }
@@ -126,7 +126,7 @@ def test_any_origin_and_any_kind_of_array_will_do(arrays: dict[str, np.ndarray])
     )
 
     class Column:
-        """What a pandas or xarray object is to numpy."""
+        """Offers numpy the interface of a pandas or xarray object."""
 
         def __init__(self, value: np.ndarray) -> None:
             self.value = value
@@ -163,7 +163,7 @@ def test_data_are_no_exceptions_but_rows_of_nan(arrays: dict[str, np.ndarray]) -
     counts[7, 1], counts[9, 2] = np.nan, 32767.0
     board = np.where(arrays['time_s'] < 0.55, np.nan, arrays['board'])
     out = thermal_calibration().correct(arrays['time_s'], counts, board=board, case=arrays['case'])
-    # The first reading of the board is that beside the sample at 1 s.
+    # The first board reading is at the sample of 1 s.
     assert np.isnan(out.specific_force[:10]).all()
     assert np.isnan(out.covariance[:10]).all()
     assert np.isfinite(out.specific_force[10:]).all()
@@ -171,7 +171,7 @@ def test_data_are_no_exceptions_but_rows_of_nan(arrays: dict[str, np.ndarray]) -
     late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
-    # Without a case the board decides, no sooner than with one.
+    # Without a case thermometer the board decides the regime, not earlier than with one.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
 
@@ -201,7 +201,10 @@ def test_nothing_in_is_nothing_out() -> None:
         ({'board': [20.0, 20.0]}, r'`board` must have a value for each of the 3 times'),
         ({'board': ([0.0, 1.0], [20.0])}, r'`board` must have as many values as times, 2'),
         ({'board': ([1.0, 0.0], [20.0, 20.0])}, r'`board time_s` must rise, got 1.0 at 0'),
-        ({'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])}, 'of the kind of `time_s`'),
+        (
+            {'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])},
+            'must be seconds or datetime64, as',
+        ),
         ({'lid': [20.0] * 3}, r'`lid` is no thermometer of this calibration: it has board, case'),
     ],
 )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the pages on theory and architecture say of the source is what stands there."""
+"""Statements of the pages on theory and architecture about the source agree with it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_the_files_that_a_page_names_exist(page: str) -> None:
     text = (DOCS / page).read_text()
     for name in re.findall(r'[\w*/]+\.py\b', text):
         places = (ROOT, ROOT / 'thermo_comp', ROOT / 'test')
-        # A path, or a file beside the one that the sentence has named.
+        # A path, or a file in the folder that the sentence has named.
         is_path = any(list(place.glob(name)) for place in places)
         assert is_path or any(path.name == name for path in SOURCES), name
 
@@ -46,7 +46,7 @@ def test_the_table_of_the_response_has_every_group() -> None:
     )
 
 
-# Not (3) to (5), which take signed counts at +I and -I apart: no command measures those.
+# Not Eq. (3) to (5), which use signed counts at +I and -I: no command measures those.
 @pytest.mark.parametrize('number', [1, 2, 6, 7, 8, 9, 10])
 def test_an_equation_of_the_paper_is_found_by_its_number(number: int) -> None:
     tag = re.compile(rf'\bEq\. [^\n]*\({number}\)')

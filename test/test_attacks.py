@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attacks on what lies around the core: clocks, rates, many clients, links, full disks, logs."""
+"""
+Attacks on the surroundings of the core: clocks, rates, many clients, links, full disks, logs.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,8 @@ def test_a_clock_that_goes_back_or_pauses_is_none_of_the_samples(
         driver = drive(peer, node)
         assert peer.set_parameters(use_sim_time=True)[0].successful
         clock = peer.publisher(Clock, '/clock')
-        # On, back by an hour, still for five looks, forward by a year, and not at all any more.
+        # The clock starts, jumps back by an hour, stands for five checks, jumps ahead by a year,
+        # and ends.
         hour = 3600 * 10**9
         times = [START_NS, START_NS + hour, START_NS, *[START_NS] * 5, START_NS + 8760 * hour]
         for n, now_ns in enumerate(times):
@@ -148,7 +151,7 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(
             assert len(results) == len(given)
             for (key, value), result in zip(given.items(), results, strict=True):
                 is_good = value not in (str(tmp_path / 'none'), 'x' * 300, -1.0, 'imu')
-                # Too many at once may be refused, and say so.
+                # With too many requests at once some may be refused, with a reason.
                 assert result.successful == is_good or 'too many' in result.reason, (key, value)
         config = node._config
         for key in ('calibration_file', 'frame_id', 'transition_time', 'diagnostics_period'):
@@ -159,7 +162,7 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(
 
 @ros
 def test_links_exchanged_under_the_folder_lead_nowhere_else(tmp_path: Path) -> None:
-    # WHY: between the look at a path and its opening a folder can become a link.
+    # WHY: between the check of a path and its opening a folder can be replaced by a link.
     from thermo_comp.ros.reader import read
 
     folder, outside = tmp_path / 'units', tmp_path / 'outside'
@@ -240,7 +243,7 @@ def test_a_calibration_killed_at_any_line_of_its_writing_is_the_old_or_the_new(
     lines = [line.split() for line in done.stdout.splitlines()]
     *killed, last = lines
     assert last == ['0', 'new']
-    # Every line of the way, and both sides of the exchange.
+    # At every line of the writing, before and after the rename.
     assert len(killed) > 30
     assert {code for code, _ in killed} == {str(signal.SIGKILL.value)}
     assert [name for name, _ in itertools.groupby(name for _, name in killed)] == ['old', 'new']

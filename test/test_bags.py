@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sample bags are what their README says: small, complete, and made by its two commands."""
+"""The sample bags agree with their README: small, complete, and made by its two commands."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_they_are_small() -> None:
 @pytest.mark.parametrize('command', COMMANDS, ids=['fit', 'held_out'])
 def test_their_commands_make_them(command: str, tmp_path: Path, cli: Cli) -> None:
     arguments = shlex.split(command)[1:]
-    # The same content, packed faster.
+    # The same content with a faster compression.
     arguments[arguments.index('--level') + 1] = '1'
     cli(*arguments, cwd=tmp_path)
     made = sorted((tmp_path / 'bags').rglob('*.mcap'))
@@ -35,7 +35,7 @@ def test_their_commands_make_them(command: str, tmp_path: Path, cli: Cli) -> Non
     for path in made:
         shipped = read_recording(ROOT / path.relative_to(tmp_path))
         anew = read_recording(path)
-        # They were made by the version that stands in them.
+        # The bags state the version that made them.
         own, theirs = (dict(one.info.metadata) for one in (anew, shipped))
         assert own.pop('simulated_by').split()[0] == theirs.pop('simulated_by').split()[0]
         assert own == theirs, path.name
@@ -47,12 +47,13 @@ def test_their_commands_make_them(command: str, tmp_path: Path, cli: Cli) -> Non
             before = shipped.columns.temperatures[name]
             np.testing.assert_array_equal(readings.stamp_ns, before.stamp_ns, err_msg=path.name)
             np.testing.assert_array_equal(readings.after, before.after, err_msg=path.name)
-            # Another processor's exponential may differ in the last bit; a count does not see it.
+            # The last bit of an exponential may differ on another processor, but not the rounded
+            # counts.
             np.testing.assert_allclose(readings.celsius, before.celsius, rtol=1e-12)
 
 
 def test_every_sample_can_be_corrected() -> None:
-    # Both temperatures stand before the first sample, so counts in can be counts out.
+    # Both temperatures come before the first sample, so that every sample is corrected.
     for path in SHIPPED:
         block = read_recording(path).columns
         assert [one.after[0] for one in block.temperatures.values()] == [0, 0]

@@ -15,19 +15,21 @@ from hypothesis import strategies as st
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.thermal.settings import DetectorSettings
-from thermo_comp.unit.calibration import GroupEvidence, parameter_layout
+from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import (
+    _FORMER,
     SIZE_LIMIT,
     dump_calibration,
     load_calibration,
     parse_calibration,
 )
 from thermo_comp.unit.functions import CubicSpline, Exponential
+from thermo_comp.unit.provenance import GroupEvidence
 
 REPOSITORY = Path(__file__).parents[1]
 # Within twice the full scale of 32767.
 number = st.floats(-6.5e4, 6.5e4)
-# The fourth power of 15 K times this stays far from turning a scale function to 0.
+# The fourth power of 15 K times this is far from making a scale function 0.
 small = st.floats(-1e-6, 1e-6)
 RICH = rich_calibration()
 
@@ -67,7 +69,7 @@ def calibrations(draw):
         calibration(sensors=('case', 'frame')),
         response=tuple(replace(t, bias=weights(number), scale=weights(small)) for t in terms),
         evidence=(
-            GroupEvidence('now', 'bias', 1e-5, 2.5, draw(number), (draw(st.floats(0, 9)),)),
+            GroupEvidence('gradient', 'bias', 1e-5, 2.5, draw(number), (draw(st.floats(0, 9)),)),
         ),
         static=regime_set(one(), one(), one()),
         dynamic=regime_set(one(), one(), one()),
@@ -173,10 +175,15 @@ TEXT = dump_calibration(RICH)
         ('sensors: [case, frame]', 'sensors: [case, case]', 'sensors', 'different names'),
         ('sensors: [case, frame]', 'sensors: []', 'sensors', 'at least one'),
         ('sensors: [case, frame]', 'sensors: [board]', 'sensors', 'none of them board'),
-        ('- kind: now', '- kind: then', 'response[0].kind', "'bend', got 'then'"),
+        ('- kind: gradient\n', '- kind: then\n', 'response[0].kind', "'bend', got 'then'"),
         ('tau_s: 600.0', 'tau_s: 0.0', 'response[3].tau_s', 'greater than 0 for board, got 0'),
         ('tau_s: 600.0', 'tau_s: -1.0', 'response[3].tau_s', 'must be at least 0, got -1.0'),
-        ('width_k: 1.5', 'width_k: 0.0', 'response[7].width_k', 'greater than 0 for even'),
+        (
+            'width_k: 1.5',
+            'width_k: 0.0',
+            'response[7].width_k',
+            'greater than 0 for gradient_even',
+        ),
         ('power: 1', 'power: 1.5', 'response[6].power', 'valid integer, got 1.5'),
         ('range: [-0.1, 0.1]', 'range: [1, 1]', 'response[2].range', r'lower < upper, got \[1'),
         ('during: static', 'during: sometimes', 'response[2].during', "got 'sometimes'"),
@@ -227,7 +234,7 @@ def test_refusals_name_key_value_and_rule(old, new, key, message):
 def test_bytes_that_are_no_calibration(content, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
-    # Those who may not read the file hear as much, but for what may quote it.
+    # Peers without access to the file get the same message without quotations from it.
     told, whole = caught.value.rule or str(caught.value), str(caught.value)
     quotes = whole.startswith('not valid YAML: ')
     assert re.fullmatch(r'not valid YAML( \(line \d+\))?', told) if quotes else told == whole
@@ -283,7 +290,7 @@ def test_files_that_are_no_files(tmp_path):
             'static.x.bias_function',
             'must be finite over its range',
         ),
-        # 1 - 0.05 t is 0.15 at 37 degC, and less than nothing along its tangent.
+        # 1 - 0.05 t is 0.15 at 37 degC, and negative along its tangent.
         ('[1.0, 7.7e-05]', '[1.0, -0.05]', 'static.x.scale_function', 'must stay above 0.1'),
     ],
 )
@@ -325,7 +332,15 @@ def test_posterior_of_other_size_is_refused():
     with pytest.raises(
         ValueError, match=rf'`posterior.rest` .*per parameter \({n + 6}\), got {n}'
     ):
-        replace(RICH, response=(term('now'), *RICH.response))
+        replace(RICH, response=(term('gradient'), *RICH.response))
+
+
+def test_former_names_of_columns_are_read():
+    text = TEXT
+    for former, name in _FORMER.items():
+        text = re.sub(rf'(group|kind): {name}(?=[,}}\n])', rf'\1: {former}', text)
+    assert text != TEXT
+    assert parse_calibration(text.encode()) == RICH
 
 
 def test_shipped_example_loads():

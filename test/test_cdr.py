@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Serialized in, serialized out: always what rclpy would make of the same message.
-"""
+"""Serialized messages in and out: always the bytes that rclpy would give."""
 
 from __future__ import annotations
 
@@ -20,7 +18,7 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 
-from thermo_comp.ros.relay import SampleConverter, read_temperature
+from thermo_comp.ros.conversion import SampleConverter, read_temperature
 
 floats = st.floats(allow_nan=True, allow_infinity=True, width=64)
 # A NUL ends the string in CDR, and lone surrogates have no UTF-8.
@@ -28,12 +26,12 @@ frames = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size
 
 
 def process(stamp_ns: int, x: float, y: float, z: float) -> tuple[float, ...]:
-    """Stand in for the compensator: nine values that tell every input from every other."""
+    """Replace the compensator by a function that depends on every input."""
     return (z, x, y, 1.5, 0.25, float(stamp_ns % 1009), 2.5, 0.125, 3.5)
 
 
 def cdr(order: str, stamp: tuple[int, int], frame: str, values: list[float]) -> bytes:
-    """Write a stamped message of float64 values by the book: a second route to the bytes."""
+    """Serialize a stamped message of float64 values after the CDR standard, as a second route."""
     name = frame.encode() + b'\0'
     head = struct.pack(f'{order}iII', *stamp, len(name)) + name
     head += bytes(-len(head) % 8)
@@ -45,7 +43,7 @@ def pack(order: str, values: list[float]) -> bytes:
 
 
 def doubles(data: bytes) -> list[bytes]:
-    """Cut the 37 values of a serialized Imu, as bytes: NaN differs from itself as a float."""
+    """Return the 37 values of a serialized Imu as bytes, as a NaN is not equal to itself."""
     body = data[-37 * 8 :]
     return [body[i : i + 8] for i in range(0, len(body), 8)]
 
@@ -78,7 +76,7 @@ def test_counts_become_an_imu(
     found = doubles(written[0])
     assert found[25:28] == [z, x, y]
     assert b''.join(found[28:]) == pack('<', covariance)
-    # REP 145: what is not measured is marked, and the quaternion is a valid one all the same.
+    # REP 145: unmeasured fields are marked, and the quaternion is still a valid one.
     assert b''.join(found[:4]) == pack('<', [0.0, 0.0, 0.0, 1.0])
     assert found[4] == found[16] == pack('<', [-1.0])
     assert not any(b''.join(found[5:16] + found[17:25]))
@@ -103,7 +101,7 @@ def test_imu_passes_everything_else_bit_for_bit(
 
 
 def test_signalling_nan_survives_the_byte_swap() -> None:
-    # A float that passes through a register may come out quiet; rclpy's must not.
+    # A signalling NaN may become quiet in a register; rclpy's must not.
     payload = 0x7FF0_0000_0000_0001
     values = struct.pack('>37Q', *[payload] * 37)
     message = cdr('>', (1, 2), 'imu', [])[:] + values
@@ -114,7 +112,7 @@ def test_signalling_nan_survives_the_byte_swap() -> None:
 
 
 def test_frames_of_other_lengths_in_one_stream() -> None:
-    # WHY: two drivers on one topic, or one that changes its frame, move every later byte.
+    # WHY: two drivers on one topic, or a changed frame_id, shift all later bytes.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
     written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))
@@ -130,13 +128,13 @@ def test_what_has_another_form_goes_through_rclpy(kind: Any, override: str) -> N
     values = [float(k) for k in range(37 if kind is Imu else 3)]
     good = cdr('<', (3, 4), 'imu', values)
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
-    # rclpy reads a message with bytes behind its end; their plain form, which is exact, has none.
+    # rclpy accepts bytes after the end of a message; their exact plain form has none.
     (expected,), (found,) = convert(fast, good), convert(slow, good + bytes(8))
     assert (fast.traffic.n_fallback, slow.traffic.n_fallback) == (0, 1)
     assert deserialize_message(found, Imu) == deserialize_message(expected, Imu)
     assert doubles(found) == doubles(expected)
     assert slow.last_result == fast.last_result is not None
-    # The stream goes on the fast way.
+    # Later messages use the fast path again.
     convert(slow, good)
     assert slow.traffic.n_fallback == 1
 
@@ -162,8 +160,8 @@ def test_unreadable_bytes_are_counted_and_the_stream_goes_on(bad: bytes) -> None
 
 
 def test_the_first_message_may_be_any_bytes() -> None:
-    # WHY: found by fuzzing: a first message of one byte fitted the layout that knows nothing yet.
-    # PROMISE: counted, and the stream goes on.
+    # WHY: found by fuzzing: a first message of one byte matched the initial empty layout. PROMISE:
+    # it is counted, and the stream goes on.
     for n in range(40):
         converter = SampleConverter(Vector3Stamped)
         good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
@@ -180,7 +178,7 @@ def test_dropped_samples_give_nothing() -> None:
 
 
 def test_same_bytes_as_rclpy_writes() -> None:
-    # Regression of the layout against the serialization in use, where padding is not compared.
+    # Regression test of the layout; padding bytes are not compared.
     imu = Imu()
     imu.header.frame_id = 'imu_link'
     imu.angular_velocity.z = 0.25
@@ -221,5 +219,5 @@ def test_a_temperature_is_read_as_rclpy_reads_it(data: bytes) -> None:
     else:
         stamp = message.header.stamp
         expected = (stamp.sec * 10**9 + stamp.nanosec, message.temperature)
-    # NaN included: as text.
+    # Compared as text, as NaN is included.
     assert repr(read_temperature(data)) == repr(expected)

@@ -37,7 +37,7 @@ COMMANDS = sorted(
 @pytest.fixture(scope='session')
 def bag(tmp_path_factory: pytest.TempPathFactory, cli: Cli) -> Path:
     """Simulate a short thermal test through the command line."""
-    # 15 minutes at 10 Hz, without the 4 samples before the board's first reading at 0.5 s: 8996.
+    # 15 minutes at 10 Hz, minus the 4 samples before the board's first reading at 0.5 s: 8996.
     path = tmp_path_factory.mktemp('cli') / 'bag'
     cli('simulate', '--profile', '20 4min, 30@2 6min', '--rate-hz', '10', '-o', path)
     return path
@@ -55,7 +55,7 @@ class TestHelp:
         said = cli(command, '--help').stdout
         assert re.search(rf'Example:?\s+thermo_comp {command} ', said), said
         assert max(map(len, said.splitlines())) <= 80
-        # Square brackets are mark-up to the help's printer, and what stands in them is gone.
+        # The help printer takes square brackets as mark-up and drops their content.
         assert not re.search(r' \.\s', said)
         assert said == cli(command, '-h').stdout
 
@@ -86,7 +86,7 @@ class TestOutput:
         arguments = ('replay', bag, '-c', unit, '-o', tmp_path / 'out', '--serial', '', '--json')
         data = parsed(cli(*arguments).stdout)
         assert data['samples_in'] == data['samples_out'] == 8996
-        # A case reading after the very last sample takes effect at none.
+        # A case reading after the last sample never applies.
         assert data['flags'] <= data['counters']['n_case']
         arguments = ('evaluate', bag, '-c', unit, '--serial', '', '--json')
         data = parsed(cli(*arguments, code=None).stdout)
@@ -117,8 +117,8 @@ class TestOutput:
 
 
 def test_a_command_computes_in_one_thread() -> None:
-    # WHY: on two cores that are busy a fit took 16 times as long, waiting for its own threads.
-    # WHAT: numpy is not there yet when its library is told so; what a user has set holds.
+    # WHY: on two busy cores a fit took 16 times as long, as BLAS threads waited for each other.
+    # WHAT: the number of threads is set before numpy is imported; a user's setting stays.
     code = (
         'import os, sys; from thermo_comp.cli import app; '
         "app.run = lambda _: print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS']); "
@@ -138,7 +138,7 @@ def test_a_command_computes_in_one_thread() -> None:
 
 
 def on_a_terminal(*arguments: str, no_color: bool = False) -> str:
-    """Run the command line on a pseudo-terminal and return what it showed."""
+    """Run the command line on a pseudo-terminal and return its output."""
     leader, follower = pty.openpty()
     environment = {**os.environ, 'COLUMNS': '80', 'TERM': 'xterm-256color'}
     environment.pop('NO_COLOR', None)
@@ -157,7 +157,7 @@ def on_a_terminal(*arguments: str, no_color: bool = False) -> str:
     while True:
         try:
             part = os.read(leader, 65536)
-        except OSError:  # the other end is closed: the process has ended
+        except OSError:  # the process has ended and closed the other end
             break
         if not part:
             break
@@ -205,16 +205,16 @@ class TestSimulate:
             measured = block.accel.mean(axis=0) / truth['scale_factor']
             # Bias and drift of a MEMS unit are a few per cent of g at most.
             np.testing.assert_allclose(measured / 9.80665, truth['up'], atol=0.05)
-            # The first sample has both temperatures before it: what goes in can come out.
+            # Both temperatures come before the first sample, so that every sample is corrected.
             assert [one.after[0] for one in block.temperatures.values()] == [0, 0]
         assert len({tuple(up) for up in ups}) == 3
 
-    def test_a_plan_is_a_whole_test_of_a_sibling(self, tmp_path: Path, cli: Cli) -> None:
-        plan = ('--plan', 'tumble-1', '--unit', 'own-lags', '--sibling', '4')
+    def test_a_plan_is_a_whole_test(self, tmp_path: Path, cli: Cli) -> None:
+        plan = ('--plan', 'tumble-1', '--unit', 'demo')
         cli('simulate', *plan, '--rate-hz', '1', '-o', tmp_path / 'sim')
         infos = [inspect_recording(path) for path in sorted((tmp_path / 'sim').iterdir())]
         assert [round((info.end_ns - info.start_ns) / 6e10) for info in infos] == [*[20] * 18, 180]
-        assert {info.metadata['serial'] for info in infos} == {'own-lags-0001-04'}
+        assert {info.metadata['serial'] for info in infos} == {'demo-0001'}
         assert json.loads(infos[0].metadata['truth'])['profile'] == 'tumble-1'
 
     def test_a_seed_is_a_recording(self, tmp_path: Path, cli: Cli) -> None:
@@ -238,7 +238,7 @@ class TestInfo:
 
 
 class TestTopics:
-    """Inputs by name: from the command line, from a laboratory's file, or told by their type."""
+    """Inputs by name: from the command line, from a file, or chosen by their type."""
 
     @pytest.fixture
     def named(self, tmp_path: Path) -> Path:

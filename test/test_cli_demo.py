@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The demonstration does what it says: over real DDS, losing nothing, with the offline run's bits.
-"""
+"""The demonstration works as described: over real DDS, without loss, equal to the offline run."""
 
 from __future__ import annotations
 
@@ -28,8 +26,8 @@ def test_end_to_end(tmp_path: Path, cli: Cli) -> None:
     said = cli('demo', cwd=tmp_path).stdout
     assert 'messages in 15407, messages out 15407' in said
     assert 'bit for bit: yes' in said
-    # What it says is what the page of the command line shows, and the README in part; how fast it
-    # was is the machine's business.
+    # The output equals that on the page of the command line and, in part, in the README, except
+    # for the speed, which depends on the machine.
     speed = re.compile(r' in [\d.]+ s, \d+ times real time')
     assert is_alike(speed.sub('', said), speed.sub('', shown()['demo'][1])), said
     lines = speed.sub('', said).splitlines()
@@ -45,8 +43,8 @@ def test_end_to_end(tmp_path: Path, cli: Cli) -> None:
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', said, re.MULTILINE)
         assert len(rows) == 4, said
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # The drift is some hundred ug. A curve leaves what the regimes differ by, two what lags;
-        # the noise of 20 cycles of the converter is below 10 ug.
+        # The drift is some hundred ug. One set leaves the difference of the regimes, two sets
+        # leave the lags; the noise over 20 cycles of the converter is below 10 ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

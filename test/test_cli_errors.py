@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Bad input gets one clear line on stderr and an exit code, through the door that a user takes.
+Bad input gives one clear line on stderr and an exit code.
 
-1: the data or the result is bad. 2: the command line is wrong. Never a traceback (`cli` asserts
-that of every run), nothing on stdout, nothing left behind.
+1: the data or the result is bad. 2: the command line is wrong. There is never a traceback (`cli`
+checks every run), nothing on stdout and no file left.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def bag(
     n: int = 600,
     up: tuple[float, float, float] = (0.6, 0.0, 0.8),
 ) -> Path:
-    """Write a minute of a resting unit with the topics asked for."""
+    """Write a minute of a resting unit with the given topics."""
     stamps = START_NS + np.arange(n) * 100_000_000
     with BagWriter(path, metadata={'serial': serial} if serial else None) as writer:
         for topic, wanted in ((TOPICS.board, board), (TOPICS.case, case)):
@@ -55,7 +55,7 @@ def unit(tmp_path: Path) -> Path:
 
 
 def refused(cli: Cli, code: int, message: str, *arguments: str | Path) -> None:
-    """Run a command that must fail with exactly one line that says this."""
+    """Run a command that must fail with exactly one line that contains this text."""
     finished = cli(*arguments, code=code)
     lines = finished.stderr.splitlines()
     assert len(lines) == 1, finished.stderr
@@ -165,14 +165,14 @@ class TestBags:
         path = bag(tmp_path / 'bag', board=False)
         self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--topic board=')
         refused(cli, 1, r'temperature/board', 'evaluate', path, '-c', unit)
-        # A fit takes it for what it is.
+        # A fit recognises it.
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.8')
         assert 'no temperature was recorded' in cli('fit', path, *arguments).stdout
 
     def test_missing_case_temperature_is_no_error(
         self, cli: Cli, unit: Path, tmp_path: Path
     ) -> None:
-        # The regime falls back to the board sensor, as in the node.
+        # The regime is decided by the board thermometer, as in the node.
         path = bag(tmp_path / 'bag', case=False)
         said = cli('replay', path, '-c', unit, '-o', tmp_path / 'out').stdout
         assert '600 of 600 samples corrected' in said
@@ -234,22 +234,22 @@ class TestEvaluations:
     def test_a_calibration_that_does_not_hold_is_exit_code_1(
         self, cli: Cli, tmp_path: Path
     ) -> None:
-        # The unit rests at 20 degC and reads exactly g; the calibration puts 50 mg of bias on it
-        # through a function of temperature that has no business there.
+        # The unit rests at 20 degC and reads exactly g; the calibration wrongly adds 50 mg of bias
+        # through a temperature function.
         wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
         sets = regime_set(wrong, wrong, wrong)
         save_calibration(calibration(static=sets, dynamic=sets), tmp_path / 'wrong.yaml')
         path = tmp_path / 'bag'
         stamps = START_NS + np.arange(3000) * 100_000_000
         level = np.tile([0.0, 0.0, 300.0 * 9.80665], (3000, 1))
-        # The output of a sensor that lives is never constant.
+        # The output of a working sensor is never constant.
         level[:, :2] += np.random.default_rng(2).integers(-1, 2, (3000, 2))
         with BagWriter(path) as writer:
             writer.write_temperature(TOPICS.board, stamps[::10], np.full(300, 20.0))
             writer.write_counts(TOPICS.counts, stamps, level)
         finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
         assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-        # This one takes 10 mg of bias back that its constants put on; it claims nothing.
+        # This calibration corrects the 10 mg of its constants again, and has no covariance.
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
         axes = Axes(*[AxisReference(300.0, -30.0)] * 3)

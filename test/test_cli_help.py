@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a terminal shows can be believed: examples run, JSON parses, quiet is quiet, lines fit."""
+"""
+The output on a terminal is right: examples run, JSON parses, --quiet prints nothing, lines fit.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 
 def leaves(group: Any, prefix: str = '') -> dict[str, Any]:
-    """Return every command by the words that call it, those of groups included."""
+    """Return every command by the words that call it, including those of groups."""
     found: dict[str, Any] = {}
     for name, one in group.commands.items():
         inner = hasattr(one, 'commands')
@@ -28,17 +30,17 @@ def leaves(group: Any, prefix: str = '') -> dict[str, Any]:
 
 
 COMMANDS = leaves(get_command(app))
-# `demo` runs whole in test_readme and test_cli_demo.
+# `demo` is run by test_cli_demo.
 EXAMPLES = [
     line.strip()
     for name, command in COMMANDS.items()
     if name != 'demo'
     for line in re.findall(r'^ +(thermo_comp .*)$', command.help or '', re.MULTILINE)
 ]
-# As a user starts it; all others run in this process.
+# This example runs in a separate process, all others in this one.
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
-# Of each command that prints figures and ends by itself: what listens does not;
-# play, report and fit have theirs in test_cli, test_cli_errors and test_docs.
+# One example of each command that prints figures and ends by itself; `play`, `report` and `fit`
+# are tested in test_cli, test_cli_errors and test_docs.
 WITH_JSON = list(
     {
         one.split()[1]: one
@@ -73,7 +75,7 @@ def test_the_example_runs_and_fits_a_pipe(example: str, desk: Desk, program: Cli
     finished = desk.run(example, program if example == OF_ITS_OWN else None)
     assert '\x1b' not in finished.stdout + finished.stderr
     long = [line for line in finished.stdout.splitlines() if len(line) > 80]
-    # Prose is wrapped by the terminal; a table must not be.
+    # The terminal wraps prose; a table must not be wrapped.
     assert [line for line in long if not line.startswith('- ') and '  ' in line.strip()] == []
 
 
@@ -99,7 +101,7 @@ def test_commands_that_print_figures_have_json() -> None:
 
 @pytest.mark.parametrize('name', COMMANDS)
 def test_help_cuts_no_name(name: str, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
-    # WHY: a terminal of 80 columns showed `--reference-tempera…`, which nobody can type.
+    # WHY: a terminal of 80 columns showed `--reference-tempera…`, an incomplete option name.
     monkeypatch.setattr(rich_utils, 'MAX_WIDTH', 80)
     said = cli(*name.split(), '--help').stdout
     assert '…' not in said

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The table of columns: the bank, what it needs remembered, and each value by hand."""
+"""The table of columns: all columns, the memory they need, and each value by hand."""
 
 from __future__ import annotations
 
@@ -40,12 +40,14 @@ def test_the_bank():
     assert tuple(60.0 * 2.0**k for k in range(8)) == BANK_TAUS
     assert pytest.approx([60.0 * 2.0 ** (k / 2) for k in range(15)]) == FINE_TAUS
     assert by_group(bank()) == {
-        'now': 1, 'board': 15, 'neighbour': 15, 'product': 16, 'mixed': 9, 'square': 24,
-        'even': 21, 'play': 20,
+        'gradient': 1, 'board': 15, 'gradient_lag': 15, 'product': 16,
+        'gradient_x_temperature': 9, 'square': 24,
+        'gradient_even': 21, 'play': 20,
     }  # fmt: skip
     assert by_group(bank(('case', 'tip'))) == {
-        'now': 2, 'board': 15, 'neighbour': 30, 'product': 16, 'mixed': 18, 'square': 24,
-        'even': 42, 'play': 20,
+        'gradient': 2, 'board': 15, 'gradient_lag': 30, 'product': 16,
+        'gradient_x_temperature': 18, 'square': 24,
+        'gradient_even': 42, 'play': 20,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
     # Knees within the temperatures seen, for the board and for parts that lag it.
@@ -57,12 +59,12 @@ def test_the_bank():
 
 def test_change_is_even_about_rest():
     warm = bank(('case', 'tip'), {'case': -0.5, 'tip': 0.0})
-    change = [column for column in warm if column.group == 'change']
-    assert by_group(warm)['change'] == 21
+    change = [column for column in warm if column.group == 'gradient_even_about_rest']
+    assert by_group(warm)['gradient_even_about_rest'] == 21
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((Layout(MemorySpec(('case', 'tip'))).width, 3))
-    # At rest, and as far to either side of it.
+    # At the gradient at rest, and equally far on either side.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -74,7 +76,7 @@ def test_change_is_even_about_rest():
 def test_what_the_bank_needs_remembered():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
-    # Lags of their own for the plays that follow one.
+    # Separate lags for the plays that follow a lag.
     assert spec.taus('board') == tuple(sorted((*FINE_TAUS, 450.0, 900.0, 1800.0)))
     assert spec.taus('case') == spec.taus('tip') == FINE_TAUS
     assert len(spec.plays) == 20
@@ -85,20 +87,20 @@ def test_what_the_bank_needs_remembered():
 
 def test_each_value_by_hand():
     columns = [
-        Column('now', 'now', 'tip', **WIDE),
+        Column('gradient', 'gradient', 'tip', **WIDE),
         Column('rate', 'rate', **WIDE),
         Column('board', 'board', tau_s=60.0, **WIDE),
-        Column('neighbour', 'neighbour', 'tip', 120.0, **WIDE),
-        Column('product', 'neighbour', 'tip', 120.0, power=1, **WIDE),
-        Column('even', 'even', 'case', width_k=1.5, power=2, **WIDE),
+        Column('gradient_lag', 'gradient_lag', 'tip', 120.0, **WIDE),
+        Column('product', 'gradient_lag', 'tip', 120.0, power=1, **WIDE),
+        Column('gradient_even', 'gradient_even', 'case', width_k=1.5, power=2, **WIDE),
         Column('play', 'play', tau_s=60.0, width_k=0.4, **WIDE),
         Column('board', 'board', tau_s=60.0, range=(-0.25, 0.25)),
         Column('board', 'board', tau_s=60.0, during='static', **WIDE),
         Column('board', 'board', tau_s=60.0, during='dynamic', power=3, **WIDE),
         Column('square', 'square', tau_s=60.0, **WIDE),
-        Column('even', 'square', 'tip', power=1, **WIDE),
-        Column('even', 'size', 'tip', **WIDE),
-        Column('even', 'size', 'tip', power=1, range=(0.0, 0.5)),
+        Column('gradient_even', 'square', 'tip', power=1, **WIDE),
+        Column('gradient_even', 'size', 'tip', **WIDE),
+        Column('gradient_even', 'size', 'tip', power=1, range=(0.0, 0.5)),
         Column('bend', 'bend', knee_k=2.0, **WIDE),
         Column('bend', 'bend', tau_s=60.0, knee_k=2.0, **WIDE),
         Column('bend', 'bend', tau_s=60.0, knee_k=2.6, **WIDE),
@@ -116,7 +118,7 @@ def test_each_value_by_hand():
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0, 1.0, 0.5, 0.0,
     ]  # fmt: skip
     assert found == pytest.approx(expected)
-    # t is held at the edge of the calibrated temperatures, the lag itself is not.
+    # t is limited to the calibrated temperatures, the lag is not.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
     assert at_edge[2] == 0.5
@@ -136,7 +138,7 @@ def test_a_bend_moves_with_the_board_and_its_lag() -> None:
     assert not table.slopes(state).any()
     assert not table.board_slopes(state).any()
     assert (
-        ColumnTable([Column('now', 'now', **WIDE)], MemorySpec(), 20.0).board_slopes(
+        ColumnTable([Column('gradient', 'gradient', **WIDE)], MemorySpec(), 20.0).board_slopes(
             np.zeros((7, 1))
         )
         is None
@@ -160,10 +162,10 @@ def test_one_state_has_the_bits_of_many(boards):
         np.testing.assert_array_equal(table.values(states[:, [k]])[:, 0], many[:, k])
 
 
-def test_lags_of_a_neighbour_in_a_ramp():
-    # The gradient of a sensor that runs away from the board at r K/s: L = r (t - tau (1 - e)).
+def test_lags_of_a_gradient_in_a_ramp():
+    # The gradient of a sensor that departs from the board at r K/s: L = r (t - tau (1 - e)).
     rate, n = 0.002, 3000
-    columns = [Column('neighbour', 'neighbour', 'tip', tau, **WIDE) for tau in BANK_TAUS]
+    columns = [Column('gradient_lag', 'gradient_lag', 'tip', tau, **WIDE) for tau in BANK_TAUS]
     spec = memory_of(columns, ('case', 'tip'))
     tracker = ThermalTracker(DetectorSettings(), spec)
     for second in range(n + 1):
@@ -173,7 +175,7 @@ def test_lags_of_a_neighbour_in_a_ramp():
     state = np.array(tracker.sample(n * SECOND_NS))[:, np.newaxis]
     found = ColumnTable(columns, spec, 20.0).values(state)[:, 0]
     expected = [rate * (n - tau * -math.expm1(-n / tau)) for tau in BANK_TAUS]
-    # The thermometer needs some readings to bend into the ramp: a few mK.
+    # The thermometer needs some readings to follow the ramp: a few mK.
     assert found == pytest.approx(expected, abs=0.02)
 
 
@@ -187,4 +189,4 @@ def test_lags_of_a_neighbour_in_a_ramp():
 )
 def test_refusals(keys, message):
     with pytest.raises(ValueError, match=message):
-        Column(**{'group': 'now', 'kind': 'now', **keys})
+        Column(**{'group': 'gradient', 'kind': 'gradient', **keys})

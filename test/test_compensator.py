@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The compensator against hand numbers, Monte Carlo, and itself: stream = batch, chunked = whole.
+The compensator against hand calculations and Monte Carlo; single samples equal blocks of any cut.
 """
 
 import math
@@ -31,12 +31,13 @@ from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.correction import Correction
 
 UNIQUE = [0, 1, 2, 4, 5, 8]
-#: One message of the plain unit: density^2 / cycle, and a converter that carries its remainder on.
+#: Variance of one message of the plain unit: density^2 / cycle, plus the rounding of a converter
+#: that carries its remainder on.
 NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
 def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
-    """Feed steady readings; with a flicker, as a sensor that is alive gives them."""
+    """Feed steady readings; with a flicker, so that they are not taken for stuck."""
     for second in range(start_s, until_s):
         noise = flicker * (-1) ** second
         compensator.push('board', second * SECOND_NS, celsius + noise)
@@ -45,9 +46,9 @@ def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=
 
 def stream(compensator, events):
     """
-    Run events one by one; return the rows and the positions of the published samples.
+    Run events one by one; return the rows and the indices of the published samples.
 
-    With a gyroscope a row goes on with the rate, of one unit in a thousand of the sample.
+    With a gyroscope a row also contains the rate, a thousandth of the sample.
     """
     rows, index = [], []
     position = 0
@@ -92,10 +93,10 @@ def test_signed_counts_and_the_printed_equations():
     offset, K = 12.0, 300.0
     plus = K * GRAVITY + offset
     minus = -K * GRAVITY + offset
-    # method.md: offset = half sum, centred count = half difference, for signed counts.
+    # Signed counts: offset = half the sum, centred count = half the difference.
     assert (plus + minus) / 2.0 == pytest.approx(offset)
     assert (plus - minus) / 2.0 == pytest.approx(K * GRAVITY)
-    # As printed, Eq. (3) and (4), the two are exchanged: the "offset" would be the whole signal.
+    # Eq. (3) and (4) as printed exchange the two: the "offset" would be the whole signal.
     assert (plus - minus) / 2.0 != pytest.approx(offset)
     compensator = Compensator(calibration(axes=Axes(*[AxisReference(K, offset)] * 3)))
     warm(compensator)
@@ -110,7 +111,7 @@ def test_every_term_by_hand():
     unit = calibration(
         axes=Axes(*[AxisReference(300.0, 7.0)] * 3),
         static=regime_set(one, one, one),
-        response=(term('now', (9.0,) * 3, (9.0,) * 3, range=(-0.05, 0.05)),),
+        response=(term('gradient', (9.0,) * 3, (9.0,) * 3, range=(-0.05, 0.05)),),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (2e-3, -3e-3, 1.0)),
     )
     compensator = Compensator(unit)
@@ -124,7 +125,7 @@ def test_every_term_by_hand():
 
 
 def test_gradient_has_the_sign_of_the_ramp():
-    unit = calibration(response=(term('now', (30.0,) * 3),))
+    unit = calibration(response=(term('gradient', (30.0,) * 3),))
     for sign in (1.0, -1.0):
         compensator = Compensator(unit)
         warm(compensator, 20.0, 20.0 + sign * 2.0, until_s=300)
@@ -132,15 +133,17 @@ def test_gradient_has_the_sign_of_the_ramp():
         assert x == pytest.approx(-sign * 30.0 * 2.0 / 300.0, rel=1e-6)
 
 
-#: For every example: a calibration does not change.
+#: One calibration for all examples, as it does not change.
 RICH = rich_calibration()
 
-#: What a converter never gives, is at its rails or nothing; most samples lie between.
+#: Values that a converter never gives, its limits, and zero; most samples are between the limits.
 STRANGE = (math.nan, math.inf, -math.inf, 32767.0, -32768.0, 0.0, -0.0, 5e-324)
 
 
 def event_list(seed):
-    """Any order of messages: late, doubled, going back, not finite, saturated, in two clocks."""
+    """
+    Make messages in any order: late, repeated, jumping back, not finite, saturated, in two clocks.
+    """
     rng = random.Random(seed)
     events = []
     stamp = rng.choice([0, rng.randrange(2**60)])
@@ -163,12 +166,12 @@ def event_list(seed):
     return events
 
 
-#: Drawn by seed: hypothesis takes as long to draw them piece by piece as the test to judge them.
+#: Drawn by seed, as drawing the single messages with hypothesis takes as long as the test.
 event_lists = st.integers(0, 2**64 - 1).map(event_list)
 
 
 def at_seconds(*events):
-    """Make events of letters and seconds: samples, or readings of the board, of the case."""
+    """Make events from letters and seconds: samples (A), board (B) and case (C) readings."""
     kinds = {'A': ('accel', (0.0, 0.0, 1.0)), 'B': ('board', 0.0), 'C': ('case', 0.0)}
     return [
         (kinds[kind][0], int(seconds * SECOND_NS), kinds[kind][1])
@@ -176,8 +179,8 @@ def at_seconds(*events):
     ]
 
 
-# Which of the readings that wait are of another clock is told by the order in which they came,
-# across the cuts, too: behind one from tomorrow, and behind one that took effect in between.
+# Which waiting readings are of another clock depends on their order of arrival, also across cuts:
+# after a reading from tomorrow, and after one that was applied in between.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -199,7 +202,7 @@ def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, trans
 
 
 def assert_sound(block, counters, events):
-    """Hold that whatever comes in, what goes out is finite, in order and counted."""
+    """Check that the output is finite, in order and counted for any input."""
     assert np.isfinite(block.specific_force).all()
     assert np.isfinite(block.angular_rate).all()
     assert np.isfinite(block.angular_rate_variance).all()
@@ -219,7 +222,7 @@ def test_long_run_batch_equals_stream(rng):
     for k in range(40_000):
         stamp = 1_790_000_000 * SECOND_NS + k * 40_000_000
         if k % 25 == 0:
-            # A soak, so that the regime is known, then a slow wave of +-14 K.
+            # A soak, so that the regime becomes known, then a slow wave of +-14 K.
             case = 20.0 + 14.0 * math.sin(max(k / 25.0 - 1000.0, 0.0) / 300.0)
             events.append(('board', stamp, case - 2.0 + 0.005 * rng.standard_normal()))
             events.append(('case', stamp, case + 0.005 * rng.standard_normal()))
@@ -263,10 +266,11 @@ def test_beyond_the_range_curves_go_on_along_their_tangent_and_the_covariance_gr
     assert outside.excess.temperature == pytest.approx(6.0, abs=1e-6)
     assert outside.excess.relative == pytest.approx(6.0 / 15.0, rel=1e-6)
     for axis, raw in enumerate((10.0, 20.0, 3000.0)):
-        # Straight lines are their tangents: at 41 degC t is 21 K.
+        # The tangent of a straight line is the line: t is 21 K at 41 degC.
         bias, scale = 0.5 * 21.0, 300.0 * (1.0 + 1e-4 * 21.0)
         assert out[axis] == pytest.approx((raw - bias) / scale, abs=1e-8)
-    # At the least the slope at the edge times the excess: 0.5 counts/K * 6 K / 300 counts.
+    # The error is at least the slope at the edge times the excess: 0.5 counts/K * 6 K / 300
+    # counts.
     assert math.sqrt(out[3]) > 0.5 * 6.0 / 300.0
     assert out[3] - NOISE > 100.0 * (edge[3] - NOISE)
 
@@ -278,7 +282,7 @@ def test_unknown_regime_is_paid_for_in_the_covariance():
     early = compensator.process(SECOND_NS // 2, 0.0, 0.0, 1.0)
     warm(compensator, until_s=1500, start_s=1)
     late = compensator.process(1500 * SECOND_NS, 0.0, 0.0, 1.0)
-    # The sets disagree by 3 counts = 0.01 m/s^2 on x, by nothing on y.
+    # The sets differ by 3 counts = 0.01 m/s^2 on x, and not on y.
     assert early[3] == pytest.approx(NOISE + 0.01**2, rel=1e-6)
     assert early[6] == pytest.approx(NOISE, rel=1e-6)
     assert late[3] == pytest.approx(NOISE, rel=1e-6)
@@ -306,10 +310,10 @@ def test_bad_samples_are_dropped_and_counted():
     bad = [(math.nan, 0, 0), (0, math.inf, 0), (0, 0, 32767.0), (-32768.0, 0, 0), (0, 0, 0)]
     for k, sample in enumerate(bad):
         assert compensator.process(k + 1, *map(float, sample)) is None
-    assert compensator.process(5, 0.0, 0.0, 1.0) is None  # the stamp of the last one again
+    assert compensator.process(5, 0.0, 0.0, 1.0) is None  # repeats the previous stamp
     counters = compensator.counters
     assert (counters.n_not_finite, counters.n_saturated, counters.n_out_of_order) == (2, 2, 1)
-    # Three exact zeros are a dead wire.
+    # Three exact zeros are a broken wire.
     assert counters.n_stuck == 1
     assert counters.n_in == 6
 
@@ -318,13 +322,13 @@ def test_bad_samples_are_dropped_and_counted():
     'run', [lambda *given: stream(*given)[1], lambda *given: batch(*given).index.tolist()]
 )
 def test_a_stamp_that_leaps_ahead_needs_a_second_one(run):
-    # WHY: one stamp 20 s ahead made all samples after it late, and the memory began anew.
+    # WHY: a single stamp 20 s ahead made all later samples late and reset the memory.
     leap, step = 20 * SECOND_NS, SECOND_NS // 100
     usual = np.arange(1, 6) * step
     for stamps, kept in (
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
-        (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),  # a true gap
-        # Two damaged ones, apart; and one more that goes back from the leap.
+        (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),  # a real gap
+        # Two separate damaged stamps; and one that is before the leap.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -370,9 +374,10 @@ def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
 @pytest.mark.parametrize('ahead_s', [0, 2])
 def test_readings_of_a_long_time_without_samples_all_count(n_before, ahead_s):
     """
-    WHY: of thermometers at 50 Hz that came 41 s ahead of the samples, a block lost the newest.
+    WHY: of thermometers at 50 Hz that arrived 41 s before the samples, a block lost the newest
+    readings.
 
-    WHAT: those of any silence take effect in their order, as in a node that waits meanwhile.
+    WHAT: readings of a silence of any length are applied in order, as in a node.
     """
     first = [('accel', k * SECOND_NS // 100, (1.0, 2.0, 2930.0)) for k in range(1, 1 + n_before)]
     readings = [
@@ -380,7 +385,7 @@ def test_readings_of_a_long_time_without_samples_all_count(n_before, ahead_s):
         for k in range(10, 50 * 120)
         for name in ('board', 'case')
     ]
-    # Some readings are stamped later than the sample behind them.
+    # Some readings have later stamps than the sample after them.
     after_ns = (120 - ahead_s) * SECOND_NS
     last = [('accel', after_ns + k * SECOND_NS // 100, (1.0, 2.0 + k, 2930.0)) for k in range(5)]
     block, live = (Compensator(replace(rich_calibration(), gyroscope=None)) for _ in range(2))
@@ -430,7 +435,7 @@ def test_empty_block():
 
 
 def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
-    # 0.025 counts = 8.5 ug: what neither time stretches
+    # 0.025 counts = 8.5 ug, independent of time
     unit = calibration(dynamic=regime_set(axis_set(delta=0.025)))
     compensator = Compensator(
         unit,
@@ -453,12 +458,12 @@ def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, 1e200])
 def test_what_is_not_finite_is_never_published_whatever_led_to_it(monkeypatch, bad):
-    # WHY: the last line of defence, behind the bounds of a calibration and its trial.
+    # WHY: this is the last check, after the bounds of a calibration and its trial.
     line = Correction.line
 
     def broken(self, start, end, slow, excess):
         found = line(self, start, end, slow, excess)
-        # The second and the third second of the stamps' whole run.
+        # The second and third of the whole seconds of the stamps.
         at = np.asarray(start)[0]
         found[0] = np.where((at > 21.0) & (at < 23.0), bad, found[0])
         return found

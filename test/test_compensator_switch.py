@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sets and calibrations that change over while samples come: no step, no sample lost."""
+"""Switches of sets and calibrations between samples cause no step and lose no sample."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from thermo_comp.unit.calibration import Axes, AxisReference
 
 
 def test_switch_makes_no_step():
-    # The sets differ by 5 counts = 1.7 mg: at the longest over 300 s, at 100 Hz 0.057 ug a sample.
+    # The sets differ by 5 counts = 1.7 mg: over at most 300 s, at 100 Hz, 0.057 ug per sample.
     unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
     compensator = Compensator(
         unit, CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)

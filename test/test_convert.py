@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A table becomes a bag in which every row is accounted for, and comes back from it unchanged."""
+"""A converted table accounts for every row, and converts back unchanged."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STEP_NS = 10_000_000
 
 
 def table(path: Path, n: int = 400, scale: float = 1.0) -> tuple[Path, dict[str, np.ndarray]]:
-    """Write a still log with slow temperatures that are held between their own readings."""
+    """Write a log at rest with slow temperatures that are held between their readings."""
     rng = np.random.default_rng(1)
     columns = {
         'ms': 1000 + 10 * np.arange(n),
@@ -74,15 +74,16 @@ def test_round_trip_through_the_bag(tmp_path: Path) -> None:
         np.column_stack([columns[k] for k in ['wx', 'wy', 'wz']]),
         rtol=1e-14,  # one rounding in each direction
     )
-    # The orientation is not there and says so; the rate is there with a covariance not known.
+    # The missing orientation is marked; the rate has an unknown covariance.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
     assert not block.imu.angular_velocity_covariance.any()
-    # A held value is one message: 4 levels of the case, 10 of the board, each when it came.
+    # A held value is one message: 4 levels of the case, 10 of the board, at the time of each
+    # change.
     case, board = block.temperatures['case'], block.temperatures['board']
     assert case.celsius.tolist() == [20.0, 20.5, 21.0, 21.5]
     assert case.stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
     assert len(board.celsius) == report.messages['board'] == 10
-    # A reading stands before the sample of its own stamp: a node has it when the sample comes.
+    # A reading comes before the sample of the same stamp, so that a node has it in time.
     assert case.after.tolist() == [0, 100, 200, 300]
     assert (report.rows, report.messages['accel']) == (400, 400)
     assert report.rate_hz == pytest.approx(100.0)
@@ -163,10 +164,10 @@ def test_every_odd_row_is_accounted_for(tmp_path: Path) -> None:
     assert (report.findings['backwards'].count, report.findings['backwards'].lines) == (1, (43,))
     assert (report.findings['repeated'].count, report.findings['repeated'].lines) == (1, (52,))
     assert len(block) == report.messages['accel'] == 397
-    # The clipped row and the disorder are the node's to judge: they are in the bag as they were.
+    # The clipped row and the wrong order stay in the bag for the node to judge.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
-    # The log time keeps the file's order, where the stamps do not.
+    # The log time keeps the order of the file where stamps do not.
     assert (np.diff(block.log_ns['accel']) >= 0).all()
 
 
@@ -175,7 +176,7 @@ def test_a_fixed_rate_gathers_no_rounding(tmp_path: Path) -> None:
     write_log(table_log(path, column_map(stamp={'rate_hz': 3.0})), tmp_path / 'bag')
     stamps = read_recording(tmp_path / 'bag').columns.accel_stamp_ns
     assert stamps[0] == 10**9
-    # Each stamp is the nearest integer to its own multiple of 1/3 s, and not of 0.333333333 s.
+    # Each stamp is the integer nearest to a multiple of 1/3 s, not of 0.333333333 s.
     assert stamps[-1] == 10**9 + round(299 * 1e9 / 3.0)
 
 
@@ -373,7 +374,7 @@ class TestCommand:
 
 
 class TestFreezer:
-    """A real MPU6050 in a freezer, with all the faults a real log has."""
+    """A real MPU6050 in a freezer, with all faults of a real log."""
 
     @pytest.fixture
     def path(self, real_data: Path) -> Path:
@@ -387,7 +388,7 @@ class TestFreezer:
         report = write_log(table_log(path, columns), tmp_path / 'bag')
         assert report.rows == report.messages['accel'] == 24514
         assert report.findings['clipped'].count == 7
-        # Handled before 49 s and after 1945 s of its clock, which starts at 1.5 s.
+        # It was handled before 49 s and after 1945 s of its clock, which starts at 1.5 s.
         first, last = report.stillness.moving_ns[0], report.stillness.moving_ns[-1]
         assert first[0] == report.log.stamp_ns[0]
         assert first[1] * 1e-9 == pytest.approx(49.0, abs=3.0)
@@ -402,5 +403,5 @@ class TestFreezer:
         n_barometer = len(block.temperatures['barometer'].celsius)
         assert report.messages['barometer'] == n_barometer
         assert report.messages.keys() == {'accel', 'board', 'case', 'barometer'}
-        # The air sensor holds its value between readings of its own: fewer messages than rows.
+        # The air sensor holds its value between its readings, so it has fewer messages than rows.
         assert report.messages['case'] < 0.75 * report.rows

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Other people's bags: topics of any name, ROS 1 and 2, and units that are checked at rest."""
+"""Bags by others: topics of any name, ROS 1 and 2, and units checked at rest."""
 
 from __future__ import annotations
 
@@ -80,8 +80,7 @@ def test_topics_of_any_name_become_ours(tmp_path, rng, ros):
     )
     np.testing.assert_allclose(found.columns.accel.mean(axis=0), (0.0, 0.1 * G, G), atol=0.02)
     np.testing.assert_array_equal(found.columns.imu.angular_velocity[0], (0.01, 0.0, 0.5))
-    # The thermometer in the Imu's namespace is the board's; temperatures begin at the name's
-    # length here.
+    # The thermometer in the namespace of the Imu is the board's.
     np.testing.assert_array_equal(
         found.columns.temperatures['board'].celsius, len('/mpu/die') + np.arange(8)
     )
@@ -114,7 +113,7 @@ def present(imu, temperature=(), pressure=()):
         ((), (), None, None),
         (('/t',), (), '/t', None),
         (('/imu/t', '/air'), (), '/imu/t', '/air'),
-        # The one beside the barometer is the case's, even alone.
+        # The thermometer beside the barometer is the case's, even without another.
         (('/baro/t',), ('/baro/p',), None, '/baro/t'),
         (('/imu/t', '/baro/t', ), ('/baro/p',), '/imu/t', '/baro/t'),
         (('/robot/imu/t', '/robot/baro/t'), ('/robot/baro/p',), '/robot/imu/t', '/robot/baro/t'),

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-ArduPilot logs: what a hand-written DataFlash file holds comes out of the bag, sensor by sensor.
+ArduPilot logs: a converted DataFlash file gives the data of each sensor.
 
 The writer below follows the public description of the format and shares no code with the reader.
 """
@@ -93,13 +93,13 @@ def test_new_instances(tmp_path, rng, imu, baro):
         bag.accel_stamp_ns, (2_000_000 + np.arange(N) * STEP_US + imu) * 1000
     )
     np.testing.assert_array_equal(bag.accel, force[imu])
-    # 0.3 passed through a float32.
+    # 0.3 rounded to float32.
     np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
-    # The chip's temperature stands still for ten samples: only its changes are messages.
+    # The chip's temperature is constant for ten samples; only its changes are messages.
     np.testing.assert_array_equal(
         bag.temperatures['board'].celsius, 30.0 + imu + 0.25 * np.arange(N // 10)
     )
-    # The barometer's is stored in hundredths of a degree.
+    # The barometer's temperature is stored in hundredths of a degree.
     hundredths = (2000 + np.arange(0, N, 10)) if baro == 0 else (1500 - np.arange(0, N, 10))
     np.testing.assert_allclose(bag.temperatures['case'].celsius, hundredths / 100, rtol=1e-15)
 
@@ -127,7 +127,7 @@ def test_old_types_are_the_instances(tmp_path, rng):
 
 
 def test_chip_without_a_thermometer(tmp_path, rng):
-    # ArduPilot writes 0 where a driver gives no temperature.
+    # ArduPilot writes 0 if a driver gives no temperature.
     log = DataflashWriter()
     log.define('IMU', *NEW_IMU)
     for k, force in enumerate(still(rng)):
@@ -143,7 +143,7 @@ def test_corrected_log_is_refused(tmp_path, rng):
     with pytest.raises(RecordingError, match=r'INS_TCAL1_ENABLE was 1.*already'):
         read_autopilot(path)
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
-    # The second IMU's drift was left as it is.
+    # The drift of the second IMU was not corrected.
     assert len(read_autopilot(path, imu=1).stamp_ns) == N
 
 
@@ -153,10 +153,10 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
 @pytest.mark.parametrize(
     ('course', 'kept', 'share'),
     [
-        # Switched on in flight, and off again.
+        # Switched on in flight, then off.
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log of learning was refused, because ArduPilot sets 1 when it has learnt.
+        # WHY: a log of the learning was refused, because ArduPilot sets 1 after it.
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )
@@ -167,7 +167,7 @@ def test_what_was_corrected_is_left_out(tmp_path, rng, course, kept, share):
     np.testing.assert_array_equal(read.accel, force[0][kept])
     assert f'INS_TCAL1_ENABLE was 1 for {share} % of the samples' in read.chosen
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
-    # The temperatures go on: the fit needs to know what the unit went through.
+    # The temperatures continue, as the fit needs the thermal history.
     assert len(read.temperatures['board'].celsius) > 1
 
 
@@ -219,7 +219,7 @@ def test_damaged_formats_are_refused(tmp_path, rng, columns, message):
     log.write('IMU', 1000, 0, *np.zeros(6), 0, 0, 30.0, 1, 1, 1000, 1000)
     body = bytearray(log.body)
     if 'longer' in message:
-        # The length in the second FMT message, which stands after the first one's 89 bytes.
+        # The length in the second FMT message, which follows the 89 bytes of the first.
         body[89 + 4] -= 10
     path = tmp_path / 'damaged.BIN'
     path.write_bytes(body)
@@ -231,7 +231,7 @@ def test_absurd_stamps_are_no_stamps(tmp_path, rng):
     path = tmp_path / 'jump.BIN'
     write_new(path, rng)
     body = bytearray(path.read_bytes())
-    # The first IMU message's time, all ones: half a million years.
+    # The time of the first IMU message, with all bits set: half a million years.
     at = body.index(b'\xa3\x95\x81') + 3
     body[at : at + 8] = b'\xff' * 8
     path.write_bytes(body)

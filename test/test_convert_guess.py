@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of numbers alone: their columns are told by what they hold, or the user is asked."""
+"""The columns of tables with numbers only are recognised by content, or the user is asked."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], 400, axis=0
 
 
 def write(path: Path, rng: np.random.Generator, unit: float, **columns: np.ndarray) -> Path:
-    """Write three rests, with what else there is before and behind."""
+    """Write three rests with other data before and after."""
     accel = unit * (UP + 0.002 * rng.standard_normal(UP.shape))
     parts = [columns['time'][:, None]] if 'time' in columns else []
     parts += [accel, columns['rate']] if 'rate' in columns else [accel]
@@ -60,7 +60,7 @@ def test_the_unit_of_times_is_that_of_a_sample_rate(
 def test_a_second_is_told_from_a_millisecond_by_how_fast_a_hand_turns(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    # WHY: samples at 1 Hz were taken for some at 1 kHz. Half a turn takes one second, or 0.8 s.
+    # WHY: samples at 1 Hz were taken for 1 kHz. Half a turn takes 1 s or 0.8 s.
     angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
     ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
     for turned, unit in ((angle, 's'), (ramp, 'ms')):
@@ -75,7 +75,7 @@ def test_a_second_is_told_from_a_millisecond_by_how_fast_a_hand_turns(
 def test_short_rests_at_1_hz_tell_their_unit(
     tmp_path: Path, rng: np.random.Generator, rest_s: int, gap_s: int
 ) -> None:
-    # WHY: cells of 30 samples and more held two rests, of which the mean is shorter than gravity.
+    # WHY: cells of 30 and more samples contained two rests, whose mean is shorter than gravity.
     ups = positions(18, 1)
     accel = np.repeat(ups, rest_s, axis=0) + 2e-5 * rng.standard_normal((18 * rest_s, 3))
     times = (np.arange(18)[:, None] * (rest_s + gap_s) + np.arange(rest_s)).ravel()

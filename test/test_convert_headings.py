@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables as other programs write them: headings, dates with zones, words of 24 bits."""
+"""Tables of other programs: headings, dates with time zones, 24-bit words."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
     ('text', 'seconds'),
     [
         ('2026-03-29T01:30:00Z', 0),
-        ('2026-03-29 01:30:00', 0),  # without a zone it is UTC
+        ('2026-03-29 01:30:00', 0),  # without a zone: UTC
         ('2026-03-29T03:30:00.5+02:00', 0.5),
         ('2026-03-29T03:30:00+0200', 0),  # GGIR
         ('2026-03-29 03:30:00.250+0200 [Europe/Paris]', 0.25),  # actipy
@@ -52,7 +52,7 @@ def test_what_is_no_date_is_no_stamp(text: str) -> None:
 
 
 def times(kind: str) -> list[str]:
-    """Write the stamps of the rows as a program does."""
+    """Write the stamps of the rows in a program's format."""
     if kind == 'pandas':
         zone = timezone(timedelta(hours=2))
         ticks = (START.astimezone(zone) + timedelta(microseconds=k * 10**4) for k in range(N))
@@ -94,7 +94,7 @@ def test_a_table_is_read_by_its_headings(
     columns = guess_columns(path)
     assert columns.stamp.unit == unit
     assert columns.accel.unit == ('g' if one_g == 1.0 else 'm/s^2')
-    # What is printed is the map, and read back the same.
+    # The printed map gives the same when it is read back.
     (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(columns)))
     assert load_column_map(tmp_path / 'map.yaml') == columns
     log = table_log(path, columns)
@@ -109,7 +109,7 @@ def test_a_table_is_read_by_its_headings(
 def test_a_parquet_table_is_read_by_its_headings(
     tmp_path: Path, rng: np.random.Generator, kind: str
 ) -> None:
-    # WHY: Parquet needed a column map, although it states more than text does.
+    # WHY: Parquet needed a column map, although it contains more information than text.
     pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
     import pyarrow.parquet as pq
 
@@ -161,7 +161,7 @@ def test_headings_that_name_nothing_are_listed(tmp_path: Path) -> None:
 
 
 def test_headings_without_a_time_take_a_rate(tmp_path: Path, rng: np.random.Generator) -> None:
-    # WHY: --rate-hz was for tables without headings alone, and not heard with them.
+    # WHY: --rate-hz only worked for tables without headings, and was ignored with them.
     path, rows = tmp_path / 'log.csv', UP + 0.002 * rng.standard_normal(UP.shape)
     path.write_text('\n'.join(['ax,ay,az', *(f'{x:.5f},{y:.5f},{z:.5f}' for x, y, z in rows)]))
     with pytest.raises(RecordingError, match="name no time: 'ax', 'ay', 'az'; give --rate-hz, or"):
@@ -193,6 +193,6 @@ def test_words_of_24_and_32_bits_are_not_saturated(
 ) -> None:
     rest = Rest(rng, level=(0.0, 0.0, one_g), sd=0.002 * one_g)
     rest.accel[:] = np.rint(rest.accel)
-    rest.accel[100] = 2.0**bits - 1.0  # one that is
+    rest.accel[100] = 2.0**bits - 1.0  # a valid one
     bag = reduce_source(rest.source(), full_scale=32767.0)
     assert (bag.n_saturated, len(bag.intervals)) == (1, 1)

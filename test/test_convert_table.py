@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Tables of numbers: every layout reads alike, every bad cell is seen, every error names the place.
-"""
+"""Tables of numbers: all layouts give the same, every bad cell is found, errors name the place."""
 
 from __future__ import annotations
 
@@ -56,7 +54,7 @@ def test_every_layout_reads_alike(
 def test_headings_are_optional(tmp_path: Path) -> None:
     path = write(tmp_path / 'log.txt', '1 2 3\n4 5 6\n')
     assert read_text(path, [2], ROWS_ALONE).values[2].tolist() == [3.0, 6.0]
-    # A table whose first line is all words has headings, unless the user says otherwise.
+    # A first line of words is the heading, unless the user says otherwise.
     path = write(tmp_path / 'words.txt', 'nan inf\n1 2\n')
     assert read_text(path, [0], ROWS_ALONE, Format(header=True)).values[0].tolist() == [1.0]
 
@@ -64,7 +62,7 @@ def test_headings_are_optional(tmp_path: Path) -> None:
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
 def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path: Path, separator: str) -> None:
     # A title, comments of three kinds, a key with its value, a blank line; a row of units, which
-    # counts as one without numbers; a comment and a torn last row in the table itself.
+    # counts as a row without numbers; a comment and an incomplete last row in the table itself.
     head = ['Inertial logger', '# serial 7', '% matlab', '// c', f'Rate:{separator}100', '']
     rows = ['t|ax|ay|az', 's|g|g|g', *(f'{k}|0.1|0.2|{k}' for k in range(60)), '# end', '60|0.1']
     text = '\n'.join([*head, *(row.replace('|', separator) for row in rows)])
@@ -76,7 +74,7 @@ def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path: Path, separ
 
 
 def test_a_column_may_begin_late(tmp_path: Path) -> None:
-    # WHY: a thermometer reports its first reading after the accelerometer, and stands last.
+    # WHY: a thermometer that reports later than the accelerometer is the last column.
     rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
     table = read_text(
         write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows])),
@@ -93,7 +91,7 @@ def test_line_numbers_are_those_of_an_editor(tmp_path: Path) -> None:
     table = read_text(path, ['a', 'b'], ROWS_ALONE)
     assert table.line.tolist() == [4, 5, 7]
     np.testing.assert_array_equal(table.values['a'], [1.0, np.nan, 5.0])
-    # The row with one cell is not silently shifted: it is counted and left out.
+    # The row with one cell is not shifted silently: it is counted and left out.
     assert table.n_short == 1
 
 
@@ -125,7 +123,7 @@ def test_layout_prefers_the_delimiter_that_splits_all_lines_alike() -> None:
         ('1,2\n3,4\n', 'a', "no column 'a': the table has no headings"),
         ('1,2\n3,4\n', 2, 'no column 2: the table has 2, 0 to 1'),
         ('1,2\n3,4\n', -1, 'no column -1: the table has 2, 0 to 1'),
-        # WHY: whole numbers among them were once all that was left of such a table.
+        # WHY: only rows with whole numbers were once kept of such a table.
         ('a;b\n1,5;2\n3;4\n5;6\n', 'a', "column 'a' has decimal commas, as in 1,5"),
         ('a,b\n\0\0\n', 'a', 'it holds zero bytes'),
     ],
@@ -197,9 +195,9 @@ class TestParquet:
 @pytest.mark.parametrize('unit', ['s', 'ns'])
 def test_stamps_that_ros_cannot_hold(tmp_path: Path, suffix: str, unit: str) -> None:
     """
-    WHY: an integer stamp of 2e10 s wrapped to 600 s, and 1e30 put all rows on one stamp.
+    WHY: an integer stamp of 2e10 s overflowed to 600 s, and 1e30 gave all rows one stamp.
 
-    WHAT: a row is in the bag at its own stamp, or it is left out and counted.
+    WHAT: a row is in the bag with its stamp, or it is left out and counted.
     """
     scale = 10**9 if unit == 's' else 1
     good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-PX4 logs: what a hand-written ULog file holds comes out of the bag, sensor by sensor.
+PX4 logs: a converted ULog file gives the data of each sensor.
 
 The writer below follows the public description of the format and shares no code with the reader.
 """
@@ -99,11 +99,11 @@ def test_log_arrives_in_the_bag(flight, tmp_path, imu):
     recording = read_recording(tmp_path / 'bag.mcap')
     bag = recording.columns
     assert report.messages['accel'] == N
-    # The sample's own time counts, not the time of its publication; each IMU has its own.
+    # The time of the sample is used, not that of its publication, separately for each IMU.
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # The chip changes at every sample; the barometer is the second, slower thermometer.
+    # The chip's temperature changes with every sample; the barometer is the slower thermometer.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
@@ -113,7 +113,7 @@ def test_gyro_of_the_same_instance_travels_along(flight, tmp_path):
     path, _ = flight
     write_log(read_autopilot(path, imu=0), tmp_path / 'bag.mcap')
     rate = read_recording(tmp_path / 'bag.mcap').columns.imu.angular_velocity
-    # Both sensors have the same stamps here; the values passed through a float32.
+    # Both sensors have the same stamps here; values are rounded to float32.
     np.testing.assert_allclose(rate[:, 0], 0.001 * np.arange(N), atol=1e-6)
     assert read_autopilot(path, imu=1).gyro is None
 
@@ -135,7 +135,7 @@ def test_old_layout_without_sample_time(tmp_path, rng):
     read = read_autopilot(path)
     np.testing.assert_array_equal(read.accel, force)
     assert 'case' not in read.temperatures
-    # A chip that stands still is heard of every 10 s; the log is 6 s long.
+    # A constant chip temperature is repeated every 10 s; the log is 6 s long.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, [31.5])
 
 
@@ -180,7 +180,7 @@ AIR = 'vehicle_air_data:uint64_t timestamp;uint64_t timestamp_sample;float baro_
 
 
 def write_combined(path: Path, rng, later=None, **parameters: int) -> np.ndarray:
-    """Write a log of PX4's default profile before it logged each sensor."""
+    """Write a log with PX4's default profile, from before it logged single sensors."""
     log = UlogWriter(COMBINED, AIR)
     for name, value in parameters.items():
         log.message('P', parameter(name, value))
@@ -190,7 +190,7 @@ def write_combined(path: Path, rng, later=None, **parameters: int) -> np.ndarray
         now = 7_000_000 + k * STEP_US
         rows = [(-200, vector)]
         if k == 3:
-            # No accelerometer in it; and one whose reading has been logged already.
+            # A log without an accelerometer, and one whose reading has been logged already.
             rows += [(2**31 - 1, vector), (-200 - 50, vector)]
         for j, (relative, (x, y, z)) in enumerate(rows):
             at = now + (50 if j == 2 else 0)
@@ -219,7 +219,7 @@ def test_the_combined_sensor_stands_in(tmp_path, rng, cli):
     np.testing.assert_array_equal(read.accel, force)
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
-    # The barometer's is the only thermometer: it is what a fit and the node must have.
+    # The barometer's thermometer is the only one, so it must become the board's.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, 40.0 + np.arange(6))
     assert 'case' not in read.temperatures
     said = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
@@ -241,7 +241,8 @@ def test_what_px4_compensated_is_left_out(tmp_path, rng, begin):
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
-    # A parameter has the stamp of the message before it: one sample may count to either half.
+    # A parameter has the stamp of the previous message, so that one sample may belong to either
+    # half.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])

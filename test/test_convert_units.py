@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The belief about units rests on physics: at rest |a| is gravity, in whatever unit it is written.
-"""
+"""Units are recognised by physics: at rest |a| is gravity in the unit of the table."""
 
 from __future__ import annotations
 
@@ -56,15 +54,15 @@ def test_contradictions_are_said(
 def test_nothing_is_said_against_what_may_be_true() -> None:
     assert contradiction('g', 1.15, None) is None
     assert contradiction('m/s^2', 9.6, None) is None
-    # Counts of a precise converter are anything above all units.
+    # Values above those of all units are counts of a precise converter.
     assert contradiction('counts', 2941.7, None) is None
     assert contradiction('counts', 2060.0, 2048.0) is None
-    # Never at rest: nothing can be said.
+    # Never at rest: the unit cannot be recognised.
     assert contradiction('g', float('nan'), None) is None
 
 
 def shaken(rng: np.random.Generator, n: int, scale: float, noise: float) -> np.ndarray:
-    """Still, with a shaken middle fifth."""
+    """At rest, except for a shaken middle fifth."""
     accel = scale * np.array([0.6, 0.0, 0.8]) + noise * rng.standard_normal((n, 3))
     middle = slice(2 * n // 5, 3 * n // 5)
     accel[middle] += 20.0 * noise * rng.standard_normal((len(accel[middle]), 3))
@@ -76,18 +74,18 @@ def test_movement_is_found_in_any_unit(rng: np.random.Generator, scale: float) -
     n = 5000
     stamp_ns = np.arange(1, n + 1) * 10_000_000
     found = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
-    # 50 s in cells of half a second: the middle fifth is 20..30 s, on cells' edges.
+    # 50 s in cells of half a second: the middle fifth is 20..30 s, on the edges of cells.
     assert [(t0 * 1e-9, t1 * 1e-9) for t0, t1 in found.moving_ns] == [
         (pytest.approx(20.01), pytest.approx(30.01))
     ]
-    # The mean of 2 s of noise of 0.1 % scatters by 0.1 % / sqrt(200).
+    # The mean over 2 s of noise of 0.1 % has an sd of 0.1 % / sqrt(200).
     assert found.magnitude == pytest.approx(scale, rel=3e-4)
     assert found.noise == pytest.approx(1e-3 * scale, rel=0.1)
     assert found.still_s == pytest.approx(40.0, abs=0.5)
 
 
 def test_a_sensor_that_shows_no_noise_is_not_moving(rng: np.random.Generator) -> None:
-    # Rounded to steps larger than its noise, it flips between two steps now and then.
+    # Rounded to steps larger than the noise, the value changes by a step from time to time.
     accel = np.tile([0.0, 0.0, 1.0], (1000, 1))
     accel[::97, 0] = 0.1
     found = find_stillness(np.arange(1000) * 10_000_000, accel)

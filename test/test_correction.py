@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Corrections with full banks: stream = batch to the bit, axes apart, sd = scatter of what is drawn.
+Corrections with all columns: single samples equal blocks bit for bit, axes are independent, the
+claimed sd equals the scatter of random calibrations.
 """
 
 from __future__ import annotations
@@ -47,10 +48,10 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
 def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
-    """Draw a unit with every column of the bank of two sensors."""
+    """Draw a unit with all columns of two sensors."""
     terms = []
     for column in bank(SENSORS):
-        # Of some counts and 1e-4 at the edges, whatever the column's power.
+        # Some counts and 1e-4 at the edges, for any power of a column.
         sd = 10.0**-column.power * size
         bias, scale = np.zeros(3), np.zeros(3)
         bias[list(axes)] = 0.05 * sd * rng.standard_normal(len(axes))
@@ -59,7 +60,7 @@ def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
             name: getattr(column, name)
             for name in ('group', 'kind', 'sensor', 'tau_s', 'width_k', 'power', 'during')
         }
-        edge = 1.0 if column.kind == 'even' else 4.0 + 4.0 * rng.random()
+        edge = 1.0 if column.kind == 'gradient_even' else 4.0 + 4.0 * rng.random()
         terms.append(
             ResponseTerm(
                 **keys, range=(-edge, edge), bias=tuple(bias.tolist()), scale=tuple(scale.tolist())
@@ -81,7 +82,7 @@ def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
 
 
 def run_of(rng, seconds=240, rate=4, swing_k=12.0):
-    """Any messages in order: samples, three thermometers that jitter and drop out."""
+    """Make messages in order: samples, three thermometers that jitter and drop out."""
     events = []
     for k in range(seconds * rate):
         stamp = k * SECOND_NS // rate + int(rng.integers(0, 1_000_000))
@@ -122,7 +123,7 @@ def assert_same(blocks, rows):
 def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
-    # Of 5 .. 35 degC, along the tangent, and beyond the quarter that this goes on for.
+    # Within 5 .. 35 degC, along the tangent, and beyond the quarter of the span.
     events = run_of(rng, seconds=50, swing_k=75.0)
     rows = stream(Compensator(unit, UNCHECKED), events)
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
@@ -144,7 +145,7 @@ def test_columns_of_one_axis_leave_every_bit_of_the_others(rng):
 
 
 def states_of(unit, rng, n=5):
-    """Give a tracker in the middle of a run, and states along its way."""
+    """Return a tracker in the middle of a run, and states of the run."""
     tracker = ThermalTracker(unit.detector, Correction(unit).memory)
     found = []
     for k, (kind, stamp, value) in enumerate(run_of(rng, seconds=1200, rate=1)):
@@ -156,8 +157,8 @@ def states_of(unit, rng, n=5):
 
 
 def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_posterior(rng):
-    # Axes' levels, curves, and every weight of a full bank, all correlated: what the drawn
-    # calibrations make of a state must scatter as SlowUncertainty says, at any specific force.
+    # Levels, curves and all weights are correlated: the corrections of random calibrations at a
+    # state must scatter as SlowUncertainty states, at any specific force.
     unit = replace(full_bank(rng), noise_density_m_s2_sqrt_hz=(1e-4,) * 3)
     layout = parameter_layout(unit)
     n = layout.n_parameters
@@ -173,7 +174,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
     slow = SlowUncertainty(judged, Correction(judged))
     nobody = [0.0] * len(Correction(unit).memory.lags)
     draws = rng.multivariate_normal(np.zeros(n), posterior.covariance(), size=300)
-    # The same state in the static regime, and while the sets cross over.
+    # The same state in the static regime, and during the transition of the sets.
     weights = np.array([0.0, 0.3])
     pair = np.repeat(np.array([states[-1][1]]), 2, axis=0).T
     pair[3] = weights
@@ -194,7 +195,10 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
 
 
 def drawn(unit, layout, d):
-    """Move every parameter of a unit but the levels of the scale, which a curve of 1 has not."""
+    """
+    Change every parameter of a unit except the levels of the scale, which a curve of 1 does not
+    have.
+    """
 
     def moved(regime_set_, start):
         axes = []
@@ -246,7 +250,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     wide = replace(
         unit, response=tuple(replace(one, range=(-4000.0, 4000.0)) for one in unit.response)
     )
-    # Squares of lags bend: the spread is asked for where they are straight.
+    # Squares of lags are nonlinear: the spread is tested for small changes.
     small = 0.05
     moved[first : first + 2 * len(lags) : 2] += small * (draws * np.array(shares)).T
     found = Correction(wide).bias_scale(moved)
@@ -259,7 +263,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
 
 
 def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
-    # Of a lag of 60 s that started unseen, nothing else is uncertain: the sd falls as exp(-t/60).
+    # Only the start of a lag of 60 s is uncertain: the sd falls as exp(-t/60).
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     compensator = Compensator(unit, UNCHECKED)
     noise = compensator.thermal.correction.noise[0]
@@ -278,7 +282,7 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # The thermometer's own part, 30 counts/K of some mK, is all that changes within.
+        # Within a span only the thermometer's part changes, 30 counts/K of some mK.
         own = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - found[0][0]) * 1e-9 + 1.0
@@ -288,7 +292,9 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
 
 
 def test_a_further_sensor_that_is_lost_is_paid_for():
-    unit = calibration(sensors=SENSORS, response=(term('now', (30.0, 0.0, 0.0), sensor='tip'),))
+    unit = calibration(
+        sensors=SENSORS, response=(term('gradient', (30.0, 0.0, 0.0), sensor='tip'),)
+    )
     compensator = Compensator(unit, UNCHECKED)
     variances = []
     for k in range(200):
@@ -318,7 +324,7 @@ def test_a_swap_keeps_the_memory_where_the_same_is_remembered(rng):
     assert compensator.thermal.tracker.memory is tracker.memory
     compensator.swap(replace(unit, response=unit.response[:5]))
     assert compensator.thermal.tracker.memory is not tracker.memory
-    # What was seen last is not lost.
+    # The latest readings are kept.
     assert compensator.thermal.tracker.board.stamp_ns == tracker.board.stamp_ns
     assert compensator.process(61 * SECOND_NS, 0.0, 0.0, 2900.0) is not None
 
@@ -326,7 +332,7 @@ def test_a_swap_keeps_the_memory_where_the_same_is_remembered(rng):
 def test_the_state_at_the_edge_of_a_column_is_held_and_what_is_cut_off_is_paid_for():
     unit = calibration(
         axes=Axes(*[AxisReference(300.0, 0.0)] * 3),
-        response=(term('now', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
+        response=(term('gradient', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
     )
     correction = Correction(unit)
     inside, outside = ((20.0, 0.0, 0.0, 0.0, 0.0, g, 0.0) for g in (1.0, 3.0))
@@ -340,7 +346,7 @@ def test_the_state_at_the_edge_of_a_column_is_held_and_what_is_cut_off_is_paid_f
 
 
 def sd_at(unit, board, behind=0.0, force=0.0):
-    """Give the claimed sd of the x axis in a soak, without the noise of a message [m/s^2]."""
+    """Return the claimed sd of the x axis in a soak, without the noise of a message [m/s^2]."""
     correction = Correction(unit)
     layout = Layout(correction.memory)
     state = [0.0] * layout.width
@@ -353,24 +359,24 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
-    # b = 0.5 L: the curve's slope and that of its lag cancel for an error of the thermometer, not
-    # for 6 K that the parts have, too.
+    # b = 0.5 L: slopes of the curve and of its lag cancel for an error of the thermometer, but not
+    # for 6 K of all parts.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bias), dynamic=regime_set(bias),
         response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
     )  # fmt: skip
     assert sd_at(unit, 35.0) == pytest.approx(1e-6, rel=1e-6)
-    # Times what is added far outside, 6 K of half a range of 15 K.
+    # Times the factor far outside, for 6 K of half a range of 15 K.
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
 
 
 def test_beyond_the_range_slopes_that_cancel_are_no_knowledge():
-    # 0.5 + 0.02 t counts/K: at the upper edge 0.8, which a force of 10 m/s^2 takes away.
+    # 0.5 + 0.02 t counts/K: 0.8 at the upper edge, cancelled by a force of 10 m/s^2.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
-    # Over 30 K the slope changes by 0.02 * 30 / sqrt(12), at few temperatures a little more.
+    # Over 30 K the slope changes by 0.02 * 30 / sqrt(12), slightly more with few temperatures.
     bends = 0.6 / math.sqrt(12.0)
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
@@ -378,7 +384,7 @@ def test_beyond_the_range_slopes_that_cancel_are_no_knowledge():
 
 
 def curves_at(unit, celsius):
-    """Evaluate bias and relative scale of x in both sets at temperatures, shape (2, 2, n)."""
+    """Return bias and relative scale of x in both sets at temperatures, shape (2, 2, n)."""
     return Correction(unit).curves.values(np.array(celsius))[:, ::3]
 
 
@@ -410,7 +416,7 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # What the sets differ by at the last temperature that both have seen.
+    # The difference of the sets at the last temperature within both.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -423,14 +429,15 @@ def test_two_kelvins_beyond_the_range_a_bent_unit_is_wrong_by_the_second_order_a
     unit = calibration(static=regime_set(axis_set(BENT)), dynamic=regime_set(axis_set(BENT)))
     ((at_edge, found),) = curves_at(unit, [35.0, 37.0])[:1, 0]
     truth = 0.5 * 17.0 + 0.01 * 17.0**2
-    # 0.01 (2 K)^2, where what is held at the edge is wrong by 1.64.
+    # 0.01 (2 K)^2, while a value held at the edge is wrong by 1.64.
     assert truth - found == pytest.approx(0.04)
     assert truth - at_edge == pytest.approx(1.64)
 
 
 def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng):
-    # Correction and regressors are linear in the parameters: what any change of them makes of the
-    # one is what the others say. The dynamic set ends first above, the static one below.
+    # Correction and regressors are linear in the parameters: the change of the correction by any
+    # change of them must equal the regressors times it. The dynamic set ends first above, the
+    # static one below.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     one = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -473,7 +480,7 @@ def test_the_claim_grows_all_the_way_out_of_the_range():
             line = correction.line(state, state, np.array(slow.at(state, nobody)), 0.0)
             variances.append(line[12:].reshape(3, 3)[:, 0])
         assert (np.diff(variances, axis=0) > 0.0).all()
-        # At the least the error of a curve that had turned flat at the edge.
+        # At least the error of a curve that is constant from the edge on.
         slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What directions are worth: against closed forms, a second route and the scatter of estimates."""
+"""
+The value of further directions: against closed forms, a second route and the scatter of estimates.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,7 @@ def test_columns_are_the_derivatives_of_the_measured_force(rng: np.random.Genera
 def test_without_positions_the_prior_is_left() -> None:
     covariance = constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
-    # Bias and scale of one axis that is upright: their variances add up.
+    # Bias and scale of one vertical axis: their variances add.
     assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
 
 
@@ -73,10 +75,10 @@ def test_the_covariance_is_the_scatter_of_estimates(rng: np.random.Generator) ->
     truth = rng.standard_normal((n, 9)) * PRIOR_SD
     columns = norm_columns(up)
     seen = truth @ columns.T + SD * rng.standard_normal((n, 12))
-    # The conditional mean of a Gaussian, by its joint covariance.
+    # The conditional mean of a Gaussian, from its joint covariance.
     joint = columns * PRIOR_SD**2 @ columns.T + SD**2 * np.eye(12)
     estimate = seen @ np.linalg.solve(joint, columns * PRIOR_SD**2)
-    # 4000 trials tell a standard deviation to 1.1 %.
+    # 4000 trials determine a standard deviation to 1.1 %.
     np.testing.assert_allclose(
         np.std(estimate - truth, axis=0), np.sqrt(np.diag(covariance)), rtol=0.06
     )
@@ -90,7 +92,7 @@ def test_the_next_direction_lowers_the_mean_variance(n: int, rng: np.random.Gene
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
     others = [before - mean_variance(np.vstack([up, one]), at) for one in units(rng, 300)]
-    # A face that is easily held may be worth half of the best; that is better than most.
+    # An easily held face is chosen even with half the benefit of the best direction.
     assert gain > 0.45 * max(others)
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 
@@ -100,7 +102,7 @@ def test_who_follows_the_proposals_gets_a_good_test() -> None:
     for _ in range(18):
         covariance = constants_covariance(up, np.full(len(up), SD))
         up = np.vstack([up, next_direction(covariance, SD, up)])
-    # The faces first, upright to begin with; then what tells the misalignment.
+    # First the faces, starting upright; then directions that determine the misalignment.
     assert up[0].tolist() == [0.0, 0.0, 1.0]
     assert {tuple(one) for one in up[:6]} == {tuple(one) for one in FACES}
     proposed = worst_sd(constants_covariance(up, np.full(18, SD)))

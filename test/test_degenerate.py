@@ -1,22 +1,19 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Degenerate inputs through the real commands: those that once cost gigabytes, hung or lied.
+Degenerate inputs through the real commands: those that once needed gigabytes, hung, or lost data
+silently.
 
-The whole table, every command on every input, is `benchmarks/degenerate.py`.
+`benchmarks/degenerate.py` runs every command on every input.
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
-import pytest
-from conftest import ROOT, Cli
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
 import degenerate
+import pytest
+from conftest import Cli
 
 
 @pytest.mark.parametrize(
@@ -70,5 +67,5 @@ def test_the_cause_is_said_in_the_users_words(
     failed = cli('fit', path, '--gravity', '9.81', '-o', tmp_path / 'out.yaml', code=1)
     (line,) = [one for one in failed.stderr.splitlines() if ': error: ' in one]
     assert said in line
-    # The topic is said where it was taken by its type.
+    # The message names the topic if it was chosen by its type.
     assert 'bag.mcap (/imu/data)' in line or name in {'stamps all zero', 'axes that lean'}

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What the pages tell a reader to type works: every command, every snippet, every page in the site.
-"""
+"""Commands and snippets on the pages work, and every page is in the site."""
 
 from __future__ import annotations
 
@@ -28,8 +26,8 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
-# The session of cli.md runs with its output in test_readme; a bag that plays for minutes, one
-# that grows, and the demo, have tests of their own (test_player, test_record, test_cli_demo).
+# test_readme runs the session of cli.md with its output; a bag that plays for minutes, a growing
+# bag and the demo have their own tests (test_player, test_record, test_cli_demo).
 ELSEWHERE = (
     'thermo_comp demo',
     'thermo_comp play bags/held_out.mcap --rate 20',
@@ -38,7 +36,7 @@ ELSEWHERE = (
 
 
 def commands() -> list[tuple[str, str, str]]:
-    """Return page, command and the output shown for it (empty for none)."""
+    """Return page, command, and the output shown for it (empty for none)."""
     found = []
     for page in PAGES:
         for kind, text in FENCE.findall(page.read_text(encoding='utf-8')):
@@ -83,7 +81,7 @@ def test_completion_is_a_script_that_bash_takes(root: Path) -> None:
     bash = shutil.which('bash')
     if bash is None:
         pytest.skip('no bash')
-    # The program looks which shell it was started by; the `:` keeps that shell waiting for it.
+    # The program looks for the shell that started it; the `:` keeps that shell waiting.
     finished = subprocess.run(
         [bash, '-c', f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'],
         cwd=root,
@@ -145,9 +143,9 @@ def test_refusals_are_quoted_as_they_are_said() -> None:
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10
     sources = ''.join(path.read_text() for path in (ROOT / 'thermo_comp').rglob('*.py'))
-    # Adjacent literals are one sentence to a reader.
+    # Adjacent literals form one sentence.
     spoken = re.sub(r"'\s+f?'", '', sources)
     for sentence in quoted:
-        # Figures and what follows them come at run time.
+        # Numbers and the text after them are only known at run time.
         words = max(re.split(r'\d+(?:\.\d+)?|\.\.\.', sentence), key=len).strip(' ,;')
         assert words in spoken, sentence

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A driver's own topics over DDS: a temperature in another message, or without a stamp."""
+"""Topics of a driver over DDS: a temperature in another message, or without a stamp."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,13 +44,6 @@ NAMES = {'board': '/pack:temperature', 'case': '/case_t'}
 
 
 @pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
-
-
-@pytest.fixture
 def unit(tmp_path: Path) -> Path:
     path = tmp_path / 'unit.yaml'
     save_calibration(thermal_calibration(), path)
@@ -85,7 +78,7 @@ def test_the_node_finds_the_type_while_it_runs(peer: Peer, unit: Path, is_file: 
         return look
 
     with node_in_thread(*node_arguments(unit, f'topics:={topics}')):
-        # Each finds a subscriber of its own type.
+        # Each publisher finds a subscriber of its type.
         board = peer.publisher(BatteryState, '/pack')
         case = peer.publisher(Float64, '/case_t')
         samples = peer.publisher(Vector3Stamped, 'accel/counts')
@@ -93,7 +86,7 @@ def test_the_node_finds_the_type_while_it_runs(peer: Peer, unit: Path, is_file: 
         peer.wait_for(values(unpublished=0), 'a report')
         samples.publish(sample(START_NS))
         peer.wait_for(values(**{'board temperature [degC]': 25.0}), 'the board')
-        # Without a stamp: it counts from the sample before it.
+        # Without a stamp a reading applies from the previous sample on.
         case.publish(Float64(data=23.0))
         samples.publish(sample(START_NS + SECOND_NS))
         samples.publish(sample(START_NS + 2 * SECOND_NS))
@@ -156,7 +149,9 @@ def test_record_writes_them_as_temperatures(peer: Peer) -> None:
         sent: list[str] = []
 
         def wait(_seconds: float) -> bool:
-            """Send a message when the one before has come; end when all have."""
+            """
+            Send each message after the previous one has arrived; return when all have arrived.
+            """
             if len(found) == len(sent) < len(messages):
                 role, message = messages[len(sent)]
                 sent.append(role)
@@ -168,7 +163,7 @@ def test_record_writes_them_as_temperatures(peer: Peer) -> None:
             for role, own in news[0].raw.items() if news else ():
                 found.setdefault(role, []).extend(own)
     case, board = (deserialize_message(found[one][0], Temperature) for one in ('case', 'board'))
-    # Without a stamp of its own, that of the sample before it.
+    # A reading without a stamp gets that of the previous sample.
     assert (case.temperature, case.header.stamp.sec) == (23.0, START_NS // SECOND_NS)
     assert (board.temperature, board.header.stamp.nanosec) == (25.0, 5)
 

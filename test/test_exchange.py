@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Exchange with other tools: their formulas written out again here, round trips, losses, refusals.
-"""
+"""Exchange with other tools: their formulas written again, round trips, losses and refusals."""
 
 from __future__ import annotations
 
@@ -94,7 +92,7 @@ def test_px4_formula_gives_our_bias(cubic: Calibration) -> None:
         for celsius in (5.0, 20.0, 33.0, 45.0):
             d = celsius - p['TC_A2_TREF']
             offset = sum(p[f'TC_A2_X{power}_{axis}'] * d**power for power in range(4))
-            # Nine digits are written, as a float holds.
+            # Nine digits are written, as in a float32.
             assert offset == pytest.approx(bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9)
 
 
@@ -151,14 +149,13 @@ def test_the_angular_rate_goes_both_ways(cubic: Calibration) -> None:
     px4 = export_calibration(unit, 'px4')
     value = numbers(px4.text, '\t')
     assert value['TC_G_ENABLE'] == 1.0
-    # PX4's formula: X0 + X1 d + X2 d^2 + X3 d^3 is what it takes from the rate, in rad/s.
+    # PX4 subtracts X0 + X1 d + X2 d^2 + X3 d^3 from the rate, in rad/s.
     d = celsius[2] - value['TC_G0_TREF']
     for axis in range(3):
         bias = sum(value[f'TC_G0_X{power}_{axis}'] * d**power for power in range(4))
         assert bias == pytest.approx(true[2, axis], rel=1e-6)
-    # 9 digits of each coefficient.
     np.testing.assert_allclose(again(px4.text), true, atol=1e-9)
-    # A gyroscope that was calibrated about another temperature than the accelerometer.
+    # A gyroscope with another reference temperature than the accelerometer.
     shifted = Polynomial((0.02, *curves[0][1:]))
     moved = px4.text.replace('TC_G0_TREF\t20\t', 'TC_G0_TREF\t30\t')
     assert moved != px4.text
@@ -167,7 +164,7 @@ def test_the_angular_rate_goes_both_ways(cubic: Calibration) -> None:
 
     ardupilot = export_calibration(unit, 'ardupilot', number=2).text
     assert 'INS_TCAL2_GYR1_X' in ardupilot
-    # The offset is ArduPilot's own: none at the temperature of its calibration.
+    # ArduPilot has its own offset; it is 0 at the temperature of the calibration.
     found = again(f'{ardupilot}INS_GYR2_CALTEMP,{celsius[3]}\n')
     np.testing.assert_allclose(found, true - true[3], atol=1e-9)
     zeros = re.sub(r'(GYR\d_.),.*', r'\1,0', ardupilot)
@@ -215,7 +212,7 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic: Calibration) -> None:
 
 
 def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic: Calibration) -> None:
-    # WHY: PX4 subtracts from m/s^2 as they are read; 0.5 % of the scale are 5 mg at rest.
+    # WHY: PX4 subtracts from m/s^2 as read; 0.5 % of the scale are 5 mg at rest.
     axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
     calibration = replace(cubic, axes=axes)
     plain = export_calibration(calibration, 'px4')
@@ -225,7 +222,7 @@ def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic: Calibration) -> N
     up = (0.6, 0.0, 0.8)
     level = numbers(export_calibration(calibration, 'px4', up=up).text, '\t')
     for axis in range(3):
-        # At the attitude and the reference nothing but gravity is left of a reading.
+        # At this attitude and the reference temperature only gravity remains of a reading.
         d = 20.0 - level['TC_A0_TREF']
         reading = 0.995 * 9.81 * up[axis] + (0.1, -0.2, 0.3)[axis]
         offset = sum(level[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))
@@ -240,14 +237,14 @@ def test_what_is_lost_is_said(cubic: Calibration) -> None:
         cubic,
         static=static,
         dynamic=dynamic,
-        response=(term('now', (0.0, 1e-3, 0.0)), term('board', tau_s=60.0)),
+        response=(term('gradient', (0.0, 1e-3, 0.0)), term('board', tau_s=60.0)),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (0.0, 0.0, 1.0)),
     )
     text = export_calibration(calibration, 'ardupilot')
     for expected in (
         'replaced by cubics',
         '1e+03 urad',
-        r'response is lost (now): ',
+        r'response is lost (gradient): ',
         'dynamic set is lost',
     ):
         assert any(expected in note for note in text.notes), expected
@@ -312,7 +309,7 @@ def ours(calibration: Calibration, raw: np.ndarray) -> np.ndarray:
 
 
 def turn(notes: tuple[str, ...]) -> np.ndarray:
-    """Make the rotation of a note's roll, pitch and yaw: ours to theirs, one axis at a time."""
+    """Build the rotation from the roll, pitch and yaw of a note, one axis at a time."""
     said = next(note for note in notes if 'roll' in note)
     roll, pitch, yaw = (float(number) for number in said.split()[-4:-1])
     x = [[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]]
@@ -325,7 +322,7 @@ RAW = np.array([[36400.0, 33100.0, 33300.0], [32500.0, 29000.0, 32000.0], [1.0, 
 
 
 def test_imu_tk_formula_gives_our_correction(tumbled: Calibration) -> None:
-    # X' = T K (X - B), as imu_tk's header has it; its reader takes 9 + 9 + 3 numbers in rows.
+    # X' = T K (X - B) as in imu_tk's header; its reader takes 9 + 9 + 3 numbers in rows.
     file = export_calibration(tumbled, 'imu_tk')
     numbers = [float(cell) for cell in file.text.split()]
     T, K = np.reshape(numbers[:9], (3, 3)), np.reshape(numbers[9:18], (3, 3))
@@ -333,7 +330,7 @@ def test_imu_tk_formula_gives_our_correction(tumbled: Calibration) -> None:
     assert np.all(np.tril(T, -1) == 0.0)
     assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
     theirs = (RAW - numbers[18:]) @ (T @ K).T
-    # Six digits of the angles are written: 1e-6 of 90 m/s^2.
+    # Angles are written with six digits: 1e-6 of 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     np.testing.assert_allclose(
         np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12
@@ -345,7 +342,7 @@ def test_imu_calib_and_kalibr_formulas_give_our_correction(tumbled: Calibration)
     theirs = RAW @ np.reshape(data['SM'], (3, 3)).T - data['bias']
     np.testing.assert_allclose(theirs, ours(tumbled, RAW), rtol=1e-10)
     imu = yaml.safe_load(export_calibration(tumbled, 'kalibr', number=1).text)['imu1']
-    # Kalibr predicts the reading: M a + b.
+    # Kalibr predicts the reading as M a + b.
     part = imu['accelerometers']
     reading = ours(tumbled, RAW) @ np.array(part['M']).T + part['bias']
     np.testing.assert_allclose(reading, RAW, rtol=1e-12)
@@ -358,7 +355,7 @@ def test_tumble_round_trip(tumbled: Calibration, to: str) -> None:
     file = export_calibration(tumbled, to)
     back = import_calibration(file.text, serial='7')
     assert back.unit.input == 'counts'
-    # The triangle of imu_tk is turned there and back.
+    # The triangular matrix of imu_tk is rotated there and back.
     np.testing.assert_allclose(ours(back, RAW), ours(tumbled, RAW), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(back.misalignment, tumbled.misalignment, atol=1e-12)
     assert any('holds at 20 degC' in note for note in file.notes)
@@ -410,7 +407,7 @@ def test_kalibr_without_bias_and_with_several_imus() -> None:
 
 
 def test_px4_rates_of_different_degree_keep_their_own_reference(cubic: Calibration) -> None:
-    # WHY: an axis without a third power had fewer coefficients than another: no array was made.
+    # WHY: an axis without a third power had fewer coefficients, and no array could be built.
     rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]
     lines = [f'TC_G0_X{p}_{axis}={row[p]!r}' for axis, row in enumerate(rows) for p in range(4)]
     lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Outputs that cannot be written, and writers that are killed: the old file or the new one, never
-half; one clear line; what a killed writer left can be read.
+Outputs that cannot be written, and writers that are killed: the old or the new file is complete,
+the error is one line, and the incomplete file of a killed writer can be read.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
-#: Two bags that are fitted in half a second, in the working folder as is the calibration.
+#: Two bags that are fitted in half a second; they are in the working folder.
 FIT = ('bags/01.mcap', 'bags/02.mcap')
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
 GRAVITY = ('--gravity', '9.80665', '--model', 'golovach')
-#: Arguments before and behind the output.
+#: Arguments before and after the output.
 COMMANDS = {
     'unit.yaml': (('fit', *FIT, *GRAVITY, '-f', '-o'), ()),
     'page.html': (('report', '-c', 'unit.yaml', '-f', '-o'), ()),
@@ -78,7 +78,7 @@ def test_a_conversion_on_a_full_disk_leaves_no_draft(
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
 def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk: Path, cli: Cli) -> None:
-    # Some 700 KB of noise, of which no compression makes less than half.
+    # About 700 KB of noise, which compresses to not less than half.
     n = 20000
     stamps = np.arange(n) * 10**8
     samples = np.random.default_rng(1).normal((0.0, 0.0, 2942.0), 3.0, (n, 3))
@@ -108,15 +108,15 @@ def test_a_folder_that_is_read_only(folder: Path, cli: Cli, name: str) -> None:
         locked = folder / 'locked'
         locked.mkdir(mode=0o500)
     else:
-        locked = Path('/proc')  # closed to root, too
+        locked = Path('/proc')  # not writable for root either
     before, _ = COMMANDS[name]
     finished = cli(*before, locked / name, code=1, cwd=folder)
     (line,) = finished.stderr.strip().splitlines()[-1:]
     assert line.startswith(f'thermo_comp: error: {locked / name}: ')
 
 
-#: Runs the command and kills itself: when the temporary file has been opened, or right before it
-#: takes the name.
+#: Runs the command and kills itself when the temporary file has been opened, or just before it is
+#: renamed.
 KILLED = """
 import os, signal, sys
 point, target = sys.argv[1:3]
@@ -165,10 +165,10 @@ def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: st
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert output.read_bytes() == old
     (rest,) = set(folder.iterdir()) - listed
-    # What it left bears another name, which no tool takes for the output.
+    # The file that remains has another name, which no tool takes for the output.
     assert rest.name.startswith('.')
     if point == 'before':
-        # It was whole already.
+        # It was complete already.
         if name == 'unit.yaml':
             assert load_calibration(rest).unit.serial
         elif name == 'bag.mcap':
@@ -180,7 +180,7 @@ def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: st
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
 def test_a_command_that_is_asked_to_end_leaves_nothing(folder: Path, name: str) -> None:
-    # WHY: a hidden file as large as the bag stayed behind each time-out and each shutdown.
+    # WHY: a hidden file as large as the bag remained after each time-out and each shutdown.
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]
     script = KILLED.replace('SIGKILL', 'SIGTERM')
@@ -196,7 +196,7 @@ def test_a_command_that_is_asked_to_end_leaves_nothing(folder: Path, name: str) 
 
 
 def rewritten(torn: Path, whole: Path) -> None:
-    """Write what can be read of a torn bag as a whole one."""
+    """Write the readable part of a damaged bag as a complete bag."""
     found = read_recording(torn).columns
     with BagWriter(whole) as bag:
         bag.write_temperature('temperature/board', *found.temperatures['board'][:2])
@@ -230,8 +230,8 @@ def test_a_fit_of_a_bag_that_holds_nothing_any_more(folder: Path, cli: Cli) -> N
     assert 'Traceback' not in finished.stderr
 
 
-#: Runs the command, and at each call that the package takes or has made looks at the output:
-#: what is there then is what a kill there leaves. Prints what it was, once for each change.
+#: Runs the command and checks the output at every function call of the package: its state is what
+#: a kill at this moment would leave. Prints each different state once.
 WATCHED = """
 import os, sys, threading
 from thermo_comp.cli.app import run
@@ -260,7 +260,7 @@ print(code, n, *(content for _, content in seen))
 
 
 def test_a_fit_that_is_killed_anywhere_leaves_the_old_file_or_the_new(folder: Path) -> None:
-    # WHY: the writing alone was tried; a command may touch its output before that, or behind.
+    # WHY: only the writing was tested; a command could touch its output before or after it.
     target = folder / 'unit.yaml'
     old = target.read_bytes()
     words = ('fit', *FIT, *GRAVITY, '-f', '-q', '-o', target)

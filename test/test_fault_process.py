@@ -18,9 +18,8 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from fault_bench import Bench, Heard, bench
-from fault_rig import CONFIG, RATE_HZ, START_NS, bag, force_at, seconds_of, unit
+from fault_rig import RATE_HZ, START_NS, bag, corrected, force_at, seconds_of, unit
 
-from thermo_comp.online.compensator import Compensator
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import SIZE_LIMIT, dump_calibration, save_calibration
 
@@ -39,20 +38,8 @@ def node(path: Path) -> Iterator[Bench]:
         yield started
 
 
-def expected(events: list[Any]) -> np.ndarray:
-    """Return what the compensator gives in a process of its own, sample by sample."""
-    compensator = Compensator(unit(), CONFIG)
-    rows = []
-    for topic, stamp_ns, value in events:
-        if topic == 'counts':
-            rows.append(compensator.process(stamp_ns, *value))
-        else:
-            compensator.push(topic, stamp_ns, value)
-    return np.array([row for row in rows if row is not None])
-
-
 def sigmas(heard: Heard) -> float:
-    """Return the largest error in the standard deviations that it was published with."""
+    """Return the largest error in units of the published standard deviation."""
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
     return float((np.abs(heard.force - force_at(seconds)) / sd).max())
@@ -63,14 +50,14 @@ def test_a_publisher_restarts(node: Bench) -> None:
     first = node.play([e for e in events if seconds_of(e[1]) < 50.0])
     node.restart_publishers()
     second = node.play([e for e in events if seconds_of(e[1]) >= 50.0])
-    table = expected(events)
+    _, table = corrected(events)
     np.testing.assert_array_equal(np.concatenate((first.force, second.force)), table[:, :3])
     assert second.values['lost'] == '0'
 
 
 def test_the_node_is_killed_and_restarts_in_the_ramp(path: Path) -> None:
     events = [e for e in bag() if seconds_of(e[1]) < 300.0]
-    undisturbed = expected(events)
+    _, undisturbed = corrected(events)
     with bench(path) as node:
         before = node.play([e for e in events if seconds_of(e[1]) < 90.0])
         assert sigmas(before) < SIGMAS
@@ -84,7 +71,7 @@ def test_the_node_is_killed_and_restarts_in_the_ramp(path: Path) -> None:
         assert first.values['memory settled'] == 'False'
         rest = node.play([e for e in events if seconds_of(e[1]) >= 91.0])
     n = len(first.force)
-    # Honest: what it has not seen is in the covariance.
+    # The covariance includes what the new process has not observed.
     at = round(90.0 * RATE_HZ)
     assert (first.covariance[:, 0, 0] > 4.0 * undisturbed[at : at + n, 3].max()).all()
     assert max(sigmas(first), sigmas(rest)) < SIGMAS
@@ -106,7 +93,7 @@ def unreadable(path: Path) -> None:
     if os.geteuid():
         path.chmod(0)
     else:
-        # Nothing is locked to root; but no process can read this one at its beginning.
+        # No file is locked for root, but no process can read this one at its beginning.
         path.unlink()
         path.symlink_to('/proc/self/mem')
 
@@ -161,9 +148,9 @@ def test_calibration_files_that_go_bad(path: Path, tmp_path: Path) -> None:
             assert result.reason.startswith(f'{bad}: ')
             assert reason in result.reason
             assert '\n' not in result.reason
-    # All the while the calibration that was read runs on.
+    # The calibration in use stays in use.
     n = sum(len(one.force) for one in heard)
-    table = expected(events)[:n, :3]
+    table = corrected(events)[1][:n, :3]
     np.testing.assert_allclose(
         np.concatenate([one.force for one in heard]), table, rtol=0.0, atol=1e-9
     )
@@ -174,9 +161,9 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
-    # Long enough for any machine: it ends with the last answer.
+    # Long enough for any machine; the loop ends with the last answer.
     events = bag(rate_hz=1000.0, duration_s=60.0)
-    n_reloads = 400
+    n_reloads = 200
     with bench(path) as node:
         answers, news = list[bool](), threading.Event()
         node.take()
@@ -189,7 +176,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
         asked = [ask() for _ in range(20)]
         begin, n, n_samples = time.monotonic(), 0, 0
         while len(answers) < n_reloads and n < len(events):
-            # In real time, as a driver does.
+            # Samples are sent in real time, as by a driver.
             while n < len(events) and seconds_of(events[n][1]) < time.monotonic() - begin:
                 n_samples += node.send([events[n]])
                 n += 1
@@ -198,7 +185,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
             asked = [future for future in asked if future not in answered]
             asked += [ask() for _ in answered]
             if n < len(events):
-                # Until the next sample's turn, or an answer.
+                # Wait until the next sample is due, or an answer arrives.
                 news.wait(max(0.0, begin + seconds_of(events[n][1]) - time.monotonic()))
                 news.clear()
         node.settle()
@@ -208,7 +195,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
     assert len(heard.force) == n_samples
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
-    # So many samples that five standard deviations of noise are one sample in a million.
+    # One sample in a million is beyond five standard deviations of noise.
     assert (np.abs(heard.force - force_at(seconds)) < (SIGMAS + 1.0) * sd).all()
 
 

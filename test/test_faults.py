@@ -1,41 +1,66 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The fault table: every row over DDS into the real node process, every number against the truth.
+The fault table: each row through the compensator and the node's diagnostics, every number against
+the truth; rows about the order of arrival also over DDS into the node process, which must agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from dataclasses import asdict, fields
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-from fault_bench import Bench, Heard, bench
-from fault_rig import CONFIG, bag, force_at, unit
+from fault_bench import Heard, bench, lots
+from fault_rig import CONFIG, Event, bag, corrected, force_at, unit
 from fault_rows import ROWS, Row, true_seconds
 
 from thermo_comp.online.compensator import Compensator
+from thermo_comp.ros.conversion import Traffic
+from thermo_comp.ros.diagnostics import findings_of
+from thermo_comp.ros.reader import LoadedCalibration
 from thermo_comp.unit.calibration_file import save_calibration
 
-#: Wrong is what is off by more than this many of the standard deviations it was published with.
+#: Largest error of a sound number, in the standard deviations that it was published with.
 SIGMAS = 5.0
-#: Recovered is what is nearer than this to the undisturbed run: 1 ug.
+#: Largest difference [m/s^2] of a recovered output to the undisturbed run: 1 ug.
 RECOVERED = 9.80665e-6
+#: Rows about the order of arrival, which the node takes from the middleware.
+OVER_DDS = (
+    *('board late by 5 s', 'counts out of order'),
+    *('time jumps back', 'temperatures of another clock'),
+)
 
 
-@pytest.fixture(scope='module')
-def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    path = tmp_path_factory.mktemp('faults') / 'unit.yaml'
-    save_calibration(unit(), path)
-    with bench(path) as started:
-        yield started
+def direct(events: list[Event]) -> Heard:
+    """Return what the node publishes for these messages, computed without DDS."""
+    compensator = Compensator(unit(), CONFIG)
+    loaded = LoadedCalibration(compensator.calibration, 'unit.yaml', '')
+    before = dict.fromkeys((one.name for one in fields(Traffic)), 0)
+    before |= {'n_in': 0, 'n_failures': 0, **asdict(compensator.counters)}
+    before_ns, parts, reports = None, [], []
+    for lot in lots(events):
+        parts.append(corrected(lot, compensator))
+        counters, status = compensator.counters, compensator.status()
+        counts = {**before, 'n_in': counters.n_in, **asdict(counters)}
+        new = {name: n - before[name] for name, n in counts.items()}
+        rate = None
+        if before_ns is not None and status.stamp_ns > before_ns and new['n_in']:
+            rate = new['n_in'] / (1e-9 * (status.stamp_ns - before_ns))
+        before, before_ns = counts, status.stamp_ns
+        found = list(findings_of(loaded, status, new, rate, silence_s=0.0))
+        reports.append((max((one for one, _ in found), default=0), '; '.join(t for _, t in found)))
+    stamps, table = (np.concatenate(one) for one in zip(*parts, strict=True))
+    covariance = table[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
+    return Heard(stamps, table[:, :3], covariance, reports)
 
 
 def wrong(row: Row, heard: Heard) -> np.ndarray:
-    """Find the published samples that are wrong, the blind span left out."""
+    """Return the times of wrong published samples outside the blind span."""
     seconds = true_seconds(row, heard.stamp_ns)
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
     is_wrong = (np.abs(heard.force - force_at(seconds)) > SIGMAS * sd).any(axis=1)
@@ -43,30 +68,15 @@ def wrong(row: Row, heard: Heard) -> np.ndarray:
     return seconds[is_wrong & ~((begin <= seconds) & (seconds < end))]
 
 
-def undisturbed(events: list) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps and specific force of the run without the fault."""
-    compensator = Compensator(unit(), CONFIG)
-    stamps, force = [], []
-    for topic, stamp_ns, value in events:
-        if topic == 'counts':
-            row = compensator.process(stamp_ns, *value)
-            if row is not None:
-                stamps.append(stamp_ns)
-                force.append(row[:3])
-        else:
-            compensator.push(topic, stamp_ns, value)
-    return np.array(stamps), np.array(force)
-
-
 @pytest.fixture(scope='module')
 def reference() -> tuple[np.ndarray, np.ndarray]:
-    return undisturbed(bag())
+    return corrected(bag())
 
 
 @pytest.mark.parametrize('row', ROWS, ids=[row.fault for row in ROWS])
-def test_row(row: Row, node: Bench, reference: tuple[np.ndarray, np.ndarray]) -> None:
+def test_row(row: Row, reference: tuple[np.ndarray, np.ndarray]) -> None:
     source = row.source or bag()
-    heard = node.play(row.inject(list(source)))
+    heard = direct(row.inject(list(source)))
     seconds = true_seconds(row, heard.stamp_ns)
     assert wrong(row, heard).tolist() == []
     assert len(seconds) >= row.n_least
@@ -74,17 +84,33 @@ def test_row(row: Row, node: Bench, reference: tuple[np.ndarray, np.ndarray]) ->
         assert not ((begin <= seconds) & (seconds < end)).any(), (begin, end)
     for level, text in row.says:
         assert heard.says(text, level), (level, text, sorted(set(heard.reports)))
-    # What is finite and positive definite is sound, wrong or not.
+    # Wrong or not, the output must be finite and the covariance positive definite.
     assert np.isfinite(heard.force).all()
     if len(seconds):
         assert np.linalg.eigvalsh(heard.covariance).min() > 0.0
-    stamps, force = undisturbed(source) if row.source else reference
+    stamps, table = corrected(source) if row.source else reference
     at, by = row.shift
     moved = heard.stamp_ns - round(by * 1e9) * (seconds >= at)
     late = seconds >= row.recovered
     place = np.searchsorted(stamps, moved[late])
     known = np.isin(moved[late], stamps)
-    difference = heard.force[late][known] - force[place[known]]
+    difference = heard.force[late][known] - table[place[known], :3]
     off = np.abs(difference).max(axis=1, initial=0.0) > RECOVERED
     assert seconds[late][known][off].tolist() == []
     assert late.any() == np.isfinite(row.recovered)
+
+
+def test_the_node_gives_the_same_over_dds(tmp_path: Path) -> None:
+    save_calibration(unit(), tmp_path / 'unit.yaml')
+    rows = [row for row in ROWS if row.fault in OVER_DDS]
+    assert len(rows) == len(OVER_DDS)
+    with bench(tmp_path / 'unit.yaml') as node:
+        for row in rows:
+            events = row.inject(list(row.source or bag()))
+            heard, expected = node.play(events), direct(events)
+            for name in ('stamp_ns', 'force', 'covariance'):
+                np.testing.assert_array_equal(
+                    getattr(heard, name), getattr(expected, name), row.fault
+                )
+            for level, text in row.says:
+                assert heard.says(text, level), (row.fault, text, sorted(set(heard.reports)))

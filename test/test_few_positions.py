@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Few positions: what temperature does is told by two of them, what stands beside it is not.
-"""
+"""Few positions: two of them determine the effect of temperature, but not the constants."""
 
 from __future__ import annotations
 
@@ -19,19 +17,19 @@ MICRO_G = 9.80665e-6
 
 
 def minutes(values: Floats) -> Floats:
-    """Means of a minute at 2 Hz [ug], the first minutes, without a temperature, left out."""
+    """Means of a minute at 2 Hz [ug], without the first minutes, which have no temperature."""
     values = values[~np.isnan(values).any(axis=1)]
     n = len(values) // 120
     return values[: 120 * n].reshape(n, 120, 3).mean(axis=1) / MICRO_G
 
 
 def left_by(pair: tuple[int, int], **options: str) -> Floats:
-    """Fit two positions; drift of each axis in a third, which was at rest all the time [ug]."""
+    """Fit two positions; return the drift of each axis in a third position at rest [ug]."""
     bags = [BAGS / f'fit/0{number}.mcap' for number in pair]
     calibration = tc.fit(bags, gravity=9.80665, **options)
     held_out = tc.read(BAGS / 'held_out.mcap')
     corrected = calibration.correct(held_out.time_s, held_out.counts, **held_out.temperatures)
-    # In an attitude nobody has seen the constants are not known, and the claim says so.
+    # In a new attitude the constants are uncertain, and the covariance includes that.
     sd = np.sqrt(np.nanmedian(np.einsum('nii->ni', corrected.covariance), axis=0))
     assert (sd > 1000.0 * MICRO_G).any()
     return np.asarray(minutes(corrected.specific_force).std(axis=0))
@@ -39,8 +37,8 @@ def left_by(pair: tuple[int, int], **options: str) -> Floats:
 
 @pytest.mark.parametrize('pair', [(1, 2), (2, 5), (3, 9), (4, 8)])
 def test_two_positions_tell_the_thermal_response(pair: tuple[int, int]) -> None:
-    # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 of them know their sd to 6 %, and a tenth is what
-    # a few columns too many may add. Of all 36 pairs half do as well (docs/accuracy.md).
+    # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine their sd to 6 %, and a few
+    # superfluous columns may add a tenth. Half of all 36 pairs are as good (docs/accuracy.md).
     assert left_by(pair) == pytest.approx([1.2] * 3, rel=0.3)
 
 

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A temperature in a message of any type: what `rosbags` deserializes there, for many at once."""
+"""
+A temperature in a message of any type: the values of many messages at once equal those of
+`rosbags`.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +19,13 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording.blocks import Messages
 from thermo_comp.recording.fields import Field, definitions_of
 from thermo_comp.recording.overview import survey_recording, unused_thermometers
 from thermo_comp.recording.reader import open_recording, read_recording
+from thermo_comp.recording.serialized import Messages
 from thermo_comp.recording.topics import Topics
 
-# As px4_msgs has them: no header, and the driver's temperature beside the samples.
+# As in px4_msgs: no header, and the temperature beside the samples.
 PX4 = {
     'px4_msgs/msg/SensorAccel': (
         'uint64 timestamp\nuint64 timestamp_sample\nuint32 device_id\nfloat32 x\nfloat32 y\n'
@@ -145,7 +148,7 @@ def test_definitions_are_the_bags_own_or_known_or_said() -> None:
 
 
 def driver_bag(path: Path, store: Any, storage: StoragePlugin = StoragePlugin.MCAP) -> list[float]:
-    """Write 50 Imu messages, and between them PX4's and a bare Float64; return the former's."""
+    """Write 50 Imu messages, and PX4's and a bare Float64 between them; return PX4's."""
     celsius = []
     with Writer(path, version=9, storage_plugin=storage) as bag:
         kinds = {
@@ -165,7 +168,7 @@ def driver_bag(path: Path, store: Any, storage: StoragePlugin = StoragePlugin.MC
         level = store.types['geometry_msgs/msg/Quaternion'](0, 0, 0, 1)
         for row in range(50):
             stamp_ns = START_NS + row * 10**7
-            # The recorder's clock is not the driver's.
+            # The recorder's clock differs from the driver's.
             log_ns = stamp_ns + 10**12
             if row % 5 == 0:
                 accel = store.types['px4_msgs/msg/SensorAccel']
@@ -189,7 +192,7 @@ def test_a_bag_with_a_drivers_own_type(tmp_path: Path, store: Any, storage: Stor
     found = read_recording(tmp_path / 'bag', Topics.named(names))
     assert 'board, case without a stamp' in str(found.info.chosen)
     board, case = (found.columns.temperatures[name] for name in ('board', 'case'))
-    # The first came before any sample; the others have the stamp of the sample before them.
+    # The first reading is before any sample; the others get the stamp of the previous sample.
     assert board.celsius.tolist() == celsius[1:]
     assert board.stamp_ns.tolist() == [START_NS + (row - 1) * 10**7 for row in range(5, 50, 5)]
     assert case.celsius.tolist() == [one - 1.0 for one in celsius]

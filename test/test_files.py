@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-How an output comes to be: nothing that is read, and nothing of another kind, is ever replaced.
+Outputs: no input, and no file of another kind, is ever replaced.
 
 WHY: `--force` destroyed the recordings that a command read; of two writers one lost its result
-without a word; an output was open to all whatever the umask said, and took the place of a link.
+silently; an output was readable by everyone whatever the umask, and replaced a link.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def umask(mask: int) -> Iterator[None]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a folder with a bag of each sort, a calibration, and other names of them."""
+    """Return a folder with bags of each kind, a calibration, and other names of them."""
     save_calibration(calibration(), tmp_path / 'unit.yaml')
     bag(tmp_path / 'raw.mcap')
     bag(tmp_path / 'raw')
@@ -219,7 +219,7 @@ def test_a_link_is_written_through(tmp_path: Path) -> None:
     (tmp_path / 'store').mkdir()
     link = tmp_path / 'current.yaml'
     link.symlink_to('store/unit.yaml')
-    for overwrite in (False, True):  # it leads nowhere first
+    for overwrite in (False, True):  # a dangling link at first
         save_calibration(calibration(), link, overwrite=overwrite)
         assert link.is_symlink()
         assert not (tmp_path / 'store' / 'unit.yaml').is_symlink()

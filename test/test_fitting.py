@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fit as a whole, on simulated units whose truth is known."""
+"""The whole fit on simulated units with known truth."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import ArrayBlock
+from triads import triad
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import SimulatedRun, arrays
 from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.typing import Floats
@@ -70,7 +70,7 @@ def constants(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
 
 
 def claimed(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
-    """Their sd, K's relative."""
+    """Their sd, that of K relative."""
     assert calibration.posterior is not None
     layout, sd = (
         parameter_layout(calibration),
@@ -80,9 +80,9 @@ def claimed(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     return sd[bias], sd[scale], sd[layout.misalignment :]
 
 
-# A reading every four seconds: within them a ramp of 1.5 K/min moves the board by 0.1 K.
+# A reading every four seconds: a ramp of 1.5 K/min changes the board by 0.1 K between them.
 OWN_LAGS, PAPER, PLAIN = (
-    unit_preset(name, 1).with_thermometers(rate_hz=0.25) for name in ('own-lags', 'paper', 'plain')
+    triad(name, 1).with_thermometers(rate_hz=0.25) for name in ('own-lags', 'paper', 'plain')
 )
 
 
@@ -114,7 +114,7 @@ def test_truth_lies_within_the_claimed_sd(response: FitResult) -> None:
     found = pulls(response, OWN_LAGS)
     assert np.abs(found).max() < 4.0
     assert np.sqrt(np.mean(found**2)) < 2.0
-    # And it is worth something: micro-g and ppm of a drift of hundreds.
+    # The claimed sd is small: micro-g and ppm, for a drift of hundreds.
     bias_sd, scale_sd, M_sd = claimed(response.calibration)
     assert (bias_sd / np.array(OWN_LAGS.counts_per_micro_g)).max() < 5.0
     assert scale_sd.max() < 10e-6
@@ -133,7 +133,7 @@ def test_the_response_reaches_the_noise(response: FitResult) -> None:
 def test_attitudes_have_unit_norm(response: FitResult) -> None:
     up = np.array([position.up for position in response.positions])
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0, rtol=1e-14)
-    # Found within some urad of the true direction, without ever being told.
+    # The directions are unknown to the fit and estimated within some urad.
     np.testing.assert_allclose(up, positions(12, 1), atol=3e-5)
 
 
@@ -142,14 +142,14 @@ def test_the_paper_s_model_on_its_own_physics(golovach: FitResult) -> None:
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        # Each regime has its own curve: there is no single one to show.
+        # Each regime has a curve of its own, so that there is not a single one.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
     # A linear static set and a quadratic dynamic one.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # What the scheme leaves on this unit's ramps goes into its levels, too: they are as good as
-    # the scheme, no better.
+    # The residual of the model in this unit's ramps changes its levels, which are as good as the
+    # model.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)
@@ -168,10 +168,10 @@ def test_the_evidence_is_complete(response: FitResult) -> None:
     assert [row.section for row in provenance.residuals] == ['static', 'dynamic', 'all']
     assert {finding.level for finding in response.findings} <= {'advice', 'good'}
     assert 'refusal' not in {finding.level for finding in response.findings}
-    # What each group is worth stands in the file.
+    # The file contains the contribution of each group.
     judged = {(one.part, one.group) for one in calibration.evidence}
     assert {('bias', 'curve'), ('scale', 'curve')} <= judged
-    # A term of no weight is there for the covariance alone: nobody could have seen it.
+    # A term with zero weight is only needed for the covariance.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
     assert {term.group for term in weighty} <= {group for _, group in judged}
 
@@ -183,8 +183,8 @@ def test_the_file_holds_the_fit(response: FitResult, tmp_path: Path) -> None:
 
 
 def test_the_compensator_does_what_the_fit_promised(response: FitResult) -> None:
-    # A run and an attitude that the fit never saw, corrected sample by sample: the same noise as
-    # the positions left out, and the published variance covers the error.
+    # A run in a new attitude, corrected sample by sample: the same noise as in positions left out,
+    # and the published variance covers the error.
     up = np.array([[0.48, -0.6, 0.64]])
     (record,) = records_of(OWN_LAGS, up, 77)
     compensator = Compensator(response.calibration)
@@ -192,13 +192,13 @@ def test_the_compensator_does_what_the_fit_promised(response: FitResult) -> None
     per_window = round(60.0 * RATE_HZ)
     n = len(found.index) // per_window
     force = found.specific_force[: n * per_window].reshape(n, per_window, 3).mean(axis=1)
-    # Until the start of the lags has faded what is not known of it dominates.
+    # The uncertainty of the lags' start dominates until it has decayed.
     late = force[45:]
     rms = residual_statistics(norm_residual(late, STANDARD_GRAVITY)).rms
     assert rms < 2.0 * response.residuals[-1].left_out.rms
     density = np.array(response.calibration.noise_density_m_s2_sqrt_hz)
     variance = found.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)
-    # White noise and rounding average down, the rest does not.
+    # White noise and rounding average out, the rest does not.
     variance += density**2 / 60.0 - np.array(compensator.thermal.correction.noise)
     error = (force - record.truth.specific_force) / np.sqrt(variance)
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
@@ -208,12 +208,13 @@ def test_six_faces_leave_misalignment_at_its_prior() -> None:
     result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'))
     _, _, M = constants(result.calibration)
     _, scale_sd, M_sd = claimed(result.calibration)
-    # Not told by six faces: 0 within 1 mrad.
+    # Six faces do not determine M: 0 within 1 mrad.
     np.testing.assert_allclose(M, 0.0, atol=1e-5)
     np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
     finding = next(one for one in result.findings if one.name == 'misalignment')
     assert (finding.level, '6 distinct positions' in finding.message) == ('advice', True)
-    # Bias and scale are told, but for what M of a mrad does to the faces: half its square.
+    # Bias and scale are determined, except for the effect of M of 1 mrad on the faces: half its
+    # square.
     assert scale_sd.max() < 2e-5
     assert np.abs(pulls(result, PLAIN)).max() < 4.0
 
@@ -226,7 +227,7 @@ def test_one_position_tells_the_bias_along_gravity_over_temperature() -> None:
     np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
     assert any(one.name == 'positions' and one.level == 'advice' for one in result.findings)
     assert np.isfinite(result.positions[0].left_out_rms)
-    # But what it saw is met.
+    # The recorded drift is corrected all the same.
     assert result.residuals[-1].fitted.rms / MICRO_G < 1.0
 
 
@@ -241,7 +242,7 @@ def test_no_temperature_gives_nine_parameters() -> None:
 def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(
     rng: np.random.Generator,
 ) -> None:
-    # WHY: both were fitted without a word. A triad that temperature spares has its constants.
+    # WHY: both were fitted without a message. A triad without drift only has constants.
     records = records_of(PLAIN, positions(9, 1), 4)
     bias, scale, M = PLAIN.bias_at_reference, PLAIN.scale_factor, np.array(PLAIN.M)
 
@@ -252,7 +253,8 @@ def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(
         return fit(sources, FitOptions(**options))  # type: ignore[arg-type]
 
     def force(counts: Floats) -> Floats:
-        # What a compensator gives has no steps, and its noise hides those of the counts.
+        # The output of a compensator has no quantisation steps, and its noise hides those of the
+        # counts.
         return ((counts - bias) / scale) @ M.T + 5e-4 * rng.standard_normal(counts.shape)
 
     raw = fit_of(lambda counts: counts)
@@ -271,8 +273,8 @@ def test_bags_with_and_without_temperature_contradict_themselves() -> None:
 
 
 def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> None:
-    # An INS at rest beside it must not notice: at most 1 ug from one second to the next, or what
-    # the longest cross-over, ten times the 30 s asked for, leaves to each second.
+    # An INS at rest must not notice the switch: at most 1 ug per second, or, for the longest
+    # transition of ten times the given 30 s, the difference divided by its duration.
     (record,) = records_of(PAPER, positions(1, 5), 905)
 
     def forces(weight: float | None) -> Floats:
@@ -283,7 +285,8 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> No
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return found.specific_force
 
-    # The noise is in all three alike, and what the weight moves along the gap is left.
+    # All three have the same noise, which cancels; the change of weight along the difference of
+    # the sets remains.
     output, static, dynamic = forces(None), forces(0.0), forces(1.0)
     gap = dynamic - static
     size = np.linalg.norm(gap, axis=1)
@@ -292,7 +295,7 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> No
     moved = np.abs(weight[per_second:] - weight[:-per_second]) * size[per_second:]
     assert weight[0] == pytest.approx(0.0, abs=1e-6)
     assert weight.max() == pytest.approx(1.0, abs=1e-6)
-    # The gap drifts while it is crossed, by far less than a hundredth.
+    # The difference drifts during the transition by far less than a hundredth.
     assert moved.max() / MICRO_G < 1.01 * max(1.0, size.max() / MICRO_G / 300.0)
 
 

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A board warmer than its case by its own heat: what a change does is even about that."""
+"""
+A board warmer than its case by self-heating: effects of temperature changes are even about that.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +19,18 @@ from thermo_comp.simulation.campaign import positions
 
 GRAVITY, MICRO = 9.80665, 9.80665e-6
 STEP_S, OWN_HEAT_K = 2.0, 0.6
-#: Of 30 samples of 4 ug, a minute each.
+#: Mean of 30 samples of 4 ug, a minute.
 NOISE = 4.0 * MICRO
 
 
 def lagged(values, tau: float):
-    """First-order lag that begins in equilibrium."""
+    """First-order lag that starts in equilibrium."""
     share = 1.0 - np.exp(-STEP_S / tau)
     return lfilter([share], [1.0, share - 1.0], values - values[0]) + values[0]
 
 
 def recorded(rng, up, name: str, targets: tuple[float, ...]) -> FitSource:
-    """Record a unit of two thermal nodes whose bias is even in what heats its board."""
+    """Record a unit of two thermal nodes whose bias is even in the heating of its board."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):
         corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]
@@ -53,19 +55,19 @@ def recorded(rng, up, name: str, targets: tuple[float, ...]) -> FitSource:
 
 def test_what_a_change_does_is_found_about_rest(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
-    bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(9, 3))]
+    bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(6, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # Of two readings of 3 mK a minute, for some twenty hours: 0.1 mK, and rates of minutes.
+    # Two readings of 3 mK a minute for about twenty hours: 0.1 mK, and rates of minutes.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
-    groups = ('curve', 'now', 'board', 'even', 'change')
+    groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     found, about_0 = (
         fit(bags, FitOptions(gravity=GRAVITY, input='m/s^2', groups=names))
         for names in (groups, groups[:-1])
     )
     kept = {column.group for column in found.calibration.response}
-    assert 'change' in kept
-    assert 'even' not in kept
-    # Means of a minute; about 0 a part of what the change does is left.
+    assert 'gradient_even_about_rest' in kept
+    assert 'gradient_even' not in kept
+    # Means of a minute; columns even about 0 leave a part of the effect.
     floor = NOISE / np.sqrt(30.0)
     assert found.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor
@@ -74,5 +76,5 @@ def test_what_a_change_does_is_found_about_rest(rng):
 
 def test_what_is_forced_takes_part_beside_the_groups_that_may(rng):
     bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(6, 3))]
-    options = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), forced=('now',))
-    assert {column.group for column in fit(bags, options).calibration.response} == {'now'}
+    options = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), forced=('gradient',))
+    assert {column.group for column in fit(bags, options).calibration.response} == {'gradient'}

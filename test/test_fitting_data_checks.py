@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The verdict: each refusal and each advice, with its number, on tables made to deserve it."""
+"""Refusals and advice of a fit, each with its number, on tables made to trigger them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def good(rng: np.random.Generator) -> tuple[ThermalWindows, np.ndarray]:
         data=data,
         temperature=case - gradient,
         rate=rate,
-        # Half of the time counts as static, at all temperatures.
+        # Half of the time is static, at all temperatures.
         weight=(rate > 0.0).astype(float),
         gradient=gradient,
         raw=np.zeros((len(case), 0)),
@@ -95,7 +95,8 @@ def test_no_ramp_and_one_direction_are_seen(good: tuple[ThermalWindows, np.ndarr
 def test_soaks_that_are_static_at_one_temperature_are_seen(
     good: tuple[ThermalWindows, np.ndarray],
 ) -> None:
-    # WHY: the static set was off by 800 ug at the others, and claimed 100.
+    # WHY: the static set was wrong by 800 ug at the other temperatures, with a claimed sd of 100
+    # ug.
     windows, up = good
     weight = (np.abs(windows.temperature - 20.0) > 3.0).astype(float)
     message = findings_of(replace(windows, weight=weight), up)['soak'].message
@@ -120,7 +121,7 @@ def test_six_faces_tell_no_misalignment(good: tuple[ThermalWindows, np.ndarray])
     assert 'the misalignment stays at its prior' in (
         findings_of(windows, faces)['misalignment'].message
     )
-    # The same face again, two degrees off, is no new position.
+    # The same face again, two degrees off, is not a new position.
     tilted = faces + 0.03
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
@@ -136,13 +137,13 @@ def test_few_and_badly_spread_positions_are_said(good: tuple[ThermalWindows, np.
 
 
 def test_geometry_is_the_scatter_of_the_parameters(rng: np.random.Generator) -> None:
-    # By Monte Carlo: least squares of pure norm noise on the nine parameters.
+    # By Monte Carlo: least squares of pure noise of the norm on the nine parameters.
     up = positions(12, 5)
     x, y, z = up.T
     jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))
     noise = rng.standard_normal((4000, 12))
     scatter = (noise @ np.linalg.pinv(jacobian).T).std(axis=0).max()
-    # 4000 draws know a standard deviation to 1.1 %.
+    # 4000 draws determine a standard deviation to 1.1 %.
     assert geometry(up, with_misalignment=True) == pytest.approx(scatter, rel=0.05)
 
 
@@ -155,7 +156,7 @@ def test_refusals_stop_and_may_be_allowed() -> None:
 
 
 def judged(raw: float, fitted: float, slow: float, left_out: float | None = None, **options: str):
-    """Judge residuals of so many ug RMS."""
+    """Judge residuals with a given RMS [ug]."""
     steps = [
         residual_statistics(np.full(0 if one is None else 9, (one or 0.0) * MICRO_G))
         for one in (raw, raw, raw, fitted, left_out)
@@ -171,7 +172,7 @@ def test_what_the_fit_left_is_said() -> None:
     good = judged(100.0, 1.0, 0.2, 1.5)
     assert set(good) == {'residual'}
     assert '100.0 ug RMS raw, 1.5 ug on data left out, 1.0 ug' in good['residual'].message
-    # Where no position can be spared, there is no such number.
+    # If no position can be left out, there is no such number.
     assert 'left out' not in judged(100.0, 1.0, 0.2)['residual'].message
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the fit claims of real units, against what they do from position to position."""
+"""Claimed sd of real units against their scatter from position to position."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
 def ratio(path: Path) -> float:
-    """Fit one log; jackknife over its positions, in units of the claimed sd."""
+    """Fit one log; return the jackknife over its positions, in units of the claimed sd."""
     accel = np.loadtxt(path, usecols=(0, 1, 2))
     stamps = np.arange(len(accel), dtype=np.int64) * 10_000_000
     nothing_ns, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -57,5 +57,5 @@ def test_claimed_sd_is_the_jackknife_s(real_data: Path) -> None:
     if not all(path.is_file() for path in logs):
         pytest.skip('the logs of the MPU-9150 units are not there')
     ratios = [ratio(path) for path in logs]
-    # Some 20 positions each, nine parameters: a jackknife knows the sd to 15 %.
+    # About 20 positions each, nine parameters: a jackknife determines the sd to 15 %.
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4, ratios

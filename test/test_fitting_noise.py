@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Noise: whitening equals the dense covariance matrix, and its parameters come out of series."""
+"""
+Noise: whitening equals the dense covariance matrix, and its parameters are estimated from series.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,11 @@ from thermo_comp.fitting.unknowns import WHITE, Noise
 
 
 def uneven(rng):
-    """Make positions of several lengths - one of a single window - with gaps and weights."""
+    """Make positions of several lengths (one of a single window) with gaps and weights."""
     lengths = (7, 1, 12, 4)
     position = np.repeat(np.arange(len(lengths)), lengths)
     steps = rng.uniform(1.0, 9.0, len(position))
-    # A gap in which a correlation of short time is lost.
+    # A gap that is longer than the short correlation time.
     steps[12] = 4000.0
     time = np.concatenate(
         [100.0 * k + np.cumsum(steps[position == k]) for k in range(len(lengths))]
@@ -25,7 +27,7 @@ def uneven(rng):
 
 
 def dense(position, time, weight, noise):
-    """Write down the covariance: exponentially correlated in each position, and white noise."""
+    """Build the covariance: exponentially correlated noise in each position, and white noise."""
     same = position[:, None] == position
     distance = np.abs(time[:, None] - time)
     slow = np.where(same, noise.ratio * np.exp(-distance / noise.time_s), 0.0)
@@ -43,7 +45,7 @@ def test_products_and_determinant_are_those_of_the_dense_matrix(rng, noise):
     white = whitener.filter(series, gains)
     covariance = dense(position, time, weight, noise)
     expected = series.T @ np.linalg.solve(covariance, series)
-    # Rounding alone, of a matrix whose condition is below 1e6.
+    # Rounding only, of a matrix with a condition below 1e6.
     np.testing.assert_allclose(white.T @ white, expected, rtol=1e-9, atol=1e-10)
     determinant = np.linalg.slogdet(covariance)[1]
     assert whitener.log_determinant(gains) == pytest.approx(determinant, abs=1e-9)
@@ -63,8 +65,8 @@ def drawn(rng, n, steps, noise):
 
 @pytest.mark.parametrize('noise', [Noise(1.0, 600.0), Noise(0.3, 2000.0), Noise(30.0, 300.0)])
 def test_ratio_and_time_are_found(rng, noise):
-    # 3 axes x 9 positions x 300 windows of a minute: 240 or more correlation times tell the
-    # variance of the process to sqrt(2 / 240) = 9 %, its time to some 15 %.
+    # 3 axes x 9 positions x 300 windows of a minute: 240 or more correlation times determine the
+    # variance of the process to sqrt(2 / 240) = 9 %, its time to about 15 %.
     whitener, weight, series = drawn(rng, 9, 300, noise)
     found = whitener.estimate(5.0 * series, weight)
     assert 0.5 < found.ratio / noise.ratio < 2.0
@@ -72,7 +74,7 @@ def test_ratio_and_time_are_found(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # The threshold is a chance of 1 % per series; none of these is drawn beyond it.
+    # The threshold has a false alarm rate of 1 % per series; none of these exceeds it.
     assert [
         whitener.estimate(series, weight)
         for whitener, weight, series in (drawn(rng, 5, 100, WHITE) for _ in range(10))
@@ -80,8 +82,8 @@ def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
 
 
 def test_a_time_that_no_position_holds_is_not_claimed(rng):
-    # Positions of twenty minutes show no correlation time of hours: the longest that is tried is
-    # a fifth of them.
+    # Positions of twenty minutes do not show a correlation time of hours: the longest time tried
+    # is a fifth of them.
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
     alone = Whitener(np.arange(3), np.zeros(3))

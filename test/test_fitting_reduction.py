@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reduction of samples: cells, still intervals, windows, readings; gravity; what sensors show."""
+"""Reduction of samples: cells, still intervals, windows, readings; gravity; sensor settings."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_chunks_do_not_matter(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng: np.random.Generator, rest_s: int) -> None:
-    # WHY: at 1 Hz a cell was half a minute; one mean was taken of all attitudes, 0.07 m/s^2 long.
+    # WHY: at 1 Hz a cell was half a minute, and the mean over all attitudes was 0.07 m/s^2 long.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     none, empty = np.empty(0, np.int64), np.empty(0)
@@ -82,9 +82,9 @@ def test_short_rests_of_slow_samples_are_found(rng: np.random.Generator, rest_s:
     assert len(bag.intervals) >= 18
     for one in bag.intervals:
         size = np.linalg.norm(one.mean, axis=1)
-        # 5 ug of each sample, in windows of ten and the short ones behind them.
+        # 5 ug of each sample, in windows of ten and the short ones at the end.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
-    # A long rest has cells as long as before.
+    # A long rest has cells of the same length as before.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])
     assert reduced([alone], full_scale=None).window_s == 30.0
 
@@ -109,7 +109,7 @@ def test_positions_in_one_bag_are_told_apart(rng: np.random.Generator) -> None:
     first, second = reduced([block(accel)]).intervals
     np.testing.assert_allclose(first.mean[0], (0.0, 0.0, 3000.0), atol=0.1)
     np.testing.assert_allclose(second.mean[-1], (3000.0, 0.0, 0.0), atol=0.1)
-    # At most two cells are given up on either side of the motion.
+    # At most two cells are dropped on either side of the motion.
     assert (first.end_ns - first.start_ns) * 1e-9 == pytest.approx(40.0, abs=1.6)
     assert (second.end_ns - second.start_ns) * 1e-9 == pytest.approx(30.0, abs=1.6)
 
@@ -123,10 +123,9 @@ def test_vibration_is_cut_out(rng: np.random.Generator) -> None:
 
 
 def test_a_chamber_whose_compressor_cycles_has_one_position(rng: np.random.Generator) -> None:
-    # WHY: half of what was recorded was left out, and each pause of the compressor was a position
-    # of its own: 18 bags had 1135, and their fit took ten minutes.
-    # WHAT: twelve shakes of three times the noise belong to the rest, and a turn of 300 urad
-    # between two of them is still one.
+    # WHY: half of the recording was left out, and each pause of the compressor was a position: 18
+    # bags had 1135, and their fit took ten minutes. WHAT: twelve shakes of three times the noise
+    # belong to the rest, and a turn by 300 urad between two of them is still detected.
     accel = still(rng, 720.0, (0.0, 0.0, 3000.0))
     for start in range(3000, 72000, 6000):
         accel[start : start + 3000] += 0.9 * rng.standard_normal((3000, 3))
@@ -194,7 +193,8 @@ def test_slow_samples_get_longer_cells(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # Cells of half a second fill ten; 30 samples of 4 Hz do not, and those of 1 Hz take longer.
+    # Cells of half a second fill windows of ten; 30 samples at 4 Hz do not, and those at 1 Hz are
+    # longer.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
 def test_windows_are_as_long_as_stated(
@@ -208,7 +208,7 @@ def test_windows_are_as_long_as_stated(
     assert bag.window_s == window_s
     assert bag.n_cells == pytest.approx(150 / cell_s)
     assert interval.n_whole == len(interval.time) == 150 / window_s
-    # A sample lies in one window or in the next.
+    # A sample is in exactly one window.
     np.testing.assert_allclose(interval.count, window_s * rate_hz, atol=1.0)
     np.testing.assert_allclose(np.diff(interval.time), window_s, atol=1.0 / rate_hz)
 
@@ -282,9 +282,9 @@ def test_a_thermometer_is_known_from_its_readings(
 ) -> None:
     found = learn_thermometer([course(quantum, noise, rng)], ThermometerSettings())
     assert found.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # Noise below a tenth of the quantum cannot be seen; that tenth is taken.
+    # Noise below a tenth of the quantum is invisible; a tenth is assumed.
     assert found.noise_sd_c == pytest.approx(max(noise, 0.1 * quantum), rel=0.1)
-    # An onset through the lag, seen through means of a minute: known to a third.
+    # An onset through the lag, in means of a minute: determined to a third.
     assert found.lag_s == pytest.approx(300.0, rel=0.35)
     assert found.fastest_ramp_k_min >= 1.0
 
@@ -315,8 +315,8 @@ def test_a_slow_ramp_is_not_to_be_missed(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize('step', [1.0, 16.0, 1.0 / 300.0])
 def test_a_coarse_sensor_rests_too(step: float, rng: np.random.Generator) -> None:
-    # An axis that reads one number for long, and toggles between two for long, is still all the
-    # time, whatever its step; a tenth of the cells has no variance at all.
+    # An axis that is constant for long, or alternates between two values, is at rest whatever its
+    # quantum; a tenth of the cells has no variance at all.
     slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
     accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))
     bag = reduced([block(np.round(accel) * step)], full_scale=None)

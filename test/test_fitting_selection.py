@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The chosen model, its widths, noises and claim, of tables whose truth is known."""
+"""The selected model, its prior sd, noises and claimed sd, for tables with known truth."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ IDLE = np.array(GROUPS) == 'idle'
 
 
 def constants(truth: Truth) -> Prior:
-    """No column yet, and noises that are wrong."""
+    """No columns yet, and wrong noise parameters."""
     return prior_of(
         truth, (), offset_sd=MICRO, offset_scale=30.0 * MICRO, sigma=np.full(3, 5.0 * MICRO),
         noise=Noise(), misalignment_sd=1e-3,
@@ -86,19 +86,20 @@ def test_what_explains_nothing_is_not_chosen(calm: Case) -> None:
     assert {(one.part, one.group) for one in evidence} == {
         (part, group) for part in ('bias', 'scale') for group in ('curve', 'board')
     }
-    # Its weights are 0, not small.
+    # Its weights are exactly 0.
     assert not found.posterior.state.weights[..., IDLE].any()
 
 
 def test_models_that_were_looked_at_show_their_left_out_errors(calm: Case) -> None:
     _, found, truth = calm
     rms = {trial.groups: trial.score.rms for trial in found.trials}
-    # Constants are always among them, then the curve; an error is of the size of what is missing.
+    # The trials contain the constants, then the curve; the error is the size of the missing
+    # effect.
     assert [*rms][:2] == [(), ('curve',)]
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in found.trials if trial.is_chosen)
     assert chosen.score is found.score
-    # Left-out windows show their white noise, and how well the others know the rest.
+    # Left-out windows have their white noise, plus the uncertainty of the fit to the others.
     assert 1.0 < found.score.rms / truth.sigma[0] < 1.15
     assert all(is_better(trial.score, found.score) for trial in found.trials[:2])
 
@@ -114,8 +115,8 @@ def test_what_is_forced_stays(calm: Case) -> None:
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
 def test_a_group_must_explain_more_than_an_accident(where: str, is_chosen: bool) -> None:
-    # WHY: a column may fit one recording, or one part of the program that all bags share.
-    # WHAT: evidence asks for the group in each case; data that took no part decide.
+    # WHY: a column may fit one recording, or one part of the program that all bags share. WHAT:
+    # the evidence favours the group in each case; data left out of the fit decide.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -133,8 +134,8 @@ def test_a_group_must_explain_more_than_an_accident(where: str, is_chosen: bool)
 def test_a_part_that_lags_is_found_although_no_curve_helps_alone(
     n_positions: int, step_s: float
 ) -> None:
-    # WHY: the choice stopped at constants, 440 ug instead of 0.6, where a curve alone was refused.
-    # WHAT: a bias that follows a lagged temperature alone is a curve and a lag that cancel.
+    # WHY: the selection stopped at constants, 440 ug instead of 0.6, as a curve alone did not
+    # help. WHAT: a bias that follows only a lagged temperature is a curve and a lag that cancel.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     truth = Truth(on_bias=on_bias, on_scale=np.zeros((3, 6)))
@@ -150,13 +151,13 @@ def test_noises_come_out(noisy: Case) -> None:
     _, found, truth = noisy
     prior = found.prior
     assert {'curve', 'board'} <= chosen_groups(found)
-    # 1080 windows per axis: white noise is known to 3 % and somewhat worse beside the slow one.
+    # 1080 windows per axis: white noise is determined to 3 %, slightly worse with the slow noise.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
-    # Positions are six correlation times long, and curves take a part of what is slow.
+    # Positions last six correlation times, and curves absorb a part of the slow noise.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
-    # 18 positions x 3 axes, of which directions, scale, bias and M take 36 + 9: nine are left,
-    # a sd of 24 %.
+    # 18 positions x 3 axes, of which directions, scale, bias and M use 36 + 9: nine degrees of
+    # freedom, a sd of 24 %.
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
 
 
@@ -167,8 +168,8 @@ def test_white_noise_is_not_taken_for_slow_noise(calm: Case) -> None:
 
 
 def test_prior_sds_are_those_of_the_weights(calm: Case) -> None:
-    # The fixed point: sd^2 = sum of squares / effective parameters, three where all is seen; the
-    # hyperprior of a factor of ten pulls by 1 / (2 x 3 x 5.3) of the distance to it.
+    # The fixed point: sd^2 = sum of squares / effective parameters, three if all are determined;
+    # the hyperprior of a factor of ten shifts it by 1 / (2 x 3 x 5.3) of the distance.
     regression, found, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(found.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -178,7 +179,7 @@ def test_prior_sds_are_those_of_the_weights(calm: Case) -> None:
 
 
 def test_no_weight_is_believed_steeper_than_a_data_sheet() -> None:
-    # A unit of ten times the steepest slope per kelvin: its prior stays at the cap.
+    # A unit with ten times the steepest slope per kelvin: its prior stays at the limit.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
     regression, state = begin(windows, up)
@@ -195,17 +196,17 @@ def test_no_weight_is_believed_steeper_than_a_data_sheet() -> None:
 def test_truth_lies_within_the_claimed_sd(noisy: Case) -> None:
     regression, found, truth = noisy
     errors = truth.errors(regression, found.posterior)
-    # Weights that were pruned have no sd; 0 is the truth for the idle ones.
+    # Pruned weights have no sd; the true weights of the idle columns are 0.
     every = np.concatenate([*errors.values()])
-    # Some thirty numbers: their rms is known to 13 %, and learnt widths make it a little less so.
+    # About thirty numbers: their RMS is determined to 13 %, slightly less with estimated prior sd.
     assert len(every) > 20
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
     assert np.abs(every).max() < 4.0
 
 
 def test_bayes_factor_is_the_fall_of_the_evidence_without_it() -> None:
-    # Savage-Dickey against brute force: solve without the group, the rest of the prior the same.
-    # Exact in a linear problem; that of the directions is linear to noise / g.
+    # Savage-Dickey against brute force: solve without the group, with the same prior for the rest.
+    # Exact in a linear problem; the directions are linear to noise / g.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
@@ -232,7 +233,7 @@ def test_what_a_group_explains_is_what_it_adds(calm: Case) -> None:
     evidence = group_evidence(regression, found.posterior, found.prior)
     explains = {(one.part, one.group): one.explains_m_s2 for one in evidence}
     expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
-    # Some 100 ug beside a noise of 2.
+    # About 100 ug, with a noise of 2 ug.
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
@@ -245,15 +246,15 @@ def test_outliers_do_not_pull(calm: Case) -> None:
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
     _, other = selected_of(truth, dirty, calm[1].posterior.state.up)
     sd = np.sqrt(one.posterior.variance[one.posterior.layout.bias])
-    # 2 % of the windows, each worth 3 sd at most, shift by about one sd; unbridled, each is worth
-    # 100, and beside them the curve is not seen.
+    # 2 % of the windows, each limited to 3 sd, shift the result by about one sd; without limit
+    # each counts 100 sd, and hides the curve.
     assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.prior.sigma, truth.sigma, rtol=0.2)
     np.testing.assert_array_equal(other.prior.column_sd[0] > 0.0, one.prior.column_sd[0] > 0.0)
 
 
 def test_means_of_few_values_are_no_knocks() -> None:
-    # A converter that carries its remainder: most means are equal, others a count more or less.
+    # A converter that carries its remainder: most means are equal, others differ by a count.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
     prior = prior_of(Truth(), (), offset_sd=1e-9)
@@ -306,8 +307,8 @@ def test_how_bags_begin_is_learnt(start_sd: float, lower: float, upper: float) -
 
 @pytest.mark.parametrize('away', [0.0, 30.0])
 def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm: Case, away: float) -> None:
-    # WHY: siblings, or a unit's last calibration, may be nearer to this unit than they look, or
-    # farther. WHAT: of a narrow and a wide knowledge the evidence takes the one that is true.
+    # WHY: siblings, or the last calibration of a unit, may be nearer to this unit than they seem,
+    # or farther. WHAT: of a narrow and a wide prior the evidence selects the true one.
     _, one, truth = calm
     state = one.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -326,7 +327,7 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm: Case, away
     found = fit_all(regression, state, prior, fixed, priors)
     assert found.prior.informative is priors[int(away > 0.0)]
     curve = unit_of(found.posterior.state, layout)[places]
-    # The same data say it: the two differ by less than each is uncertain.
+    # The same data: both results differ by less than their uncertainties.
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(found.posterior.variance[places]).max()
 
 
@@ -343,13 +344,14 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone() -> None:
     found, left = drift_left(windows)
     # 12 positions x 2 angles x 2 columns: a sd of 10 %.
     assert 0.7 < found.prior.tilt_sd / truth.tilt_sd < 1.3
-    # 5 urad turn 5 ug into any axis; the noise of 720 windows hides 0.1 ug of each weight.
+    # A tilt of 5 urad changes any axis by 5 ug; the noise of 720 windows is 0.1 ug for each
+    # weight.
     assert left < 0.5 * MICRO
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
 
 def test_a_stiff_support_is_not_seen_tilting(calm: Case) -> None:
-    # Less than the noise of the windows that a tilt is seen in, 2 ug / sqrt(60).
+    # Less than the noise of the windows of a tilt, 2 ug / sqrt(60).
     _, found, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)
     tilt = GRAVITY * found.posterior.state.tilt
@@ -358,7 +360,7 @@ def test_a_stiff_support_is_not_seen_tilting(calm: Case) -> None:
 
 
 def claimed(n_positions: int, gravity_sd: float = 0.0) -> tuple[Floats, Floats]:
-    """Claimed and fitted covariance of the unit, of which mounting repeats to 20 ug."""
+    """Return claimed and fitted covariance of a unit whose mounting repeats to 20 ug."""
     truth = Truth(offset_sd=20.0 * MICRO)
     windows, up = table_of(truth, n_positions, np.random.default_rng(1), n_windows=20)
     regression, state = begin(without_starts(windows), up)
@@ -374,7 +376,7 @@ def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting() -> N
     for n in (9, 24):
         claim, fitted = claimed(n)
         assert np.linalg.eigvalsh(claim).min() > 0.0
-        # Biases, behind kappa in each axis.
+        # The biases, after kappa in each axis.
         k = (len(claim) - 3) // 3
         at = 1 + k * np.arange(3)
         ratios.append(np.sqrt(np.diag(claim)[at].mean() / np.diag(fitted)[at].mean()))
@@ -387,7 +389,7 @@ def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once() -> None:
     (without, _), (within, _) = claimed(12), claimed(12, 5e-4)
     added = within - without
     kappa = np.arange(3) * ((len(without) - 3) // 3)
-    # K is as wrong as g, in each axis by the same ratio; nothing else is.
+    # The relative error of K is that of g in each axis; nothing else has an error.
     both = np.ix_(kappa, kappa)
     np.testing.assert_allclose(added[both], (5e-4 / GRAVITY) ** 2, rtol=2e-3)
     correlation = added[both] / np.sqrt(np.outer(np.diag(added)[kappa], np.diag(added)[kappa]))

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The windows, the curves and the way back to a file: the fit means what the compensator does."""
+"""
+Windows, curves and the conversion to a file: the fit uses the corrections of the compensator.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builders import ArrayBlock
+from triads import triad
 
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit_bags, reduce_bag
 from thermo_comp.fitting.claim import Claim, claim_of
@@ -18,7 +21,6 @@ from thermo_comp.fitting.options import sets_of
 from thermo_comp.fitting.reduction import Readings, ReducedBag
 from thermo_comp.fitting.windows import N_SECTIONS, Model, ThermalWindows, thermal_windows
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import arrays
 from thermo_comp.thermal.memory import MemorySpec, ThermalMemory, memory_on_grid
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
@@ -39,7 +41,7 @@ SECOND = 1_000_000_000
 def sources(n: int, seed: int = 1) -> list[FitSource]:
     plan = [Position(PROGRAM, up) for up in positions(n, seed)]
     result = []
-    unit = unit_preset('own-lags', seed).with_thermometers(rate_hz=0.25)
+    unit = triad('own-lags', seed).with_thermometers(rate_hz=0.25)
     for record in arrays(unit, plan, seed):
         counts = record.counts.astype(np.float64)
         board, case = (record.board_stamp_ns, record.board), (record.case_stamp_ns, record.case)
@@ -88,7 +90,7 @@ def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng: np.random.
 
 
 def test_columns_are_those_of_the_tracker(bags: list[ReducedBag]) -> None:
-    # Window by window against a tracker with its whole memory, read and sampled as online.
+    # Window by window against a tracker with full memory, with readings and samples as online.
     windows = windows_of(bags)
     spec = memory_of(bank())
     table = ColumnTable(bank(), spec, 20.0)
@@ -121,8 +123,8 @@ def test_columns_are_those_of_the_tracker(bags: list[ReducedBag]) -> None:
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # The lags run on the tracker's estimates here and on its readings there, plays turn at once
-    # or a window's part later.
+    # Here the lags follow the tracker's estimates, there its readings; plays turn at once, or a
+    # part of a window later.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
@@ -131,12 +133,12 @@ def test_sets_and_start_states_by_hand(bags: list[ReducedBag]) -> None:
     data = windows.data
     t, w = windows.temperature - 20.0, windows.weight
     assert data.groups[:6] == ('curve',) * 3 + ('set',) * 3
-    # Means of products are those of the means, but for what happens within a minute at 1 K/min.
+    # Means of products equal products of means, except for changes within a minute at 1 K/min.
     np.testing.assert_allclose(data.columns[:, 0], t, atol=1e-9)
     np.testing.assert_allclose(data.columns[:, 1], t * t, atol=0.3)
     np.testing.assert_allclose(data.columns[:, 3], w, atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
-    # What is not known of a lag's start fades with its time constant; t multiplies it in products.
+    # The uncertainty of a lag's start decays with its time constant; in products t multiplies it.
     taus = [tau for _, tau in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]
@@ -144,7 +146,7 @@ def test_sets_and_start_states_by_hand(bags: list[ReducedBag]) -> None:
             assert not data.start[:, k].any()
             continue
         fades = np.exp(-data.time / taus[lag])
-        if column.kind in ('board', 'neighbour') and column.power == 0:
+        if column.kind in ('board', 'gradient_lag') and column.power == 0:
             np.testing.assert_allclose(data.start[:, k], fades, atol=0.15)
         assert np.abs(data.start[-1, k]) <= np.abs(data.start[:, k]).max()
 
@@ -154,8 +156,8 @@ def test_sets_and_start_states_by_hand(bags: list[ReducedBag]) -> None:
 def test_where_a_thermometer_is_lost_nothing_is_known(
     bags: list[ReducedBag], name: str, is_stuck: bool
 ) -> None:
-    # It falls silent in the first ramp, or says the same from then on, and comes back late in the
-    # second one.
+    # The thermometer falls silent in the first ramp, or repeats its value, and comes back late in
+    # the second.
     bag, start, stop = bags[0], 900.0, 2200.0
     readings = bag.temperatures[name]
     age = (readings.stamp_ns - bag.start_ns) * 1e-9
@@ -167,8 +169,8 @@ def test_where_a_thermometer_is_lost_nothing_is_known(
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     told = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([told])
-    # Silence: the time-out of 60 s, five intervals of 4 s, and a window. Whoever stands still is
-    # found out when the other has moved.
+    # Silence: the time-out of 60 s, five intervals of 4 s, and a window. A constant reading is
+    # detected when the other thermometer changes.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])
@@ -180,7 +182,7 @@ def test_where_a_thermometer_is_lost_nothing_is_known(
 
 def test_each_column_stands_without_the_others(bags: list[ReducedBag]) -> None:
     together = windows_of(bags).data
-    for kind in ('board', 'neighbour', 'square'):
+    for kind in ('board', 'gradient_lag', 'square'):
         number = next(k for k, one in enumerate(bank()) if one.kind == kind and one.tau_s == 960.0)
         alone = windows_of(bags, (bank()[number],)).data
         np.testing.assert_array_equal(alone.columns[:, 6], together.columns[:, 6 + number])
@@ -188,7 +190,7 @@ def test_each_column_stands_without_the_others(bags: list[ReducedBag]) -> None:
 
 
 def test_the_lag_of_a_column_moves_it_as_its_slope_says() -> None:
-    # A lag that began a microkelvin elsewhere, through the columns' own formula.
+    # A lag that started a microkelvin higher, through the formula of the columns.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
     layout, table = Layout(spec), ColumnTable(columns, spec, 20.0)
@@ -225,7 +227,8 @@ def test_curves(bags, options, static, dynamic, is_shared) -> None:  # type: ign
     weight = np.linspace(0.0, 1.0, 9)
     columns, levels = found.columns(t, weight), found.levels()
     assert len(columns) == len(levels) == found.static.n_free + 1 + found.dynamic.n_free
-    # At the reference nothing is said; in the static regime nothing of the dynamic set.
+    # No effect at the reference temperature, and no effect of the dynamic set in the static
+    # regime.
     nothing = found.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for column, (_, is_level) in zip(nothing, levels, strict=True):
         np.testing.assert_allclose(column, [0.0, 0.5, 1.0] if is_level else 0.0, atol=1e-12)
@@ -252,7 +255,7 @@ def fitted(request: pytest.FixtureRequest, all_bags: list[ReducedBag]) -> tuple[
 
 
 def states_of(windows: ThermalWindows, calibration: Calibration) -> Floats:
-    """States that have the windows' raw columns in their places."""
+    """Return states with the raw columns of the windows in their places."""
     columns = calibration.response
     spec = memory_of(columns)
     layout = Layout(spec)
@@ -263,7 +266,7 @@ def states_of(windows: ThermalWindows, calibration: Calibration) -> Floats:
     for (tau, width), place in layout.plays.items():
         states[:, place] = plain['play', 'case', tau, width]
     for (name, tau), place in layout.lags.items():
-        kind = 'board' if name == 'board' else 'neighbour'
+        kind = 'board' if name == 'board' else 'gradient_lag'
         states[:, place] = plain.get((kind, 'case', tau, 0.0), 0.0)
     for place in layout.gradients.values():
         states[:, place] = windows.gradient
@@ -271,8 +274,8 @@ def states_of(windows: ThermalWindows, calibration: Calibration) -> Floats:
 
 
 def test_the_file_corrects_as_the_regression(fitted: tuple[FitResult, Claim]) -> None:
-    # Curves, sets and linear columns through the calibration's own correction. Windows are means
-    # over a minute: powers of means are not means of powers, which at 1 K/min is some ppm.
+    # Curves, sets and linear columns through the calibration's correction. Windows are means over
+    # a minute; powers of means differ from means of powers by some ppm at 1 K/min.
     result, _ = fitted
     windows, calibration = result.windows, result.calibration
     state, prior = result.selected.posterior.state, result.selected.prior
@@ -291,8 +294,8 @@ def test_the_file_corrects_as_the_regression(fitted: tuple[FitResult, Claim]) ->
 
 
 def test_covariance_of_the_file_is_that_of_the_claim(fitted: tuple[FitResult, Claim]) -> None:
-    # The variance of levels through the file's parameters and through the regression's: the same
-    # linear form of the claim.
+    # The variance of levels by the file's parameters and by the regression's: the same linear
+    # form.
     result, claim = fitted
     calibration = result.calibration
     assert calibration.posterior is not None
@@ -309,7 +312,7 @@ def test_covariance_of_the_file_is_that_of_the_claim(fitted: tuple[FitResult, Cl
         assert found[bias] == pytest.approx(expected, rel=1e-4)
         expected = sd[claim.layout.kappa[axis]] / state.kappa[axis]
         assert found[scale] == pytest.approx(expected, rel=1e-4)
-        # The stated error of gravity is a part of it.
+        # The stated error of gravity is included.
         assert found[scale] > 1e-4 / STANDARD_GRAVITY
     places = claim.layout.misalignment[[0, 2]]
     np.testing.assert_allclose(found[-3:][[0, 2]], sd[places], rtol=1e-4)
@@ -324,7 +327,8 @@ def test_sections_and_kelvins_by_hand(bags: list[ReducedBag]) -> None:
         assert (np.diff(own) >= 0).all()
         assert np.ptp(np.bincount(own, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # A line stands for its own RMS; t^2 is steepest, 2 t, at the farthest temperature.
+    # A line has an RMS of its own; t^2 is steepest, 2 t, at the largest distance from the
+    # reference.
     lines = [0, *(k for k, one in enumerate(bank(), start=6) if one.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

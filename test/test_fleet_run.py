@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A fleet comes through what happens to fleets: bad bags, refusals, dead workers, interruptions.
-"""
+"""A fleet survives bad bags, refusals, dead workers and interruptions."""
 
 from __future__ import annotations
 
@@ -22,6 +20,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from fleet_helpers import OPTIONS, damage, write_unit
+from triads import sibling
 
 from thermo_comp.cli.app import run as run_command
 from thermo_comp.errors import OutputError, ThermoCompError
@@ -40,13 +39,13 @@ pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `flee
 
 @pytest.fixture(scope='module')
 def client() -> Iterator[Any]:
-    """Start two workers, once for this file."""
+    """Start two workers once for this file."""
     with connected(None, 2) as client:
         yield client
 
 
 def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
-    """Return all files of a folder, with the time of their last change."""
+    """Return all files of a folder, with their times of change."""
     return {
         str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
         for path in sorted(folder.rglob('*'))
@@ -56,9 +55,7 @@ def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
 
 @pytest.fixture(scope='module')
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """
-    Write three units: one with a corrupt bag among good ones, one with its thermometers exchanged.
-    """
+    """Write three units: one has a corrupt bag, one has its thermometers exchanged."""
     folder = tmp_path_factory.mktemp('fleet') / 'bags'
     write_unit(folder / 'A' / 'good', 1)
     damage(write_unit(folder / 'A' / 'torn', 2, 7)[2])
@@ -75,7 +72,7 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(
     def tell(_n: int, _total: int, row: Row | None) -> None:
         if row is None:
             return
-        # Both workers are in the middle of a unit when the first one has come back.
+        # Both workers are fitting a unit when the first result arrives.
         if not told:
             os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
         told.append(str(row['name']))
@@ -103,14 +100,14 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(
     assert again.rows == result.rows
     assert contents(out / 'units') == before
 
-    # Other bags under the same names are another test.
+    # Changed bags under the same names are another test.
     os.utime(fleet / 'A/good/01.mcap', ns=(0, 0))
     touched = fit_fleet(str(fleet), out, OPTIONS, client=client)
     assert touched.n_done == 1
     after = contents(out / 'units')
     assert {Path(name).parts[1] for name in before if before[name] != after[name]} == {'good'}
 
-    # A result that somebody edited does not count.
+    # An edited result is not accepted.
     (out / 'units/B/exchanged').rename(out / 'units/B/other')
     (out / 'units/A/torn/calibration.yaml').write_text('edited')
     results = Results(out)
@@ -181,7 +178,7 @@ def test_an_interrupted_run_goes_on_where_it_was(client: Any, tmp_path: Path) ->
         fit_fleet(str(fleet), out, OPTIONS, client=client, tell=stop)
     assert not (out / 'fleet.csv').exists()
     assert len(list(out.rglob('result.json'))) == 1
-    # A unit whose files were being written when the power went.
+    # A unit whose files were being written at a power failure.
     (out / 'units/A/u0').mkdir(parents=True, exist_ok=True)
     (out / 'units/A/u0/result.json').write_text('{"format": 1,')
     result = fit_fleet(str(fleet), out, OPTIONS, client=client)
@@ -195,7 +192,7 @@ def children_of(pid: int) -> list[int]:
 
 
 def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path: Path) -> None:
-    # WHY: each worker that was being imported, and then Dask, printed one.
+    # WHY: each starting worker, and then Dask, printed a traceback.
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
     words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
     process = subprocess.Popen(
@@ -208,16 +205,16 @@ def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path: Path) -> None:
         start_new_session=True,
     )
     pause = threading.Event()
-    # The first worker is a child of the server of processes.
+    # The first worker is a child of the fork server.
     while not any(map(children_of, children_of(process.pid))):
         assert process.poll() is None
         pause.wait(0.01)
-    # As a terminal does, to all of them.
+    # A terminal sends it to all processes of the group.
     os.killpg(process.pid, signal.SIGINT)
     said, _ = process.communicate(timeout=60)
     assert process.returncode == 130
     said = said.splitlines()
-    # Whether Dask had a worker already is chance.
+    # Whether Dask had started a worker is random.
     assert said in (
         [f'thermo_comp: interrupted: {state}, kept in out; the same command does the others']
         for state in ('no test has begun', '0 of 1 test done')
@@ -252,14 +249,14 @@ class TestScheduler:
         refused = str(fleet / 'B')
         result = fit_fleet(refused, tmp_path / 'out', OPTIONS, scheduler=address)
         assert [row['verdict'] for row in result.rows] == ['refused']
-        # A worker of another version would fit something else under the same key.
+        # A worker of another version could give another fit under the same key.
         monkeypatch.setattr('thermo_comp.fleet.work.__version__', '9.9')
         with pytest.raises(ThermoCompError, match=r'runs thermo_comp \d+\.\d+\.\d+, not 9\.9'):
             fit_fleet(refused, tmp_path / 'other', OPTIONS, scheduler=address)
 
 
 class _Future:
-    """A task that has ended in some way."""
+    """A finished task."""
 
     def __init__(self, status: str, error: Exception | None = None) -> None:
         self.status, self._error = status, error
@@ -303,7 +300,7 @@ def test_a_fleet_without_dask_says_what_to_install(
 
 
 def command(folder: Path, out: Path, *options: str) -> int:
-    """Run the command in this process, return its exit code."""
+    """Run the command in this process, and return its exit code."""
     return run_command(['fleet', 'fit', str(folder), '-o', str(out), *options])
 
 
@@ -347,9 +344,9 @@ def test_options_are_part_of_a_result(client: Any, fleet: Path, tmp_path: Path) 
 
 
 def test_siblings_help_a_unit_that_lacks_data(client: Any, tmp_path: Path) -> None:
-    # WHY: a unit with one position in the chamber says nothing of what tells bias from scale.
+    # WHY: one position in the chamber does not separate bias from scale.
     kind = unit_preset('mems', 1)
-    siblings = [kind.sibling(number) for number in range(4)]
+    siblings = [sibling(kind, number) for number in range(4)]
     for number, unit in enumerate(siblings):
         folder, n_bags = tmp_path / 'bags' / f'u{number}', 9 if number else 1
         write_unit(folder, number, n_bags, unit=unit, serial=f's{number}')
@@ -366,7 +363,7 @@ def test_siblings_help_a_unit_that_lacks_data(client: Any, tmp_path: Path) -> No
     assert contents(tmp_path / 'out' / 'units') == before
     assert [bool(row['prior']) for row in helped.rows] == [True, False, False, False]
     (before_row, *_), (row, *_) = alone.rows, helped.rows
-    # What a first guess of one axis misses may be small by luck: all three are judged together.
+    # The error of one axis may be small by chance, so all three are judged together.
     scale = np.array(siblings[0].scale_factor)
     errors, sds = (
         [np.array([float(one[name.format(axis)]) for axis in 'xyz']) for one in (row, before_row)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet's bags are found, and read, wherever they lie."""
+"""The bags of a fleet are found and read in every kind of storage."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def unit(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def memory() -> Iterator[tuple[Any, str]]:
-    """Give an empty folder of fsspec's memory file system, and its URL."""
+    """Return an empty folder of fsspec's memory file system, and its URL."""
     fs = fsspec.filesystem('memory')
     name = f'/{uuid4().hex}'
     yield fs, f'memory:/{name}'
@@ -44,7 +44,7 @@ def memory() -> Iterator[tuple[Any, str]]:
 
 
 def to_sqlite(path: Path, target: Path) -> None:
-    """Write a bag anew in the other storage of rosbag2."""
+    """Write a bag again in the other storage of rosbag2."""
     with (
         Reader(path) as reader,
         Writer(target, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer,
@@ -71,7 +71,7 @@ class TestElsewhere:
             process_unit(there, url, OPTIONS),
         )
         first, second = (parse_calibration(text.calibration.encode()) for text in (one, other))
-        # The date of the fit is all that differs.
+        # Only the date of the fit differs.
         assert replace(first, provenance=second.provenance) == second
         assert first.provenance.sources == second.provenance.sources
         assert other.hashes == {name: digest(unit.parent / name) for name in here.bags}
@@ -147,7 +147,7 @@ class TestDiscovery:
         assert {one.name: list(one.bags) for one in found} == {
             'mems-0001': ['a.mcap', 'd.mcap'],
             'mems-0002': ['b.mcap', 'c.mcap'],
-            # Nothing says whose it is but the folder; and one that cannot even be asked.
+            # The serial follows from the folder only; one bag cannot be opened at all.
             tmp_path.name: ['e.mcap'],
             'f.mcap': ['f.mcap'],
         }

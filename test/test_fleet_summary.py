@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet table tells what is there to tell, and nothing where there is nothing."""
+"""The statistics of a fleet table: real outliers and drifts are reported, chance is not."""
 
 from __future__ import annotations
 
@@ -31,9 +31,7 @@ def fleet_of(
     day: float = 0.0,
     like: Sequence[Row] = (),
 ) -> list[Row]:
-    """
-    Draw a fleet: every quantity normal (sizes log-normal), or around that of an earlier test.
-    """
+    """Draw a fleet: every quantity normal (sizes log-normal), or near that of an earlier test."""
     rows = []
     for i in range(n):
         cells = {}
@@ -43,7 +41,7 @@ def fleet_of(
                 before = float(like[i][quantity.name])
                 sd = float(like[i][quantity.sd]) if quantity.sd else 0.0
                 per_unit = abs(before) * 1e-6 if quantity.by == 'ppm' else 1.0
-                # What two tests of one unit differ by: the noise of this one, see `sds`.
+                # The difference of two tests of a unit is the noise of the second, see `sds`.
                 cells[quantity.name] = before + noise * sd * per_unit
             elif quantity.by == 'ppm':
                 cells[quantity.name] = 300.0 * (1.0 + 1e-3 * noise)
@@ -140,12 +138,12 @@ class TestDrift:
         later = fleet_of(3, rng, day=90.0, like=first)
         drifts = summarise(later, before).drifts
         assert sorted(one.earlier for one in drifts) == [f'earlier /u00{i}@0' for i in range(3)]
-        # The same calibrations again, found a second time, are no drift.
+        # The same calibrations in a second table are not a drift.
         assert summarise(first, before).drifts == ()
 
 
 def hostile(rng: np.random.Generator) -> list[Row]:
-    """Draw a fleet whose bags were written by somebody who dislikes us."""
+    """Draw a fleet whose texts contain mark-up and escape sequences."""
     evil = '<script>alert(1)</script>"&$x_1$'
     first = fleet_of(12, rng, lots=('A', evil))
     rows = [*first, *fleet_of(12, rng, lots=('A', evil), day=400.0, like=first)]
@@ -172,7 +170,7 @@ class TestPage:
         assert all(re.fullmatch(r"[\w./%'()~-]+", link) for link in links)
         assert re.findall(r'\ssrc="', page) == []
         assert "default-src 'none'" in page
-        # What is left, and distances.
+        # Residuals, and distances.
         assert page.count('<figure') == 2
 
     def test_a_fleet_without_a_calibration(self) -> None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A unit's fit is that of one process, and says what became of each of its bags."""
+"""A unit's fit equals that of one process, and accounts for each of its bags."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def brief(fleet: Path) -> UnitOutcome:
-    """Fit it without a certificate, once for this file."""
+    """Fit the unit without a certificate, once for this file."""
     return processed(fleet)
 
 
@@ -51,7 +51,7 @@ def test_the_fit_is_that_of_thermo_comp_fit(fleet: Path, brief: UnitOutcome) -> 
     ours = parse_calibration(brief.calibration.encode())
     theirs = fit(sources, replace(OPTIONS.fit, serial='mems-0001')).calibration
     assert ours.provenance.sources == theirs.provenance.sources
-    # The date of the fit is all that differs.
+    # Only the date of the fit differs.
     assert ours == replace(theirs, provenance=ours.provenance)
 
 
@@ -74,6 +74,7 @@ def test_the_verdict_is_that_of_evaluate(
 
 
 class TestRow:
+    @pytest.mark.usefixtures('no_figures')
     def test_a_good_unit(self, fleet: Path, brief: UnitOutcome) -> None:
         outcome = processed(fleet, certificates=True)
         row = outcome.row
@@ -83,7 +84,7 @@ class TestRow:
         assert (row['problem'], row['left_out'], row['chosen']) == ('', '', '')
         assert (row['n_bags'], row['n_left_out'], row['n_positions']) == (6, 0, 6)
         calibration = parse_calibration(outcome.calibration.encode())
-        # A reading of x at the reference, from the row and from the file.
+        # Bias of x at the reference temperature, from the row and from the file.
         x = calibration.axes.x
         bias = (x.bias + calibration.static.x.delta) / x.scale_factor
         assert row['bias_x_ug'] == pytest.approx(bias / 9.80665e-6)

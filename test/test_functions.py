@@ -21,7 +21,7 @@ temperatures = st.floats(-15.0, 15.0)
 
 
 def test_polynomial_by_hand():
-    # 1 + 2*3 + 0.5*9 + 0.25*27: a4 t^4 is the fourth term of Eq. (10), not a4 t.
+    # 1 + 2*3 + 0.5*9 + 0.25*27: the fourth term of Eq. (10) is a4 t^4, not a4 t.
     assert Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
 
 
@@ -36,7 +36,7 @@ def test_spline_equals_scipy():
     ours = CubicSpline(KNOTS, values)
     reference = ReferenceSpline(KNOTS, values, bc_type='natural')
     t = np.linspace(-15.0, 15.0, 301)
-    # Two solutions of one linear system: only rounding apart.
+    # Two solutions of one linear system differ by rounding only.
     np.testing.assert_allclose(ours.value(t), reference(t), atol=1e-13)
     np.testing.assert_allclose(ours.slope(t), reference(t, 1), atol=1e-13)
 

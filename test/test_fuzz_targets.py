@@ -1,17 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fuzz targets without a fuzzer: their seeds, whole, cut and changed, keep the promises."""
+"""The fuzz targets without a fuzzer: their seeds, whole, cut and changed."""
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
-from conftest import ROOT
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-sys.path.insert(0, str(ROOT / 'fuzz'))
 
 
 import targets

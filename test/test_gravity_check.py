@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The field check: a good calibration passes, an aged one shows, motion is not mistaken for either.
-"""
+"""The gravity check: a good calibration passes, an aged one is reported, motion is neither."""
 
 import math
 
@@ -32,10 +30,10 @@ def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
 
 def test_residual_of_a_good_calibration_is_within_its_sd(rng):
     result = watch(rng)
-    # One window of 99 samples (0.98 s) leaves 0.2 mm/s^2 of noise; 30 of them 0.04.
+    # A window of 99 samples (0.98 s) has 0.2 mm/s^2 of noise; 30 of them 0.04.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
-    assert result.n_windows == 59  # the first has no window before it to agree with
+    assert result.n_windows == 59  # there is no earlier window to compare the first one with
     assert result.is_still
 
 
@@ -57,7 +55,7 @@ def test_time_that_jumps_starts_a_new_window(rng):
 
 
 def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
-    """Watch a platform that stands, and from a time on reads more; give when it was refuted."""
+    """Run a platform at rest that reads more from a given time; return when it was refused."""
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
     for k in range(round((at_s + 10.0) * rate_hz)):
@@ -74,15 +72,15 @@ def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
 @pytest.mark.parametrize('rate_hz', [2.5, 5.0, 10.0])
 @pytest.mark.parametrize('offset', [0.3, -3.0, 15.0])
 def test_what_steps_away_at_rest_is_refuted_within_a_second(rng, rate_hz, offset):
-    # WHY: it took five seconds, and the message gave the mean over what had been before.
+    # WHY: it took five seconds, and the message averaged over the time before the change.
     after_s, result = steps(rng, offset=offset, rate_hz=rate_hz)
     assert after_s < 1.0
-    # Two samples at least.
+    # At least two samples.
     assert result.residual == pytest.approx(offset, abs=5 * NOISE_SD)
 
 
 def test_what_moves_away_is_not_refuted_at_once(rng):
-    # A lift: the acceleration grows over 0.8 s. And a car that pulls away, which shakes.
+    # A lift, whose acceleration grows over 0.8 s, and a car that starts and shakes.
     assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
 
@@ -91,7 +89,7 @@ def test_the_message_gives_the_deviation_now(rng):
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     watch(rng, seconds=40, bias=0.001, monitor=monitor)
     assert not monitor.is_refuted
-    # Another beginning of time, so that no step is seen, but windows.
+    # Another start of time, so that windows are tested and not a step.
     result = watch(rng, seconds=8, bias=0.5, monitor=monitor)
     assert monitor.is_refuted
     assert result.residual == pytest.approx(0.5, abs=1e-3)

@@ -39,7 +39,7 @@ FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
 
 
 def block_of(record, K, rate=None):
-    """Make the block that a recording of Imu messages would be."""
+    """Make the block of a recording of Imu messages."""
     stamps, board_ns, case_ns = (
         START_NS + stamp_ns
         for stamp_ns in (record.accel_stamp_ns, record.board_stamp_ns, record.case_stamp_ns)
@@ -64,23 +64,23 @@ def rms(values):
 
 @pytest.fixture(scope='module')
 def unit():
-    # Its parts take minutes; a reading every four seconds is enough, and a quarter of the work.
+    # Its lags are minutes: a reading every four seconds suffices, with a quarter of the work.
     return unit_preset('mems', 2).with_thermometers(rate_hz=0.25)
 
 
 @pytest.fixture(scope='module')
 def fitted(unit):
-    """Fit a MEMS unit, whose gyroscope drifts with parts that no column is, to nine positions."""
+    """Fit a MEMS unit in nine positions; no single column equals the drift of its gyroscope."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # Heat flows in and between the parts; half of the bank, and half of the work.
-    options = replace(OPTIONS, groups=('curve', 'now', 'board', 'neighbour', 'product'))
+    # Heat flows in and between the parts; half of the columns, and half of the work.
+    options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(one, unit.scale_factor) for one in records], options)
 
 
 @pytest.fixture(scope='module')
 def held_out(unit):
     stations = plan('held-out', 2)[:2]
-    # Up, down, up and down, each with its soak, without the last way back.
+    # Two ramps up and two down with soaks, without the last way back.
     whole = stations[0].program
     program = replace(whole, time_s=whole.time_s[:10], temperature_c=whole.temperature_c[:10])
     stations = [replace(one, program=program) for one in stations]
@@ -102,13 +102,13 @@ def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
         assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
         assert rms(changes) < 1.15 * FLOOR
         assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
-        # The level holds a turn-on of 2 mdeg/s and the Earth's rate, which are told apart from
-        # nothing: so it stands within what is claimed for the bias and the Earth's rate.
+        # The level contains a turn-on of 2 mdeg/s and the Earth's rate, which cannot be separated,
+        # so it must be within the claimed sd of the bias plus the Earth's rate.
         message = own.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
         claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
         assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
     np.testing.assert_allclose(own.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
-    # Of 9 positions with a turn-on of 2 mdeg/s, and of the Earth's rate as the prior has it.
+    # Claimed sd from 9 positions with a turn-on of 2 mdeg/s, and the prior of the Earth's rate.
     assert np.mean(own.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
 
 
@@ -123,7 +123,7 @@ def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
     program = parse_cyclogram('20 10min, 35@1.5 10min, 10@1.5 15min')
     stations = [replace(one, program=program) for one in plan('chamber-9', 2)[:2]]
     records = arrays(unit, stations, 2, rate_hz=RATE_HZ)
-    options = replace(OPTIONS, groups=('curve', 'now', 'board'))
+    options = replace(OPTIONS, groups=('curve', 'gradient', 'board'))
     with_rate = fit([source_of(one, unit.scale_factor) for one in records], options)
     silent = [np.zeros((len(one.counts), 3)) for one in records]
     sources = [
@@ -136,7 +136,7 @@ def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
         with_rate.calibration, gyroscope=None, provenance=without.calibration.provenance
     )
     assert same == without.calibration
-    # A bag whose rate is not a number somewhere at rest has none.
+    # A bag with an invalid rate at rest has no rate.
     broken = [np.array(one.angular_rate) for one in records]
     broken[0][len(broken[0]) // 2 :] = np.nan
     sources = [
@@ -170,13 +170,13 @@ def test_file_and_triad_round_trip():
     triad = rate_triad(whole)
     assert gyroscope_of(triad) == whole.gyroscope
     assert triad.gyroscope is None
-    # Its scale is 1, and the posterior says nothing of it.
+    # Its scale is 1, without uncertainty.
     states = ramp_states(triad, np.array([10.0, 20.0, 30.0]))
     bias, scale = bias_and_scale(triad, states)
     np.testing.assert_array_equal(scale, 1.0)
     sd_bias, sd_scale = sd_of_states(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
-    # At the reference: the bias as it stands there; its level's variance and the turn-on's.
+    # Bias at the reference; variance of its level and of the turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     np.testing.assert_allclose(
         sd_bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5
@@ -210,7 +210,7 @@ def test_a_file_is_refused_by_key():
 
 
 def test_the_rate_is_corrected_by_hand_numbers():
-    # No response, at the reference: what is left is the constant; the force takes no notice.
+    # At the reference without response only the constant remains; the force is unaffected.
     own = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (own, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))
@@ -226,11 +226,11 @@ def test_the_rate_is_corrected_by_hand_numbers():
     assert compensator.process(0, 300.0, 600.0, 2900.0) is not None
     x, y, z, *variances = compensator.correct_rate(0, 1.0, 1.0, 1.0)
     assert (x, y, z) == pytest.approx((0.98 - 1e-5, 1.03, 0.99 - 1e-5), abs=1e-12)
-    # While the regime is unknown: noise of a message, slow error, what the sets differ by.
+    # While the regime is unknown: noise of a message, slow error, and difference of the sets.
     least = np.square((1e-4, 2e-4, 1e-4)) / 0.01 + np.square((1e-5, 2e-5, 1e-5))
     assert (np.array(variances) >= least).all()
     assert variances == pytest.approx(least, rel=0.05)
-    # What an INS is told: the same without the noise of a message.
+    # The bias sd for an INS: the same without the noise of a message.
     sd = compensator.status().rate_bias_sd
     noise = np.square((1e-4, 2e-4, 1e-4)) / 0.01
     np.testing.assert_allclose(np.square(sd), variances - noise, rtol=1e-6)
@@ -250,7 +250,7 @@ def reduced(unit, records):
 
 def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, held_out)
-    # A third of it has ramps and soaks enough to show what is wrong.
+    # A third of it has enough ramps and soaks to show an error.
     thirds = [replace(one, n_whole=one.n_whole // 3) for one in bags[0].intervals]
     short = [replace(bags[0], intervals=tuple(thirds))]
     judged = judge_bags(bags, calibration)
@@ -259,13 +259,13 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     assert judged.exit_code == 0
     for name in ('static', 'dynamic', 'all'):
         section = rate.sections[name]
-        # Honest: above what the noise alone is, and of lags that start unseen more than needed.
+        # Above the noise alone, and larger than necessary because of lags with unknown start.
         assert 0.7 < section.ratio < 1.2
         assert section.rms < 1.3 * FLOOR
         assert section.raw_rms > 50.0 * FLOOR
     assert judged.facts()['angular_rate']['reason'] == rate.reason
     assert 'angular rate: valid: 0.' in str(rate)
-    # A gyroscope of another unit is found out, and so is one that claims nothing.
+    # A gyroscope of another unit is detected, also one without covariance.
     own = calibration.gyroscope
     other = replace(own, response=(), static=own.dynamic, dynamic=own.dynamic, posterior=None)
     wrong = judge_bags(short, replace(calibration, gyroscope=other))
@@ -273,7 +273,7 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     assert wrong.rate.kind is Verdict.RECALIBRATE
     assert wrong.exit_code == 1
     assert judge_bags(short, replace(calibration, gyroscope=None)).rate is None
-    # One that claims nothing, as an import, is not shown to be wrong.
+    # A calibration without covariance, as an import, is not refuted.
     silent = replace(other, residual_sd_rad_s=(0.0, 0.0, 0.0))
     unknown = judge_bags(short, replace(calibration, gyroscope=silent))
     assert unknown.rate.kind is Verdict.NO_CLAIM

@@ -1,17 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The navigator of benchmarks/ins.py against what is known of navigators in closed form."""
+"""The navigator of benchmarks/ins.py against closed forms."""
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
-from conftest import ROOT
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
 from ins import EARTH_RADIUS, FREE_S, Model, Navigator, fly, levelled
 
 G = 9.80665
@@ -20,7 +14,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.mark.parametrize('axis', [0, 1])
 def test_a_bias_makes_schuler_s_oscillation(axis: int) -> None:
-    # b on one level axis, none when it was levelled: p = b R / g (1 - cos(w t)), w^2 = g / R.
+    # Bias b on one level axis after levelling without it: p = b R / g (1 - cos(w t)), w^2 = g / R.
     bias, dt, minutes = 1e-4, 0.5, 84
     force = G * UP
     force[axis] += bias
@@ -31,7 +25,7 @@ def test_a_bias_makes_schuler_s_oscillation(axis: int) -> None:
         if k % 1200 == 0:
             angle = omega * k * dt
             expected = bias / omega**2 * (1.0 - np.cos(angle))
-            # One step of the integration's order; 130 m is the amplitude.
+            # One integration step; the amplitude is 130 m.
             assert navigator.position[axis] == pytest.approx(expected, abs=0.1)
             speed = bias / omega * np.sin(angle)
             assert navigator.velocity[axis] == pytest.approx(speed, abs=1e-4)
@@ -41,7 +35,7 @@ def test_a_bias_makes_schuler_s_oscillation(axis: int) -> None:
 
 
 def test_a_turn_is_followed() -> None:
-    # A quarter turn about the vertical in 90 s: what was along body x is then along north.
+    # A quarter turn about the vertical in 90 s: body x then points north.
     navigator = Navigator(np.eye(3), G)
     for _ in range(9000):
         navigator.step(0.01, G * UP, np.radians([0.0, 0.0, 1.0]))
@@ -62,7 +56,7 @@ def test_levelling_makes_the_force_vertical(rng: np.random.Generator) -> None:
 
 
 def test_the_sigma_is_that_of_white_noise(rng: np.random.Generator) -> None:
-    # Over half an hour, a third of Schuler's period, levelling's noise and the integral of noise.
+    # Over half an hour, a third of Schuler's period: noise of levelling, and integrated noise.
     density, dt = 1e-4, 0.5
     force = G * UP + rng.normal(0.0, density / np.sqrt(dt), (40_000, 3))
     free = fly(Model(force, density, 0.0), dt, UP, G, 0.0)
@@ -71,12 +65,12 @@ def test_the_sigma_is_that_of_white_noise(rng: np.random.Generator) -> None:
     by_integration = density**2 * (T / 2.0 - np.sin(2.0 * omega * T) / (4.0 * omega)) / omega**2
     expected = np.sqrt(2.0 * (by_levelling + by_integration))
     assert free.sigma[-1, 0] == pytest.approx(expected, rel=0.01)
-    # 298 flights, of which some eight have nothing in common
+    # of 298 flights, about eight are independent
     assert 0.5 < np.sqrt(np.mean(free.position[-1] ** 2)) / expected < 1.5
 
 
 def test_updates_find_a_bias_that_levelling_has_not_seen() -> None:
-    # It appears as the flight begins: after 25 minutes of ZUPT little of it is left in the coast.
+    # An error at the start of the flight: after 25 minutes of ZUPT little of it is left.
     dt, n_align = 0.5, 600
     force = np.tile(G * UP, (n_align + 3600 + 1, 1))
     force[n_align:, 0] += 1e-3
@@ -84,5 +78,5 @@ def test_updates_find_a_bias_that_levelling_has_not_seen() -> None:
     free = fly(Model(force, 1e-4, 1e-3), dt, UP, G, 0.0)
     assert free.position[-1, 0] > 1000.0
     coasted = told.position[-1, 0] - told.position[2999, 0]
-    # Free over the same five minutes it would have been 45 m.
+    # Without ZUPT the same five minutes would give 45 m.
     assert abs(coasted) < 4.5

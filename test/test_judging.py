@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The judge: residuals known by hand, windows of the stated length, verdicts one by one."""
+"""The judge: residuals known by hand, windows of the stated length, each verdict."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter, table_writer
 from thermo_comp.replay import replay
-from thermo_comp.unit.calibration import Calibration, Provenance, ResidualSummary, Source
+from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, spoken
+from thermo_comp.unit.provenance import Provenance, ResidualSummary, Source
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000
@@ -44,7 +45,7 @@ def resting(
     error: float = 0.0,
     serial: str = '',
 ) -> Path:
-    """Write a unit at rest, z up, from one temperature to another, whose z axis drifts with it."""
+    """Write a unit at rest, z up, whose z axis drifts with its temperature."""
     rng = np.random.default_rng(3)
     begin, end = temperature if isinstance(temperature, tuple) else (temperature, temperature)
     n = round(minutes * 60.0 * rate_hz)
@@ -54,7 +55,7 @@ def resting(
     counts = np.zeros((n, 3))
     counts[:, 2] = K * GRAVITY + SLOPE * (celsius - 20.0) + error
     counts += noise * rng.standard_normal((n, 3))
-    # What lives is never the same to the bit for long, and what is the same is not believed.
+    # A working sensor never repeats a value for long, and repeated values are rejected.
     counts[::2, 0] += 1e-9
     if shaken_s:
         shaken = (seconds >= shaken_s[0]) & (seconds < shaken_s[1])
@@ -69,7 +70,7 @@ def resting(
 
 
 def corrected_by(slope: float, claim: float = 0.0, **changes: object) -> Calibration:
-    """Correct the z axis by so much per K; claim so much [m/s^2]."""
+    """Make a calibration of the z axis' drift per K, with a claimed sd [m/s^2]."""
     parts = {name: axis_set(residual_sd_m_s2=claim) for name in 'xy'}
     part = regime_set(**parts, z=axis_set((0.0, slope), residual_sd_m_s2=claim))
     return dataclasses.replace(calibration(static=part, dynamic=part), **changes)
@@ -82,7 +83,7 @@ def judged(bag: Path, one: Calibration, **keys: object) -> Judgement:
 def made(
     residual: float, raw: float, claimed: float, n: int = 40, dynamic: int = 10, outside: int = 0
 ) -> Windows:
-    """Make windows of one position, z up, whose figures are given in micro-g."""
+    """Make windows of one position, z up, from figures in micro-g."""
     force, constant = np.zeros((n, 3)), np.zeros((n, 3))
     force[:, 2] = GRAVITY + residual * MICRO_G
     constant[:, 2] = GRAVITY + raw * MICRO_G
@@ -114,12 +115,12 @@ CLAIMING = corrected_by(SLOPE, 1e-5)
 
 class TestWindows:
     def test_residuals_are_those_of_the_hand(self, tmp_path: Path) -> None:
-        # 10 K above the reference the z axis reads 20 counts too much: 20 / 300 m/s^2.
+        # 10 K above the reference the z axis reads 20 counts more: 20 / 300 m/s^2.
         bag = resting(tmp_path / 'bag', 30.0)
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
         found = evaluate([bag], models).judgements
         drift = SLOPE * 10.0 / K
-        # The thermometer's estimate of a steady reading is exact to 1e-7 K, 1e-9 m/s^2.
+        # The estimate of a steady temperature is exact to 1e-7 K, 1e-9 m/s^2.
         for name, expected in (('right', 0.0), ('half', drift / 2)):
             windows = found[name].windows
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
@@ -127,7 +128,7 @@ class TestWindows:
             np.testing.assert_allclose(windows.board, 30.0, rtol=0.0, atol=1e-6)
 
     def test_a_window_is_the_mean_of_what_the_node_publishes(self, tmp_path: Path) -> None:
-        # A ramp of 1 K/min, where a wrong time or a wrong reading would show.
+        # A ramp of 1 K/min, in which a wrong time or reading would show.
         bag = resting(tmp_path / 'bag', (15.0, 33.0), minutes=18.0, noise=0.2)
         one = corrected_by(SLOPE)
         windows = judged(bag, one).windows
@@ -139,7 +140,7 @@ class TestWindows:
         for start_ns, mean in zip(windows.start_ns, windows.force, strict=True):
             inside = (stamps >= start_ns) & (stamps < start_ns + 60 * 10**9)
             assert inside.sum() == 600
-            # The correction is a line over ten seconds: to a thousandth of a micro-g.
+            # The correction is linear over ten seconds: accurate to a thousandth of a micro-g.
             np.testing.assert_allclose(mean, force[inside].mean(axis=0), atol=1e-8)
 
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
@@ -147,13 +148,13 @@ class TestWindows:
     def test_windows_are_as_long_as_stated(
         self, tmp_path: Path, rate_hz: float, window_s: float
     ) -> None:
-        # WHY: 32 samples of 4 Hz are 8 s, and "ten seconds" were sixteen.
+        # WHY: 32 samples at 4 Hz are 8 s, and "ten seconds" were sixteen.
         bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
         windows = judged(bag, calibration(), window_s=window_s).windows
         assert windows.window_s == window_s
         np.testing.assert_array_equal(windows.count, rate_hz * window_s)
         np.testing.assert_allclose(np.diff(windows.start_ns) * 1e-9, window_s, atol=1e-6)
-        # Whatever rests for so long is in one of them, but for the first board reading's time.
+        # Every rest of this length is in a window, except for the time before the first reading.
         assert len(windows) >= int(20.5 * 60.0 / window_s) - 1
 
     def test_samples_too_slow_for_a_window_are_refused(self, tmp_path: Path) -> None:
@@ -172,7 +173,7 @@ class TestWindows:
         assert np.sqrt(np.mean(windows.residual**2)) < 3.0 * 0.3 / K / 10.0
 
     def test_noise_is_claimed_as_it_is(self, tmp_path: Path) -> None:
-        # White noise of sd 0.3 counts at 10 Hz, and a calibration that knows it.
+        # White noise of sd 0.3 counts at 10 Hz, which the calibration states.
         density = 0.3 / K * np.sqrt(0.1)
         unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
         knows = calibration(unit=unit, noise_density_m_s2_sqrt_hz=(density,) * 3)
@@ -183,7 +184,7 @@ class TestWindows:
         assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.14)
 
     def test_a_noisy_unit_rests_as_its_calibration_says(self, tmp_path: Path) -> None:
-        # WHY: the ceiling of 50 mg held for a unit that is known to scatter by 100, too.
+        # WHY: the limit of 50 mg also applied to a unit whose known scatter is 100 mg.
         bag = resting(tmp_path / 'bag', 20.0, noise=0.1 * K * GRAVITY)
         density = 0.1 * GRAVITY * np.sqrt(0.1)
         unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
@@ -204,7 +205,7 @@ class TestWindows:
         ]
         found = evaluate(bags, [('it', CLAIMING)])
         whole = found.judgements['it'].sections['all']
-        # +102 ug in the one, -102 ug in the other: nothing on average, 102 ug RMS.
+        # +102 ug in one regime, -102 ug in the other: mean 0, RMS 102 ug.
         assert whole.n == sum(judged(bag, CLAIMING).sections['all'].n for bag in bags)
         assert whole.mean / MICRO_G == pytest.approx(0.0, abs=0.5)
         assert whole.rms == pytest.approx(0.3 / K, rel=1e-3)
@@ -233,7 +234,7 @@ class TestVerdict:
             (121.0, 1000.0, 60.0, 'recalibrate'),
             (1100.0, 9000.0, 1500.0, 'valid, but it only claims 1.5 mg'),
             (50.0, 100.0, 60.0, 'valid, but it only claims 60 ug'),
-            # However much is claimed, what is no better than raw is not valid.
+            # A result no better than raw is not valid, whatever its claim.
             (1100.0, 1000.0, 1500.0, 'no better than raw'),
             (1000.0, 1000.0, 1500.0, 'no better than raw'),
         ],
@@ -245,7 +246,7 @@ class TestVerdict:
         assert found.verdict == verdict
         assert found.is_valid == verdict.startswith('valid')
         assert found.exit_code == (0 if found.is_valid else 1)
-        # Like beside like, over the same windows.
+        # Both are compared over the same windows.
         assert found.sections['all'].ratio == pytest.approx(residual / claimed)
         for value in (residual, raw, claimed):
             assert spoken(value * MICRO_G) in found.reason
@@ -253,8 +254,8 @@ class TestVerdict:
     @pytest.mark.parametrize(
         ('residual', 'raw', 'claimed', 'verdict'),
         [
-            (90.0, 1000.0, 10.0, 'valid'),  # nine times its claim, and yet good enough
-            (110.0, 1000.0, 200.0, 'recalibrate'),  # as claimed, and yet not good enough
+            (90.0, 1000.0, 10.0, 'valid'),  # nine times its claim, but within the tolerance
+            (110.0, 1000.0, 200.0, 'recalibrate'),  # as claimed, but beyond the tolerance
             (90.0, 1000.0, 200.0, 'valid, but it only claims 200 ug'),
             (90.0, 80.0, 60.0, 'no better than raw'),
         ],
@@ -267,7 +268,7 @@ class TestVerdict:
         assert '100 ug tolerated' in found.reason
 
     def test_headline_of_seen_windows_is_what_was_left_out(self) -> None:
-        # WHY: in sample 59 ug, held out of the same positions 61, in a new attitude 1091.
+        # WHY: in sample 59 ug, held out in the same positions 61 ug, in a new attitude 1091 ug.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         one = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -278,7 +279,7 @@ class TestVerdict:
         assert seen.reason.startswith(
             '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
         )
-        # Against the claim like stands beside like; the limit holds for a new attitude.
+        # The claim is compared with the same positions; the limit holds for a new attitude.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, one, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
@@ -295,7 +296,7 @@ class TestVerdict:
             assert found.left_out_rms == pytest.approx(expected, nan_ok=True)
 
     def test_no_uncertainty_makes_no_claim(self) -> None:
-        # WHY: an import that says nothing of itself was held to the noise and called wrong.
+        # WHY: an import without covariance was compared with the noise alone and called wrong.
         imported = corrected_by(SLOPE)
         windows = made(50.0, 1000.0, 2.0)
         found = judge(windows, imported)
@@ -312,7 +313,7 @@ class TestVerdict:
         worse = windows.force.copy()
         worse[:10, 2] = GRAVITY + 150.0 * MICRO_G
         windows = dataclasses.replace(windows, force=worse)
-        # 84 ug in all of 60 claimed, but 150 in the dynamic regime.
+        # 84 ug over all of 60 claimed, but 150 in the dynamic regime.
         found = judge(windows, CLAIMING)
         assert found.sections['all'].ratio < 2.0
         assert found.verdict == 'recalibrate'
@@ -327,7 +328,7 @@ class TestVerdict:
         assert found.sections['all'].n == 30
         assert found.sections['outside'].n == 10
         assert '10 windows of 60 s outside the calibrated ranges not judged: 5 mg' in found.reason
-        # Nor can it make anything valid.
+        # A residual in sample cannot make a calibration valid.
         bad = windows.force.copy()
         bad[10:, 2] = GRAVITY + 500.0 * MICRO_G
         found = judge(dataclasses.replace(windows, force=bad), CLAIMING)
@@ -342,7 +343,7 @@ class TestVerdict:
         found = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
         assert found.kind is Verdict.OUTSIDE
         assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in found.reason
-        # The noise of the thermometer does not carry a soak at the range's end out of it.
+        # Noise of the thermometer does not put a soak at the edge of the range outside of it.
         edge = judged(resting(tmp_path / 'edge', upper + 0.01), CLAIMING)
         assert edge.sections['outside'].n == 0
 
@@ -350,7 +351,7 @@ class TestVerdict:
 def around(
     n: int, bias: tuple[float, ...], scale: tuple[float, ...], noise: float = 0.0
 ) -> Windows:
-    """Make windows of a unit in n positions whose axes have moved by so much [m/s^2], [1]."""
+    """Make windows of a unit in n positions, with changes of the axes' bias [m/s^2] and scale."""
     rng = np.random.default_rng(5)
     faces = np.vstack((np.eye(3), -np.eye(3)))
     others = rng.standard_normal((max(n - 6, 0), 3))
@@ -366,7 +367,8 @@ class TestShifts:
     @pytest.mark.parametrize('n', [6, 18])
     def test_what_moved_is_named(self, n: int) -> None:
         moved = around(n, (20.0 * MICRO_G, 0.0, 0.0), (0.0, 30e-6, 0.0), noise=0.5 * MICRO_G)
-        # The noise of one window, half a micro-g, claims 2 ug: 12 of them in each position.
+        # The noise of a window, half a micro-g, gives a claim of 2 ug with 12 windows per
+        # position.
         found = judge(moved, corrected_by(SLOPE, 1e-5), None)
         assert found.n_positions >= min(n, 12)
         assert found.shifts[0].bias / MICRO_G == pytest.approx(20.0, abs=1.0)
@@ -379,7 +381,7 @@ class TestShifts:
     def test_a_unit_as_it_was_has_not_moved(self) -> None:
         found = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)
         assert (len(found.shifts), found.moved, found.verdict) == (3, (), 'valid')
-        # Five positions tell no shifts.
+        # Five positions do not determine the shifts.
         found = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
         assert (found.shifts, found.n_positions) == ((), 5)
 
@@ -393,9 +395,10 @@ class TestShifts:
 
 def test_thermometers_in_doubt_are_told_offline_too(root: Path, tmp_path: Path) -> None:
     """
-    WHY: replay said nothing of exchanged thermometers, and evaluate called them valid.
+    WHY: replay did not report exchanged thermometers, and evaluate called them valid.
 
-    WHAT: both say the node's words, and no verdict is built on it; of a heat beyond, too.
+    WHAT: both print the node's message and no verdict is given; likewise outside the calibrated
+    range.
     """
     exchanged = Topics(board='temperature/case', case='temperature/board')
     for topics, said in ((Topics(), []), (exchanged, [SWAPPED])):

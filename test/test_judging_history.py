@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The history of a unit: changes and their covariance known by hand, in the order of the dates."""
+"""The history of a unit: changes with covariances known by hand, in order of dates."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.judging.evaluation import drifts_of, history_of
 from thermo_comp.report.page import render_report
-from thermo_comp.unit.calibration import AxisReference, Calibration, Source
+from thermo_comp.unit.calibration import AxisReference, Calibration
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.provenance import Source
 
 pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
@@ -25,7 +26,7 @@ K = 300.0
 
 
 def dated(created: str, bias_ug: float = 0.0, ppm: float = 0.0, sd_ug: float = 3.0) -> Calibration:
-    """Move the z axis of a unit; claim so much for its bias."""
+    """Change the z axis of a unit, with a claimed sd of its bias."""
     scale = K * (1.0 + 1e-6 * ppm)
     axes = dataclasses.replace(
         calibration().axes, z=AxisReference(scale, bias_ug * MICRO_G * scale)
@@ -39,7 +40,7 @@ def dated(created: str, bias_ug: float = 0.0, ppm: float = 0.0, sd_ug: float = 3
 
 
 def test_changes_and_their_sd_by_hand() -> None:
-    # The later one is given first: dates decide. 3 and 4 ug of doubt make 5.
+    # The later calibration is given first, but dates decide. Sd of 3 and 4 ug make 5.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
     assert [one.constant for one in drifts] == [
         *('bias x', 'bias y', 'bias z', 'scale x', 'scale y', 'scale z')
@@ -57,11 +58,11 @@ def test_changes_and_their_sd_by_hand() -> None:
 
 def test_what_is_no_history() -> None:
     one = dated('2026-01-01')
-    # Another model of the same bags, another unit, and a calibration alone.
+    # Another model of the same bags, another unit, and a single calibration.
     other = dataclasses.replace(one, unit=dataclasses.replace(one.unit, serial='other'))
     for calibrations in ([one], [one, one], [one, dataclasses.replace(other)]):
         assert drifts_of(history_of(calibrations)) == []
-    # Without a claim a change is never sure.
+    # Without a claimed sd a change is never significant.
     import_ = dataclasses.replace(dated('2026-03-01', 500.0, sd_ug=0.0))
     silent = drifts_of(history_of([one, import_]))
     assert np.isnan([drift.sd for drift in silent]).all()
@@ -69,7 +70,6 @@ def test_what_is_no_history() -> None:
 
 
 def test_commands_tell_the_history(cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # What a drawing shows is tested with the figures.
     undrawn = 'thermo_comp.report.page.drawn_figures'
     monkeypatch.setattr(undrawn, lambda figures: [(one, '') for one in figures])
     now = fitted().calibration
@@ -90,5 +90,5 @@ def test_commands_tell_the_history(cli, tmp_path: Path, monkeypatch: pytest.Monk
     page = tmp_path / 'page.html'
     drawn = json.loads(cli('report', *given, '-o', page).stdout)
     assert drawn['history'] == told['history']
-    assert 'What has drifted between the calibrations' in page.read_text(encoding='utf-8')
+    assert '2020-01-01' in page.read_text(encoding='utf-8')
     assert '<h2>History</h2>' not in render_report(evidence(), figures=[])

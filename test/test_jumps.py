@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Jumps at rest: when and by how much; what was only turned, moved or bumped is none."""
+"""Jumps at rest: time and size; turns, motions and knocks are not jumps."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ def test_jump_along_gravity(rng, with_gyro):
     rest = Rest(rng)
     rest.add((2.0 * MG, 0.0, 20.0 * MG), from_s=301.0)
     (event,) = look(rest, with_gyro=with_gyro)
-    # Placed by the one sample that separates the levels.
+    # Located by the single sample between the levels.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # 10 s of 25 Hz on each side beside a free drift: sd 2 * 3 mg * sqrt(2 / 250) = 0.5 mg; 4 sd.
+    # 10 s at 25 Hz on each side with a free drift: sd 2 * 3 mg * sqrt(2 / 250) = 0.5 mg; 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
-    # The board cools on; 20 readings of 20 mK on each side of the step: 2 * 0.02 * sqrt(2 / 20).
+    # The board keeps cooling; 20 readings of 20 mK on each side of the step: 2 * 0.02 * sqrt(2 /
+    # 20).
     assert event.temperature_change_sd == pytest.approx(0.0126, rel=0.4)
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 
@@ -50,7 +51,7 @@ def turned(rest, from_s, angle, with_rate):
 
 @pytest.mark.parametrize('seen', [True, False])
 def test_turn_is_told_by_the_gyro(rng, seen):
-    # 20 mrad in one sample: the norm stays, so only a gyro can tell.
+    # 20 mrad in one sample: the norm does not change, so only a gyroscope shows it.
     rest = Rest(rng)
     turned(rest, 250.0, 0.02, with_rate=seen)
     events = look(rest, with_gyro=True)
@@ -101,7 +102,7 @@ def test_drift_with_temperature_is_no_step(rng):
 
 
 def behind_a_low_pass(rng, rest, tau_s, sd):
-    """Replace the noise by a first-order one, of this time constant and standard deviation."""
+    """Replace the noise by first-order noise with this time constant and standard deviation."""
     r = np.exp(-1.0 / (rest.rate_hz * tau_s))
     white = sd * np.sqrt(1.0 - r * r) * rng.standard_normal(rest.accel.shape)
     rest.accel[:] = np.array(rest.level) + lfilter([1.0], [1.0, -r], white, axis=0)
@@ -109,20 +110,20 @@ def behind_a_low_pass(rng, rest, tau_s, sd):
 
 @pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0, 3.0])
 def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
-    # WHY: phones filter their samples; a rest of ten minutes became 8 .. 37, many of which were
-    # said to begin with a jump: a mean counted as if every sample told something new.
+    # WHY: phones filter their samples; a rest of ten minutes became 8 .. 37, many with a supposed
+    # jump, because the variance of a mean was computed for independent samples.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
     bag = reduce_source(rest.source(), full_scale=None)
     assert len(bag.intervals) == 1
     assert find_jumps(bag) == ()
-    # As its samples scatter, all of it is at rest, but for the ends of the interval.
+    # Given the scatter of its samples all of it is at rest, except for the ends of the interval.
     assert bag.n_still_cells > 0.98 * bag.n_cells
 
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
 def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
-    # WHY: means over 10 s know a level to 3 mg there, so 20 mg within one sample were overlooked.
+    # WHY: means over 10 s determine a level to 3 mg there, so 20 mg within one sample were missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)
@@ -130,7 +131,7 @@ def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
     assert len(bag.intervals) == 2
     (event,) = find_jumps(bag)
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
-    # To what is new in one sample, which no sample before it tells: 4 sd.
+    # Compared with the innovation of one sample, which does not depend on earlier ones: 4 sd.
     new = sd * np.sqrt(1.0 - np.exp(-2.0 / (rest.rate_hz * tau_s)))
     assert event.along / MG == pytest.approx(20.0, abs=4.0 * new)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch files name what exists: arguments, executables, parameters and topics."""
+"""The launch files name existing arguments, executables, parameters and topics."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ FILES = sorted((ROOT / 'launch').glob('*.launch.xml'))
 OURS = ROOT / 'launch' / 'thermo_comp.launch.xml'
 BESIDE = ROOT / 'launch' / 'beside_ins.launch.xml'
 
-# What the example says to packages of others, from their sources for Jazzy. A misspelt parameter
-# is silently ignored by their nodes, so the spelling is held here.
+# Parameters that the example sets in packages by others, from their sources for Jazzy. A misspelt
+# parameter is silently ignored by their nodes, so the spelling is tested here.
 OTHERS = {
     ('tf2_ros', 'static_transform_publisher'): set(),
     ('imu_filter_madgwick', 'imu_filter_madgwick_node'): {
@@ -68,7 +68,7 @@ class TestEveryFile:
 
 
 def parameters_set(arguments: dict[str, str]) -> dict[str, str]:
-    """Give the parameters that our launch file sets, as launch evaluates its substitutions."""
+    """Return the parameters that our launch file sets, with substitutions evaluated by launch."""
     given = {one.get('name', ''): one.get('default', '') for one in parse(OURS).findall('arg')}
     given |= arguments
 
@@ -90,7 +90,7 @@ def test_a_driver_is_a_file_of_topics() -> None:
 
 
 def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path: Path) -> None:
-    # WHY: the defaults of the arguments came after the user's file and took its values away.
+    # WHY: the defaults of the arguments replaced the values of the user's file.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     import rclpy
     import yaml
@@ -112,7 +112,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path: Path) ->
     some = [{}, {'frame_id': 'body'}, {'serial': '0042', **counts}]
     for arguments in some:
         files = []
-        # As launch gives them: the user's file, then its own.
+        # In the order of launch: the user's file, then its own values.
         for name, values in (('mine', mine), ('launch', parameters_set(arguments))):
             path = tmp_path / f'{name}.yaml'
             path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
@@ -144,13 +144,13 @@ def test_our_node_s_executable_parameters_and_topics() -> None:
     named = set(parameters_set(dict.fromkeys(declared(parse(OURS)), 'given')))
     assert named == {'calibration_file', 'serial', 'input', 'topics', 'frame_id'}
     assert named <= {field.name for field in fields(NodeConfig)}
-    # A serial such as 0042 would otherwise arrive as a number.
+    # A serial such as 0042 would otherwise become a number.
     assert all(one.get('type') == 'str' for one in node.findall('param') if one.get('name'))
     topics = {topic.name for topic in (*INPUTS.values(), *OUTPUTS)}
     defaults = {one.get('name'): one.get('default') for one in parse(OURS).findall('arg')}
     for remap in node.findall('remap'):
         topic = remap.get('from')
-        # Temperatures are subscribed by the sensors' names.
+        # Temperature topics are named after the sensors.
         assert topic in topics or topic.startswith('temperature/'), topic
         argument = re.fullmatch(r'\$\(var (\w+)\)', remap.get('to', ''))
         assert argument is not None
@@ -178,16 +178,16 @@ def test_the_example_s_frames_form_one_tree() -> None:
         (found,) = (one for one in node.findall('param') if one.get('name') == name)
         return found.get('value', '')
 
-    # One parent per frame (REP 105): the filter's own transform stays off, the mounting is static.
+    # One parent per frame (REP 105): the filter publishes no transform, the mounting is static.
     assert value(madgwick, 'publish_tf') == 'false'
     assert value(ekf, 'publish_tf') == 'true'
     mounting = nodes['static_transform_publisher'].get('args', '')
     assert f'--frame-id {value(ekf, "base_link_frame")}' in mounting
-    # Gravity is taken off exactly once.
+    # Gravity is subtracted exactly once.
     assert value(madgwick, 'remove_gravity_vector') == 'false'
     assert value(ekf, 'imu0_remove_gravitational_acceleration') == 'true'
     used = value(ekf, 'imu0_config').split()
     assert len(used) == 15
-    # No position, no speed, and no heading without a magnetometer.
+    # Without position, speed and, as there is no magnetometer, heading.
     assert [k for k, one in enumerate(used) if one == 'true'] == [3, 4, 9, 10, 11, 12, 13, 14]
     assert float(value(madgwick, 'orientation_stddev')) > 0.0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Holds the house together: imports go down only, and each heavy library has one home."""
+"""Imports go down only, and each heavy library is imported in one room only."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
 
-# One line per room (a folder or a module of the package's root). A room that is not here fails the
-# test: whoever adds one says where it lives.
+# One line per room (a folder, or a module in the package's root). A room that is missing here
+# fails the test, so that its layer must be decided.
 LAYERS = {
-    '__init__': 0,  # its public names, asked for by name, are types of any room to a checker
+    '__init__': 0,  # public names, for type checkers
     'errors': 0,
     'typing': 0,
     'files': 0,
@@ -42,7 +42,7 @@ LAYERS = {
     '__main__': 6,
 }
 
-# Who may import what from outside. A library that is not here is free for all.
+# Rooms that may import a library. A library that is missing here is free for all rooms.
 ROS = ['rclpy', 'rcl_interfaces', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs']
 HOMES = {
     **{name: {'ros'} for name in ROS},
@@ -64,11 +64,11 @@ HOMES = {
     'rich': {'cli', '__main__'},
 }
 
-# The arithmetic has no clock of its own.
+# The mathematics reads no clock.
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
 CLOCK_EXCEPTIONS = {
-    'fitting/assembly.py'  # the date of a fit is provenance, and stands in the calibration file
+    'fitting/assembly.py'  # the date of a fit is part of its provenance
 }
 
 SOURCES = sorted(PACKAGE.rglob('*.py'))
@@ -105,9 +105,7 @@ def imports_of(path: Path, with_types: bool = True) -> list[tuple[int, str]]:
 
 @cache
 def own_unit(name: str) -> str | None:
-    """
-    Return the unit that an absolute name of this package belongs to, None for other packages.
-    """
+    """Return the room of an absolute name of this package, None for other packages."""
     parts = name.split('.')
     if parts[0] != 'thermo_comp':
         return None
@@ -136,9 +134,7 @@ def test_imports_go_down_only(path: Path) -> None:
 
 @cache
 def own_file(name: str) -> str:
-    """
-    Return the file of this package that an absolute name is imported from, by its dotted name.
-    """
+    """Return the file of this package that an absolute name is imported from, as a dotted name."""
     parts = name.split('.')[1:]
     while parts:
         path = PACKAGE.joinpath(*parts)
@@ -152,7 +148,7 @@ def own_file(name: str) -> str:
 
 def circle(uses: dict[str, set[str]]) -> dict[str, set[str]]:
     """
-    Return what is left of a graph without its leaves, again and again; nothing without a circle.
+    Remove the leaves of a graph repeatedly; return the rest, which is empty without a circle.
     """
     while True:
         leaves = {one for one, targets in uses.items() if not targets & uses.keys()}
@@ -163,8 +159,8 @@ def circle(uses: dict[str, set[str]]) -> dict[str, set[str]]:
 
 @pytest.mark.parametrize('by', ['room', 'file'])
 def test_no_circle(by: str) -> None:
-    # Inside one layer a room may use another, but never each the other; nor may two files. Naming
-    # a type is no use.
+    # Within a layer a room may use another, but not mutually, and no two files may use each other.
+    # Imports for type annotations do not count.
     uses: dict[str, set[str]] = {}
     for path in SOURCES:
         own = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)
@@ -181,7 +177,7 @@ def test_no_circle(by: str) -> None:
 
 
 def loaded_after(statement: str, *watched: str) -> list[str]:
-    """Return which of the watched modules a fresh interpreter holds after one statement."""
+    """Return which of the watched modules a new interpreter has imported after one statement."""
     code = f'{statement}\nimport sys\nprint(*[m for m in {watched!r} if m in sys.modules])'
     finished = subprocess.run(
         [sys.executable, '-c', code],
@@ -195,8 +191,8 @@ def loaded_after(statement: str, *watched: str) -> list[str]:
 
 
 def test_node_starts_without_the_offline_libraries() -> None:
-    # The node runs on the robot's computer for weeks: what only a fit or a plot needs would cost
-    # it memory and start-up time.
+    # The node runs on the robot's computer for weeks: libraries for fits or plots would cost
+    # memory and start-up time.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     offline = ('rosbags', 'mcap', 'matplotlib', 'scipy', 'scipy.optimize', 'typer', 'rich')
     assert loaded_after('import thermo_comp.ros.node', *offline) == []

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Holds the viewers' layouts to the bags: every path in them leads to a number in a replayed bag.
-"""
+"""Every path in the viewers' layouts leads to a number in a replayed bag."""
 
 from __future__ import annotations
 
@@ -27,7 +25,7 @@ from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 FOXGLOVE = ROOT / 'config' / 'thermo_comp.foxglove.json'
 PLOTJUGGLER = ROOT / 'config' / 'plotjuggler_layout.xml'
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-# Only the live node publishes diagnostics; the panels for them stay empty on a replayed bag.
+# Only the live node publishes diagnostics; the panels for them are empty for a replayed bag.
 LIVE_ONLY = {'/diagnostics'}
 
 
@@ -59,7 +57,7 @@ def topics(tmp_path_factory) -> dict[str, str]:
 
 
 def field_kind(message: str, fields: list[str]) -> str:
-    """Follow field names through message definitions; return what stands at their end."""
+    """Follow field names through message definitions; return the type of the last one."""
     name = message
     for part in fields:
         field, _, index = part.partition('[')
@@ -99,7 +97,7 @@ def test_foxglove_paths_lead_to_numbers(topics):
         else:
             assert field_kind(topics[topic], fields) in ('float64', 'bool')
         found.add(topic)
-    # The stamped flag says what the flag says; a viewer has the time of either.
+    # The stamped flag equals the plain flag; a viewer shows either at its time.
     assert found == {output, *topics} - {'/regime/stamped'}
 
 
@@ -126,7 +124,7 @@ def plotjuggler() -> ET.Element:
 def source_kind(topics: dict[str, str], series: str) -> str:
     topic = max((t for t in topics if series.startswith(f'{t}/')), key=len)
     fields = series[len(topic) + 1 :].split('/')
-    # PlotJuggler spells an element of a covariance [row;column], as a field of its own.
+    # PlotJuggler writes an element of a covariance as a field [row;column].
     if match := re.fullmatch(r'\[([012]);([012])\]', fields[-1]):
         place = 3 * int(match[1]) + int(match[2])
         fields = [*fields[:-2], f'{fields[-2]}[{place}]']
@@ -156,8 +154,9 @@ def test_plotjuggler_splitters_count_what_they_hold():
 @pytest.mark.parametrize(
     ('name', 'expected'),
     [
-        # T = 20 + 0.5 m + 0.01 m^2 with m in minutes: at m = 60 its rate is 1.7 K/min, two lags
-        # of 30 s earlier 1.68 (within the lags' sampling at 1 Hz), its second derivative 0.02.
+        # T = 20 + 0.5 m + 0.01 m^2 with m in minutes: at m = 60 its rate is 1.7 K/min; two lags of
+        # 30 s earlier it is 1.68 (within the sampling of the lags at 1 Hz); its second derivative
+        # is 0.02.
         ('/thermo_comp/board_k_min', 1.68),
         ('/thermo_comp/case_k_min', 1.68),
         ('/thermo_comp/case_k_min2', 0.02),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The attitude that positions left unseen is named, with what that costs there."""
+"""The attitude least determined by the positions is named, with the sd of |f| there."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.coverage import least_known
 from thermo_comp.simulation.campaign import positions
 
-#: How well a mounting repeats is stated: six faces do not tell it, and it is not the subject here.
+#: The repeatability of the mounting is given, as six faces do not determine it.
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), mounting_sd=1e-6)
 FACES = np.vstack((np.eye(3), -np.eye(3)))
 
@@ -31,12 +31,12 @@ def said(result) -> str:
 def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
     result = fitted(rng, FACES)
     least = result.least_known
-    # Without a posterior nothing is claimed.
+    # Without a posterior there is no claimed sd.
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
-    # A corner, or what of the grid is beside it: there the variance is flat.
+    # A corner, or a neighbour in the grid: the variance is flat there.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
-    # d|f| = g (xy, xz, yz) . (three angles of 1 mrad); noise and curve of the faces add some.
+    # d|f| = g (xy, xz, yz) . (three angles of 1 mrad); noise and curves of the faces add a little.
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-3 / 3.0**0.5, rel=0.2)
 
 

@@ -25,7 +25,8 @@ TAUS = (60.0, 900.0, 7680.0)
 
 @pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
 def test_a_lag_of_a_ramp(step_s):
-    # u = r t from rest: u - L = r tau (1 - exp(-t / tau)), however it is read (first-order hold).
+    # u = r t from rest: u - L = r tau (1 - exp(-t / tau)) for any reading interval (first-order
+    # hold).
     rate, n = 0.01, 200
     bank = LagBank(TAUS)
     for k in range(n + 1):
@@ -63,7 +64,7 @@ def test_what_is_not_known_of_a_lag():
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
-    # It fades as the lag forgets.
+    # The uncertainty decays with the lag.
     found = bank.at(150 * SECOND_NS, 2.0)[1]
     assert found == pytest.approx([lost**2 * math.exp(-2.0), 0.0])
     bank.note_jump(3.0)
@@ -82,7 +83,7 @@ def plays(*widths):
 
 
 def test_the_loop_of_a_play():
-    # Half-width 1 on 0 -> 5 -> 0 -> 5: up at v - 1, stands still over 2, down at v + 1.
+    # Half-width 1 on 0 -> 5 -> 0 -> 5: rising at v - 1, constant over 2, falling at v + 1.
     memory = plays(1.0)
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []
@@ -114,7 +115,7 @@ def test_a_play_on_a_lag_follows_the_lag():
     lagged = 23.6 - 0.002 * 900.0 * -math.expm1(-2.0)
     found = memory.at(1800 * SECOND_NS, 23.6, [0.0])
     assert 23.6 - found[0] == pytest.approx(lagged)
-    # It has been pushed from 20 up to 0.4 K below the lagged temperature.
+    # The play was pushed up from 20, and ends 0.4 K below the lagged temperature.
     assert lagged - 20.0 > 0.4
     assert found[2] == pytest.approx(-0.4)
 
@@ -133,7 +134,7 @@ def test_start_prior():
 
 
 def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
-    # A board that has wandered for long: its lags at the first reading scatter by P.
+    # A board in a long random walk: its lags at the first reading scatter by P.
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0
@@ -143,7 +144,7 @@ def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
         e = np.exp(-step / tau)
         m = m * e + walk * (tau / step) * (1.0 - e)
     P = start_covariance([('board', t) for t in tau])
-    # n draws: relative sd sqrt(2 / n) = 2.2 %; the walk's steps are a tenth of 60 s.
+    # n draws: relative sd sqrt(2 / n) = 2.2 %; the steps of the walk are a tenth of 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
 
 

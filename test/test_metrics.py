@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Residual statistics against numbers worked out by hand."""
+"""Residual statistics against numbers computed by hand."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The profile for Fast DDS: it does what it is there for, and one of the user's wins."""
+"""The Fast DDS profile has its effect, and a profile of the user replaces it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from subprocess import PIPE
 
@@ -30,7 +29,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 
 CYCLE_NS = 10_000_000
 N_SAMPLES = 300
-#: After so many nobody hears any.
+#: Longest time after which no message arrives any more.
 N_TRIED = 5000
 OTHER = """\
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
@@ -38,7 +37,7 @@ OTHER = """\
 </profiles></dds>
 """
 
-#: Hears the output twice; says when it does, and in the end what stamps it has got either way.
+#: Receives the output twice; prints when it does, and at the end the stamps received in each way.
 RECEIVER = """
 import json, select, sys, time
 import rclpy
@@ -76,7 +75,7 @@ print(json.dumps(list(heard.values())), flush=True)
 
 
 def event_wakes(pid: int) -> int:
-    """Count how often the thread that holds the middleware's timed events was woken so far."""
+    """Count how often the thread of the middleware's timed events has been woken so far."""
     (thread,) = (
         task
         for task in Path(f'/proc/{pid}/task').iterdir()
@@ -87,20 +86,13 @@ def event_wakes(pid: int) -> int:
 
 
 def send(driver: Driver, first: int, last: int, pause_s: float) -> None:
-    """Send samples one by one, and with every hundredth the temperatures."""
+    """Send samples one by one, with the temperatures at every hundredth."""
     pause = threading.Event()
     for k in range(first, last):
         if k % 100 == 0:
             driver.temperatures(k * CYCLE_NS, 20.0, 20.0)
         driver.counts(k * CYCLE_NS, *standing(k))
         pause.wait(pause_s)
-
-
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
 
 
 @pytest.fixture
@@ -111,13 +103,13 @@ def node_arguments(tmp_path: Path) -> list[str]:
 
 
 def wakes_per_sample(peer: Peer, drivers: list[Driver], node_arguments: list[str]) -> float:
-    """Run the node before a reliable subscriber; count the wake-ups of its event thread."""
+    """Run the node with a reliable subscriber; count the wake-ups of its event thread."""
     with NodeProcess(*node_arguments) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
-        # One driver for all nodes: what has two sources is not published.
+        # One driver for all nodes, as samples of two sources are not published.
         drivers[:] = drivers or [Driver(peer)]
         first = 0
-        # Until the node and the peer know each other.
+        # Wait until node and peer have discovered each other.
         while not heard:
             assert first < N_TRIED, node.said
             send(drivers[0], first, first + 100, 0.001)
@@ -132,14 +124,14 @@ def wakes_per_sample(peer: Peer, drivers: list[Driver], node_arguments: list[str
 def test_samples_do_not_wake_the_event_thread(
     peer: Peer, node_arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A profile of the user's wins, and this one leaves Fast DDS as it is: an event that is due at
-    # once is set with each sample, or with the first of several that a busy machine lets gather.
+    # The user's profile leaves Fast DDS at its default: an event is due with each sample, or with
+    # the first of several that a busy machine handles together.
     other = tmp_path / 'other.xml'
     other.write_text(OTHER)
     monkeypatch.setenv(VARIABLE, str(other))
     drivers: list[Driver] = []
     by_default = wakes_per_sample(peer, drivers, node_arguments)
-    # With the node's own it is due 50 times a second, not with each of some 700 samples.
+    # With the node's profile an event is due 50 times a second, not with each of 700 samples.
     monkeypatch.delenv(VARIABLE)
     assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
 
@@ -147,8 +139,8 @@ def test_samples_do_not_wake_the_event_thread(
 def test_what_is_lost_on_the_way_is_repeated(
     peer: Peer, node_arguments: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The receiver is stopped while twice as many samples are sent as its queue of shared
-    # memory holds (512).
+    # The receiver is stopped while twice as many samples are sent as its shared memory queue holds
+    # (512).
     monkeypatch.delenv(VARIABLE, raising=False)
     command = [sys.executable, '-c', RECEIVER]
     with (
@@ -170,14 +162,14 @@ def test_what_is_lost_on_the_way_is_repeated(
         print((last - 1) * CYCLE_NS, file=receiver.stdin, flush=True)
         assert receiver.stdout.readline() == 'ready\n'
         reliable, best_effort = json.loads(receiver.stdout.readline())
-    # All there and in order, and it was not for want of a loss.
+    # All samples arrived in order, although some were lost at first.
     assert reliable[-1000:] == [k * CYCLE_NS for k in range(first, last)]
     assert len(set(best_effort) & set(reliable[-1000:])) < 1000
 
 
 def test_where_the_profile_comes_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    # What is set is put back in the end, whatever it was.
+    # The previous setting is restored at the end.
     monkeypatch.setenv(VARIABLE, 'mine.xml')
     use_profile()
     assert os.environ[VARIABLE] == 'mine.xml'

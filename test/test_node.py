@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node on real DDS: what goes in, what comes out, and what it says about itself."""
+"""The node on real DDS: its input, its output and its diagnostics."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,15 +40,8 @@ IMU_UNIT = Unit('T-1', 'm/s^2', 160.0, 0.01)
 
 
 @pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
-
-
-@pytest.fixture
 def saved(tmp_path: Path) -> Callable[..., list[str]]:
-    """Write a calibration and give the ROS arguments of a node that runs it."""
+    """Write a calibration and return the ROS arguments of a node with it."""
 
     def save(of: Calibration, *overrides: str) -> list[str]:
         path = tmp_path / 'unit.yaml'
@@ -60,7 +53,7 @@ def saved(tmp_path: Path) -> Callable[..., list[str]]:
 
 
 def diagnosis(peer: Peer) -> Callable[[Callable[[DiagnosticStatus, dict[str, str]], Any]], Any]:
-    """Wait for diagnostics that fulfil a condition; answer with status and values."""
+    """Wait for diagnostics that fulfil a condition; return the status and its values."""
     heard = peer.listen(DiagnosticArray, '/diagnostics')
 
     def wait(condition: Callable[[DiagnosticStatus, dict[str, str]], Any]) -> Any:
@@ -113,8 +106,8 @@ def test_publishes_the_compensators_values_under_the_inputs_stamps(
 def test_a_reading_that_comes_late_counts_from_the_next_sample(
     peer: Peer, saved: Callable[..., list[str]]
 ) -> None:
-    # WHY: the node takes all samples that wait before it takes the readings between them.
-    # WHAT: order of arrival decides, as in a bag; a reading never reaches back.
+    # WHY: the node takes all waiting samples before the readings between them. WHAT: order of
+    # arrival decides, as in a bag; a reading never applies to earlier samples.
     unit = rich_calibration()
     with node_in_thread(*saved(unit), *lossless()) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -126,7 +119,7 @@ def test_a_reading_that_comes_late_counts_from_the_next_sample(
             driver.counts(stamp_ns, *standing(k))
             expected.append(compensator.process(stamp_ns, *standing(k)))
             if k % 7 == 0:
-                # Stamped three samples before the one that it follows.
+                # Its stamp is that of three samples before the one that it follows.
                 late = stamp_ns - 3 * CYCLE_NS
                 driver.temperatures(late, 20.0 + 0.01 * k, 22.0 + 0.01 * k)
                 compensator.push('board', late, 20.0 + 0.01 * k)
@@ -157,7 +150,8 @@ def test_imu_input_with_frame_and_switch_of_the_input(
         assert heard[0].orientation == sent.orientation
         assert heard[0].orientation_covariance.tolist() == sent.orientation_covariance.tolist()
         assert heard[0].linear_acceleration.z == pytest.approx(0.4, rel=1e-12)
-        # Vectors are counts, of a calibration in counts; the node changes over while it runs.
+        # Vectors are counts for a calibration in counts; the node switches the input while it
+        # runs.
         assert 'unit.input: must be' in peer.set_atomically(input='counts').reason
         file = saved(calibration())[1].removeprefix('calibration_file:=')
         both = peer.set_atomically(input='counts', frame_id='', calibration_file=file)
@@ -188,7 +182,7 @@ def test_flag_is_latched_and_not_there_while_unknown(
         assert not flags
         n = 0
         while not flags and n < 4000:
-            # Two minutes of data at a time, until the detector has seen enough of the soak.
+            # Two minutes of data at a time, until the detector knows that it is a soak.
             for _ in range(120):
                 n += 1
                 driver.temperatures(START_NS + n * SECOND_NS, 20.0, 20.0)
@@ -199,9 +193,9 @@ def test_flag_is_latched_and_not_there_while_unknown(
         late = peer.listen(Bool, 'regime/dynamic', LATCHED)
         peer.wait_for(lambda: late, 'the latched flag')
         assert not late[0].data
-        # The same with the stamp of the reading that decides, latched, too.
+        # The same with the stamp of the deciding reading, also latched.
         latched = peer.listen(DiagnosticArray, 'regime/stamped', LATCHED)
-        # A late reader gets what is kept for it, the newest last.
+        # A late subscriber gets the latched messages, the newest last.
         peer.wait_for(
             lambda: (
                 len(stamped_flags) == len(flags)
@@ -245,11 +239,12 @@ def test_diagnostics_name_what_is_wrong(peer: Peer, saved: Callable[..., list[st
         assert (values['samples in'], values['samples out']) == ('4', '1')
         assert values['sample stamp [ns]'] == str(stamp_ns)
         assert [m.linear_acceleration.x for m in heard] == [1.0 / 300.0]
-        # It is an error while it lasts, and no longer.
+        # The level is ERROR only while it lasts.
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
         driver.counts(stamp_ns + CYCLE_NS, 1.0, 2.0, 3.0)
-        # An old stamp by more than a second is another time; a little old is disorder.
+        # A stamp that is more than a second older is a jump of time; one slightly older is out of
+        # order.
         driver.counts(stamp_ns - 5, 1.0, 2.0, 3.0)
         _, status, _ = wait(lambda s, _: 'out of order' in s.message)
         driver.counts(START_NS - 10 * SECOND_NS, 1.0, 2.0, 3.0)
@@ -266,7 +261,7 @@ def test_diagnostics_tell_noise_and_bias_apart(
         driver.counts(START_NS + 1, *standing(0))
         _, _, values = wait(lambda _, values: values['samples out'] == '1')
         for axis in 'xyz':
-            # What an INS needs beside the covariance: its own sd is noise, rounding and bias.
+            # What an INS needs in addition to the covariance: noise density and bias sd.
             density, whole, bias = (
                 float(values[f'{name} {axis} {of}'])
                 for name, of in (
@@ -282,7 +277,7 @@ def test_diagnostics_tell_noise_and_bias_apart(
             assert bias > 0.0
             of_rate = float(values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'])
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
-            # The regime is unknown: the two sets of that gyroscope differ by some 30 urad/s.
+            # The regime is unknown: the two sets of that gyroscope differ by about 30 urad/s.
             assert 1e-5 < float(values[f'bias sd of rate {axis} [rad/s]']) < 1e-3
 
 
@@ -338,8 +333,9 @@ def test_constants_need_no_thermometer(peer: Peer, saved: Callable[..., list[str
         for k in range(20):
             driver.counts(START_NS + k * CYCLE_NS, *standing(k))
         _, status, values = wait(lambda _, values: values['samples out'] == '20')
-    assert len(heard) == 20
-    # 100 samples a second as calibrated, but in a hurry: DDS says how many came in a report.
+        # The report and the samples come on different topics, in any order.
+        peer.wait_for(lambda: len(heard) == 20)
+    # 100 samples a second as calibrated, but sent at once: their number per report depends on DDS.
     assert 'not corrected for temperature' in status.message or 'samples/s' in status.message
     assert status.level != DiagnosticStatus.ERROR
     assert (values['board age [s]'], values['board temperature sd [K]']) == ('inf', '10.0000')
@@ -352,7 +348,7 @@ def test_sample_rate_is_held_against_the_calibrated_one(
     with node_in_thread(*saved(calibration())) as node:
         driver = drive(peer, node)
         driver.temperatures(START_NS, 20.0, 20.0)
-        # The unit's cycle is 10 ms; these come every 20 ms of their own time.
+        # The unit's cycle is 10 ms; the stamps of these samples are 20 ms apart.
         for k in range(50):
             driver.counts(START_NS + 2 * k * CYCLE_NS, *standing(k))
         wait(lambda _, values: values['samples in'] == '50')
@@ -384,7 +380,7 @@ def test_namespace_and_remapping(peer: Peer, saved: Callable[..., list[str]]) ->
         assert '/accel/counts' not in topics
         names = {name for name, _ in node.node.get_service_names_and_types()}
         assert '/imu0/thermo_comp/set_parameters' in names
-        # Two units are two entries, and the aggregator's group has both.
+        # Two units have two entries, both in the aggregator's group.
         _, status, _ = diagnosis(peer)(lambda *_: True)
         assert status.name == '/imu0/thermo_comp: compensation'
         config = ROOT / 'config' / 'diagnostic_aggregator.yaml'

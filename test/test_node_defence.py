@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What strangers on the network may ask of the node and send to it: it answers, and samples go on.
-"""
+"""Requests and messages of strangers on the network: the node answers, and samples go on."""
 
 from __future__ import annotations
 
@@ -13,7 +11,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,25 +51,11 @@ from thermo_comp.text import one_line
 from thermo_comp.unit.calibration_file import save_calibration
 
 
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
-
-
-@pytest.fixture
-def unit(tmp_path: Path) -> Path:
-    path = tmp_path / 'unit.yaml'
-    save_calibration(calibration(), path)
-    return path
-
-
 def odd(name: str, kind: int) -> ParameterMessage:
     return ParameterMessage(name=name, value=ParameterValue(type=kind))
 
 
-#: Anything that a request may hold; every one of them is answered.
+#: Values that a request may contain; each request must be answered.
 STRANGE: list[ParameterMessage] = [
     *[odd(name, kind) for name in ('frame_id', '', 'no such') for kind in (0, 77, 255)],
     *[
@@ -115,7 +98,7 @@ def test_any_request_is_answered_and_samples_go_on(peer: Peer, unit: Path, toget
             assert result.reason == one_line(result.reason)
             assert len(result.reason) < 10_000, message.name[:60]
         samples.go_on()
-        # One bad one among good ones: the good ones are set, or none.
+        # A bad value among good ones: all good ones are set, or none.
         good = Parameter('frame_id', value='body').to_parameter_msg()
         answer = peer.call(kind, name, kind.Request(parameters=[STRANGE[1], good]))
         config: NodeConfig = node._config
@@ -140,7 +123,7 @@ def test_any_request_is_answered_and_samples_go_on(peer: Peer, unit: Path, toget
 def test_questions_of_any_length_are_answered(
     peer: Peer, unit: Path, kind: Any, field: str
 ) -> None:
-    # WHY: 100 000 names kept the samples waiting for more than a second.
+    # WHY: a request with 100 000 names delayed the samples by more than a second.
     name = 'thermo_comp/' + re.sub('(?<!^)(?=[A-Z])', '_', kind.__name__).lower()
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
@@ -160,7 +143,7 @@ def test_questions_of_any_length_are_answered(
 
 
 def test_a_callback_that_fails_is_logged_counted_and_survived(peer: Peer, unit: Path) -> None:
-    # WHY: the class of fault: whatever nobody foresaw, in a service, a call or the relay itself.
+    # WHY: the class of fault: unexpected failures in a service, a call or the relay itself.
     with node_in_thread(*node_arguments(unit)) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
@@ -238,7 +221,7 @@ def test_calibrations_are_taken_from_one_folder_only(
 
 
 def test_a_reader_that_ends_is_begun_anew(unit: Path) -> None:
-    # WHY: whatever a file does to the process that reads it, the node only hears of it.
+    # WHY: a file may crash or hang the process that reads it, but not the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
     process = reader._process
@@ -254,7 +237,7 @@ def test_a_reader_that_ends_is_begun_anew(unit: Path) -> None:
 
 
 def test_a_reader_that_hangs_is_given_up(unit: Path) -> None:
-    # WHY: a network drive that was gone held every request, and the end of the node, too.
+    # WHY: a lost network drive blocked every request, and also the end of the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
     process, reader._limit_s = reader._process, 0.3
@@ -322,7 +305,7 @@ def test_while_a_file_hangs_the_node_ends_and_nothing_stays(
 
 
 def alive(pid: int) -> bool:
-    """Tell whether a process is there, and more than a number that waits for its parent."""
+    """Return whether a process runs, not counting a zombie."""
     try:
         return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
     except FileNotFoundError:
@@ -338,7 +321,7 @@ raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.
 
 
 def test_a_start_that_hangs_ends_with_one_signal() -> None:
-    # WHY: SIGTERM was noted and nobody came to look; it took a second one.
+    # WHY: SIGTERM was stored but not handled; a second one was needed.
     with subprocess.Popen(
         [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True
     ) as process:

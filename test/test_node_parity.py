@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag played over DDS into the node and the offline replay of it give the same, bit for bit."""
+"""A bag played over DDS into the node and its offline replay give the same, bit for bit."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ UNIT = Unit('T-1', 'counts', 32767.0, 1.0 / RATE_HZ)
 
 @pytest.fixture(autouse=True)
 def _collected():
-    """Free what rclpy leaves in circles: until then it stays in the graph of the next test."""
+    """Free rclpy's circular references, which would remain in the ROS graph of the next test."""
     yield
     gc.collect()
 
 
 def thermal_test(path: Path, imu: bool = False, has_case: bool = True) -> int:
     """
-    Write a soak, a ramp and a soak, with readings that come late; return the number of samples.
+    Write a soak, a ramp and a soak with late readings; return the number of samples.
 
-    Late means: stamped before the samples that stand before them in the bag. Only a node that
-    respects the order of arrival, and no other order, does with them what the replay does.
+    A late reading has an earlier stamp than the samples before it in the bag, so that only a node
+    that keeps the order of arrival gives the result of the replay.
     """
     rng = np.random.default_rng(11)
     n = MINUTES * 60 * RATE_HZ
@@ -55,7 +55,7 @@ def thermal_test(path: Path, imu: bool = False, has_case: bool = True) -> int:
     case = np.interp(seconds, [0.0, 600.0, 1200.0], [15.0, 15.0, 25.0])
     board = np.interp(seconds - 100.0, [0.0, 600.0, 1200.0], [16.0, 16.0, 26.0])
     reading_ns = START_NS + (seconds * 1e9).astype(np.int64)
-    # Around the sensitivity of `rich_calibration`: at rest, level, z up, with a little noise.
+    # Scale factors near those of `rich_calibration`: at rest, level, z up, with a little noise.
     accel = np.array([5.0, -3.0, 310.0 * 9.80665]) + rng.integers(-4, 5, (n, 3))
     with BagWriter(path) as writer:
         for topic, values, late_ns in (
@@ -71,7 +71,7 @@ def thermal_test(path: Path, imu: bool = False, has_case: bool = True) -> int:
             writer.write_temperature(topic, reading_ns, noisy, reading_ns + late)
         if imu:
             rest = ImuColumns(*(rng.standard_normal((n, k)) for k in (4, 9, 3, 9, 9)))
-            # Every tenth message says that it holds no angular rate.
+            # Every tenth message states that it has no angular rate.
             rest.angular_velocity_covariance[::10, 0] = -1.0
             covariance = rest.linear_acceleration_covariance
             force = accel / [300.0, -295.0, 310.0]
@@ -82,7 +82,7 @@ def thermal_test(path: Path, imu: bool = False, has_case: bool = True) -> int:
 
 
 def output_of(path: Path) -> tuple[Block, list[bool], list[bytes]]:
-    """Read a corrected bag; the flags, and the stamped ones as bytes, by a library not ours."""
+    """Read a corrected bag with `rosbags`: samples, flags, and stamped flags as bytes."""
     with AnyReader([path]) as reader:
         wanted = [c for c in reader.connections if c.topic.endswith(REGIME.name)]
         flags = [
@@ -106,7 +106,7 @@ def assert_same(live: Path, offline: Path) -> None:
     assert expected.imu is not None
     for name in ImuColumns._fields:
         assert getattr(found.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
-    # The k-th flag belongs to the k-th case reading: equal flags are equal switch times.
+    # The k-th flag belongs to the k-th case reading: equal flags mean equal switch times.
     assert (len(flags), flags) == (len(expected_flags), expected_flags)
     assert False in flags
     assert True in flags
@@ -129,12 +129,12 @@ def run(calibration: Calibration, bag: Path, folder: Path, *node_args: str, **ke
 def test_counts(tmp_path: Path) -> None:
     n = thermal_test(tmp_path / 'bag')
     unit = replace(rich_calibration(), unit=UNIT)
-    # All but what comes before the first board temperature, which is not late by chance.
+    # All samples after the first board temperature, which is not late.
     assert run(unit, tmp_path / 'bag', tmp_path) == n
 
 
 def test_the_board_says_the_regime_where_there_is_no_case(tmp_path: Path) -> None:
-    # WHY: nobody published `regime/dynamic`, and the table of a replay said `unknown` throughout.
+    # WHY: nobody published `regime/dynamic`, and the table of a replay always said `unknown`.
     n = thermal_test(tmp_path / 'bag', has_case=False)
     unit = replace(rich_calibration(), unit=UNIT)
     assert run(unit, tmp_path / 'bag', tmp_path) == n
@@ -155,10 +155,10 @@ def test_imu_in_another_frame(tmp_path: Path) -> None:
     found, _, _ = output_of(tmp_path / 'live.mcap')
     given = given.imu.take(np.flatnonzero(np.isin(given.accel_stamp_ns, found.accel_stamp_ns)))
     is_rate = given.angular_velocity_covariance[:, 0] != -1.0
-    # The rate is corrected where there is one; what was no rate goes through as it came.
+    # An existing rate is corrected, a missing one passes unchanged.
     moved = np.abs(found.imu.angular_velocity - given.angular_velocity)
     assert moved[~is_rate].max() == 0.0
-    # The biases of `rich_gyroscope` at the reference are 10 mrad/s and more.
+    # The biases of `rich_gyroscope` at the reference temperature are 10 mrad/s and more.
     assert moved[is_rate].min() > 1e-3
     claimed = found.imu.angular_velocity_covariance[is_rate].reshape(-1, 3, 3)
     assert (np.linalg.eigvalsh(claimed) > 0.0).all()

@@ -1,12 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node as a process: its calibration changes while samples flow, through the real services."""
+"""
+The node as a process: its calibration is changed through the real services while samples flow.
+"""
 
 from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
@@ -38,13 +40,13 @@ K = 300.0
 
 
 def of_bias(counts: float, **keys: Any) -> Any:
-    """Make a calibration that can be told by what it takes off the x axis."""
+    """Make a calibration that is recognised by its bias of x."""
     axes = Axes(AxisReference(K, counts), AxisReference(K, 0.0), AxisReference(K, 0.0))
     return calibration(axes=axes, **keys)
 
 
 class Flow:
-    """Publishes the counts of a unit that stands, and hears what becomes of them."""
+    """Publishes the counts of a unit at rest, and collects the output."""
 
     def __init__(self, peer: Peer) -> None:
         self._peer = peer
@@ -64,7 +66,7 @@ class Flow:
             self.n_sent += 1
 
     def more(self, n: int = 100) -> int:
-        """Wait for further samples; return how many there are."""
+        """Wait for further samples; return their number."""
         wanted = len(self.heard) + n
         self._peer.wait_for(lambda: len(self.heard) >= wanted, f'{n} more samples')
         return len(self.heard)
@@ -79,13 +81,6 @@ class Flow:
         self._thread.join(TIMEOUT)
         last = START_NS + (self.n_sent - 1) * CYCLE_NS
         self._peer.wait_for(lambda: stamp_of(self.heard[-1]) == last, 'the last sample')
-
-
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
 
 
 def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:
@@ -104,7 +99,7 @@ def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:
         assert [r.successful for r in peer.set_parameters(calibration_file=str(second))] == [True]
         flow.more()
 
-        # Broken: refused with path, key and reason; the running calibration stays.
+        # Broken file: refused with path, key and reason; the calibration in use stays.
         (result,) = peer.set_parameters(calibration_file=str(broken))
         assert not result.successful
         assert str(broken) in result.reason
@@ -117,7 +112,7 @@ def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:
             GetParameters.Request(names=['calibration_file']),
         ).values[0].string_value == str(second)
 
-        # Together with others: all or none.
+        # With other parameters: all are set, or none.
         result = peer.set_atomically(transition_time=5, calibration_file=str(broken))
         assert not result.successful
         result = peer.set_atomically(transition_time=5, calibration_file=str(tmp_path / 'none'))
@@ -128,14 +123,15 @@ def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:
         assert values[0].double_value == 30.0
         assert flow.bias(flow.more() - 1) == 2.0
 
-        # The same name again reads the file again; a whole number is a number.
+        # Setting the same name again reads the file again; an integer is accepted as a number.
         save_calibration(of_bias(3.0), second)
         result = peer.set_atomically(transition_time=5, calibration_file=str(second))
         assert result.successful, result.reason
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 5.0
 
-        # Another unit's file, where the unit was named; a serial that the file is not for.
+        # The file of another unit while the serial is set, and a serial that differs from the
+        # file's.
         save_calibration(of_bias(4.0, unit=Unit('T-2', 'counts', 32767.0, 0.01)), third)
         (result,) = peer.set_parameters(serial='T-9')
         assert "unit.serial: must be 'T-9'" in result.reason
@@ -147,7 +143,7 @@ def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:
         save_calibration(of_bias(4.0, unit=Unit('T-1', 'm/s^2', 160.0, 0.01)), third)
         (result,) = peer.set_parameters(calibration_file=str(third))
         assert "must be 'counts' (parameter `input` is counts), got 'm/s^2'" in result.reason
-        # Another set of thermometers, for which this node has no subscriptions.
+        # Other thermometers, which this node does not subscribe to.
         save_calibration(of_bias(5.0, sensors=('case', 'lid')), third)
         (result,) = peer.set_parameters(calibration_file=str(third))
         assert 'sensors: must be case, which this node listens to, got case, lid' in result.reason
@@ -157,17 +153,17 @@ def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:
         assert node.stop() == 0
         assert 'Traceback' not in node.said
 
-    # None lost, none twice, in order, from the first one on.
+    # No sample lost or repeated, all in order from the first one on.
     stamps = [stamp_of(message) for message in flow.heard]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
-    # One calibration after the other, and each sample under exactly one of them.
+    # One calibration after the other, and each sample is corrected by exactly one of them.
     biases = [flow.bias(index) for index in range(len(stamps))]
     changes = [b for a, b in pairwise(biases) if a != b]
     assert (biases[0], changes) == (1.0, [2.0, 3.0])
 
 
 def test_a_reload_keeps_the_thermal_state(peer: Peer, tmp_path: Path) -> None:
-    # WHY: a new calibration of the same sensors must not make the node blind for minutes.
+    # WHY: a new calibration with the same sensors must not reset the node for minutes.
     bias = regime_set(*[axis_set(bias=(0.0, 10.0))] * 3)
     plain, biased = tmp_path / 'plain.yaml', tmp_path / 'biased.yaml'
     save_calibration(of_bias(1.0), plain)
@@ -181,16 +177,19 @@ def test_a_reload_keeps_the_thermal_state(peer: Peer, tmp_path: Path) -> None:
         flow.stop()
     stamps = [stamp_of(message) for message in flow.heard]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
-    # At 20 degC, the reference, the bias function is 0 whatever its slope.
+    # At the reference, 20 degC, the bias function is 0 for any slope.
     assert {flow.bias(index) for index in range(len(stamps))} == {1.0}
 
 
 class _Stop(BaseException):
-    """What is raised at a line."""
+    """The exception raised at a line."""
 
 
 def raising_at(number: int, call: Callable[[], Any]) -> bool:
-    """Call, and raise at the so-manieth line of this package; tell whether there was one."""
+    """
+    Call a function and raise at the n-th executed line of this package; return whether it was
+    reached.
+    """
     n_lines = 0
 
     def trace(frame: FrameType, event: str, _: Any) -> Any:
@@ -213,10 +212,10 @@ def raising_at(number: int, call: Callable[[], Any]) -> bool:
 
 
 def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path: Path) -> None:
-    # WHY: a calibration was refused, the answer said so, and its bias was published all the same.
+    # WHY: a calibration was refused, and its bias was applied all the same.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    # Another detector, so that everything is built anew.
+    # Another detector, so that everything is rebuilt.
     save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
     context = Context()
     rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)
@@ -250,7 +249,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path: Path) -> 
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # Each line of what is built, exchanged and set.
+        # Each executed line of the building, the exchange and the setting.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
             one.name: one.value for one in changes
@@ -267,7 +266,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path: Path) -> 
 
 
 def test_a_calibration_that_cannot_be_applied_changes_nothing(peer: Peer, tmp_path: Path) -> None:
-    # WHY: a lag of 1e-300 s was refused after the new bias had been taken into use.
+    # WHY: a lag of 1e-300 s was refused after the new bias was in use.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
     text = dump_calibration(of_bias(77.0))

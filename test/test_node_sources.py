@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What other publishers may send: two sources are never mixed, and a new driver is heard soon.
-"""
+"""Other publishers: two sources are never mixed, and a new driver is accepted soon."""
 
 from __future__ import annotations
 
@@ -43,24 +41,10 @@ from thermo_comp.ros.waitloop import Sources
 from thermo_comp.unit.calibration_file import save_calibration
 
 
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
-
-
-@pytest.fixture
-def unit(tmp_path: Path) -> Path:
-    path = tmp_path / 'unit.yaml'
-    save_calibration(calibration(), path)
-    return path
-
-
 def contested(
     peer: Peer, heard: list[DiagnosticArray], topic: str, send: Callable[[], None]
 ) -> DiagnosticStatus:
-    """Let both send, however slowly, until the node says that two do."""
+    """Let both publishers send until the node reports two, however slowly."""
     text = f'2 publishers on {topic}, the topic is not used until only one of them sends'
     found: list[DiagnosticStatus] = []
 
@@ -75,7 +59,7 @@ def contested(
 
 
 def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> None:
-    # WHY: a second driver's samples, another attitude, went out as if they were the unit's.
+    # WHY: samples of a second driver in another attitude were published as the unit's.
     with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
@@ -94,7 +78,7 @@ def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> N
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
         peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
-        # The first ones after it may still be of the other.
+        # The first samples afterwards may still be of the other driver.
         samples.send(20)
         before = len(samples.heard)
         peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
@@ -102,7 +86,8 @@ def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> N
         assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
 
 
-#: A driver as a process of its own: 100 Hz from its first subscriber on, its name in each sample.
+#: A driver as a separate process: 100 Hz from its first subscriber on, with its name in each
+#: sample.
 DRIVER = """
 import sys, time, rclpy
 from geometry_msgs.msg import Vector3Stamped
@@ -135,7 +120,7 @@ rclpy.spin(node)
 
 @contextlib.contextmanager
 def driver_process(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """Run a driver; give the time of its first sample [ns]. It is killed at the end."""
+    """Run a driver; return the time of its first sample [ns]. It is killed at the end."""
     command = [sys.executable, '-c', DRIVER, name]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -148,7 +133,7 @@ def driver_process(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
 
 
 def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer: Peer, unit: Path) -> None:
-    # WHY: for the 20 s of the dead one's lease nothing was published.
+    # WHY: nothing was published for the 20 s of the dead driver's lease.
     with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -159,7 +144,7 @@ def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer: Peer, u
         with driver_process('first'):
             peer.wait_for(lambda: len(of('first')) > 100, 'samples of the first driver')
         killed = time.monotonic()
-        # It is the clock that is waited for: the respawn comes a second later.
+        # Waits for the clock, as the driver is restarted a second later.
         peer.poll(lambda: time.monotonic() - killed > 1.0, 'a second')
         with driver_process('second') as (_, began_ns):
             peer.wait_for(lambda: of('second'), 'samples of the second driver')
@@ -179,7 +164,7 @@ def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer: Peer, u
 
 
 def numbered(begin: int, period_s: float, until_s: float, start_s: float = 0.0) -> Any:
-    """List a publisher's messages: when, its number."""
+    """List the messages of a publisher: time and number."""
     n = int((until_s - start_s) / period_s)
     return [(start_s + k * period_s, begin + k) for k in range(n)]
 
@@ -188,7 +173,7 @@ def numbered(begin: int, period_s: float, until_s: float, start_s: float = 0.0) 
 @pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
 def test_two_that_send_are_never_mixed(offset: int, period_s: float) -> None:
     own = [(*one, 'own') for one in numbered(500, 0.01, 12.0)]
-    begins = 500 + 200 + offset  # as many as the other has sent by then, or nearly
+    begins = 500 + 200 + offset  # about as many as the other driver has sent by then
     other = [(*one, 'other') for one in numbered(begins, period_s, 8.0, start_s=2.003)]
     sources, used = Sources(), []
     for at_s, number, name in sorted(own + other):
@@ -196,7 +181,7 @@ def test_two_that_send_are_never_mixed(offset: int, period_s: float) -> None:
         if not sources.of_one(n_known, [number], [round(at_s * 1e9)]):
             used.append((at_s, name))
     assert {name for _, name in used} == {'own'}
-    # The other one known, but not sending: this one alone, from a second after it was silent on.
+    # The other driver is known but silent: this one's samples count from a second of silence on.
     assert sum(at_s < 2.0 for at_s, _ in used) >= 199
     assert sum(at_s > 10.0 for at_s, _ in used) >= 199
 
@@ -248,7 +233,7 @@ def test_reports_more_often_than_samples_are_no_silence(peer: Peer, tmp_path: Pa
     from thermo_comp.unit.calibration import Unit
 
     slow = tmp_path / 'slow.yaml'
-    # Its samples may be 1.5 s late: more than a busy machine keeps the driver waiting.
+    # Samples may be 1.5 s late, which is more than a busy machine delays the driver.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)
     with node_in_thread(*node_arguments(slow, 'diagnostics_period:=0.01')) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
@@ -269,13 +254,13 @@ def test_reports_more_often_than_samples_are_no_silence(peer: Peer, tmp_path: Pa
 
 
 def test_a_reading_far_ahead_is_forgotten(peer: Peer, unit: Path) -> None:
-    # WHY: one reading a day ahead kept WARN until a sample of that day came.
+    # WHY: a reading one day ahead kept WARN until a sample of that day came.
     with node_in_thread(*node_arguments(unit)) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
         samples.go_on()
         samples.driver.temperatures(START_NS + 86_400 * SECOND_NS, 25.0)
-        samples.n_sent += 1  # without the readings of every tenth sample
+        samples.n_sent += 1  # without the readings at every tenth sample
         samples.send(5)
         status_with(peer, heard, 's ahead of the samples')
         samples.go_on()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node as a process: bad start-ups end at once with one clear line, good ones end cleanly."""
+"""The node as a process: bad starts end at once with one clear line, good ones end cleanly."""
 
 from __future__ import annotations
 
@@ -27,13 +27,6 @@ from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 def arguments(*overrides: str) -> list[str]:
     words = [word for override in overrides for word in ('-p', override)]
     return ['thermo_comp_node', '--ros-args', *words]
-
-
-@pytest.fixture
-def unit(tmp_path: Path) -> Path:
-    path = tmp_path / 'unit.yaml'
-    save_calibration(calibration(), path)
-    return path
 
 
 @pytest.mark.parametrize(
@@ -130,7 +123,8 @@ def test_an_environment_that_ros_cannot_use(
 
 
 def test_closed_streams_are_no_signal(unit: Path) -> None:
-    # WHY: the pipe of the signals took the number of stderr, and the log's first letter was one.
+    # WHY: the signals' pipe got the descriptor of stderr, and the first letter of the log was
+    # taken for a signal.
     peer = Peer()
     shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
     words = [*shell, '-m', 'thermo_comp.ros.node', *arguments(f'calibration_file:={unit}')[1:]]
@@ -152,14 +146,14 @@ def test_help_that_cannot_be_written(sink: str, code: int) -> None:
     assert 'Traceback' not in finished.stderr
 
 
-#: What the tools need and apt lacks, or the robot has no use for.
+#: Libraries of the tools that are not on a robot.
 ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
 
 
 def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
     unit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The interpreter of the node and those that it starts import this before anything else.
+    # The interpreters of the node and of its child processes import this first.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
         'class Absent:\n'
@@ -188,7 +182,7 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
             return bool(heard)
 
         peer.poll(is_heard, 'a sample')
-        # Another process reads the file.
+        # The file is read by another process.
         (result,) = peer.set_parameters(calibration_file=str(unit))
         assert result.successful, result.reason
         del heard[:]
@@ -233,7 +227,7 @@ def test_misspelt_parameters_are_said(unit: Path, capfd: pytest.CaptureFixture[s
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_during_start_up_ends_it_cleanly(unit: Path, number: int) -> None:
-    # Caught while the node is being built: as soon as the middleware has a thread.
+    # A signal during the construction of the node, once the middleware has a thread.
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         tasks = Path(f'/proc/{node.process.pid}/task')
         deadline = time.monotonic() + TIMEOUT

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Raw words whose zero is far away: the same calibration, the word of no force in its bias."""
+"""Raw words with an offset: the same calibration, with the offset in its bias."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def source(words, name='words') -> FitSource:
 
 
 def words_of(ups, rng, seconds=20.0):
-    """Read each attitude for some seconds, after a second of handling; whole numbers."""
+    """Read each attitude for some seconds after a second of handling; integers."""
     parts = []
     for up in ups:
         n = round(100 * seconds)
@@ -65,7 +65,7 @@ def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declar
     bias, scale = constants(found)
     np.testing.assert_allclose(bias - offset, constants(plain)[0], atol=0.02)
     np.testing.assert_allclose(scale, constants(plain)[1], rtol=1e-6)
-    # And these are the truth: means of 2000 samples of 12 counts, 14 of them.
+    # Compared with the truth: means of 2000 samples of 12 counts, 14 of them.
     np.testing.assert_allclose(bias - offset, BIAS, atol=1.0)
     np.testing.assert_allclose(scale, K, rtol=3e-4)
     np.testing.assert_allclose(found.calibration.misalignment, M, atol=3e-4)
@@ -75,7 +75,7 @@ def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declar
 
 
 def test_a_bag_for_each_position_needs_none_of_the_others(rng):
-    # All axes down, all up, some of both: only some words of 16 bits show that they have no sign.
+    # All axes down, all up, or mixed: only some 16-bit words show that they are unsigned.
     ups = positions(10, 3)
     ups[0] = -np.full(3, 3.0**-0.5)
     bags = [source(words_of([up], rng) + 32768.0, f'bag{k}') for k, up in enumerate(ups)]
@@ -89,7 +89,7 @@ def test_a_bag_for_each_position_needs_none_of_the_others(rng):
 def test_one_attitude_of_16_bits_has_the_right_scale(rng):
     found = fit([source(words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0)], OPTIONS)
     bias, scale = constants(found)
-    # The norm of one reading, and bias at its prior: 1 m/s^2, some 400 counts.
+    # Norm of one reading with the bias at its prior: 1 m/s^2, about 400 counts.
     np.testing.assert_allclose(scale, 4200.0 / GRAVITY, rtol=0.05)
     np.testing.assert_allclose(bias, 32768.0, atol=400.0)
     assert found.calibration.unit.full_scale == 65535.0
@@ -113,7 +113,7 @@ def test_a_centre_is_found_only_where_there_is_one(rng):
     ups = positions(12, 5)
     assert not rough_centre(4096.0 * ups + (800.0, -900.0, 700.0)).any()
     np.testing.assert_allclose(rough_centre(100.0 * ups + 338.0), 338.0, atol=1e-6)
-    # In a plane, or too few: what is across is not seen.
+    # In a plane, or too few positions: the direction across is not determined.
     flat = ups * (1.0, 1.0, 0.0)
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     assert not rough_centre(100.0 * flat + 338.0).any()

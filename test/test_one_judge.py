@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""One judge: commands that look at the same bags with the same calibration say the same."""
+"""Commands give the same verdict for the same bags and the same calibration."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.usefixtures('no_figures')
 @pytest.mark.parametrize('options', [(), ('--tolerance', '1ug', '--window', '120')])
 def test_evaluate_and_report_agree(cli, folder: Path, options: tuple[str, ...]) -> None:
-    # WHY: of one bag and one calibration one said "re-calibrate", the other "holds".
+    # WHY: for one bag and calibration one command said "re-calibrate", another "holds".
     page = folder / f'page{len(options)}.html'
     given = (folder / 'held_out.mcap', '-c', folder / 'unit.yaml', *options, '--json')
     one = cli('evaluate', *given, code=None)
@@ -42,7 +42,7 @@ def test_evaluate_and_report_agree(cli, folder: Path, options: tuple[str, ...]) 
         assert ours[name] == theirs[name], name
     assert one.returncode == other.returncode == (0 if ours['is_valid'] else 1)
     assert ours['window_s'] == float(options[3] if options else 60)
-    # The page shows these very figures, and no other length of a window.
+    # The page shows the same figures, with the same length of windows.
     text = page.read_text(encoding='utf-8')
     assert f'means over {ours["window_s"]:g} s' in text
     assert ours['verdict'].replace(' ug', ' µg') in text

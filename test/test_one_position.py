@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Too little for the whole: what a recording tells comes out, the rest stays at its prior."""
+"""
+Too little data for a whole fit: determined parameters are right, the rest stays at its prior.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ def one_position():
 
 
 def turned(rng, ups, rest_s=20.0):
-    """Hold a triad with bias (0.1, -0.2, 0.3) m/s^2 in some attitudes, moved in between."""
+    """Hold a triad with bias (0.1, -0.2, 0.3) m/s^2 in some attitudes, moved between them."""
     n = round(100 * rest_s)
     parts = []
     for up in ups:
@@ -55,7 +57,7 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
     for axis in calibration.static.axes():
         # Three powers, 1e-4 each where the column has unit RMS.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
-    # Scale 5 %, misalignment 1 mrad: what is known of any unit beforehand.
+    # Prior of any unit: scale 5 %, misalignment 1 mrad.
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-3, rtol=0.02)
     assert 'stays at its prior' in next(
         one.message for one in one_position.findings if one.name == 'positions'
@@ -81,18 +83,18 @@ def test_positions_without_temperature(rng):
     np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.001)
     assert calibration.response == ()
     assert 'temperature' in {finding.name for finding in result.findings}
-    # What temperature does stays at its prior: no slope, 5 mm/s^2 and 200 ppm per K as its sd.
+    # Temperature effects stay at their prior: no slope, sd 5 mm/s^2 and 200 ppm per K.
     assert not calibration.needs_temperature
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     layout = parameter_layout(calibration)
     for bias, scale in zip(layout.bias, layout.scale, strict=True):
         assert sd[bias.static + 1] == pytest.approx(5e-3, rel=0.02)
         assert sd[scale.static + 1] == pytest.approx(2e-4, rel=0.02)
-    # Without a thermometer the unit is taken to be within 10 K of the reference.
+    # Without a thermometer the unit is assumed to be within 10 K of the reference.
     out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
-    # Noise of a sample, 0.02, and what the tumble leaves.
+    # Noise of a sample, 0.02, plus the uncertainty of the tumble.
     np.testing.assert_allclose(
         np.sqrt(np.diagonal(out.covariance[0])), np.hypot(left, 0.02), rtol=0.05
     )
@@ -106,9 +108,9 @@ def test_six_faces_leave_the_misalignment_at_its_prior(rng):
 
 
 def test_short_rests_have_windows_enough_to_learn_the_noise_from(rng):
-    # WHY: a window per rest is met exactly by its attitude, and the noise learnt from it was 0.
+    # WHY: one window per rest is fitted exactly by its attitude, and the estimated noise was 0.
     calibration = fit([turned(rng, positions(12, 3), rest_s=5.0)], OPTIONS).calibration
-    # 0.02 m/s^2 a sample, 100 samples a second.
+    # 0.02 m/s^2 per sample at 100 Hz.
     np.testing.assert_allclose(calibration.noise_density_m_s2_sqrt_hz, 0.002, rtol=0.3)
 
 

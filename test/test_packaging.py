@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The package says one thing in every place where it says it: version, licence, commands, keys."""
+"""Version, licence, commands and keys of the package agree wherever they are stated."""
 
 from __future__ import annotations
 
@@ -115,7 +115,8 @@ def test_no_source_is_too_long_to_read() -> None:
 
 
 def test_the_manifest_asks_for_the_node_alone() -> None:
-    # What else a command needs comes from PyPI: test_node_startup.py runs the node without it.
+    # Other dependencies of the commands come from PyPI: test_node_startup.py runs the node without
+    # them.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     assert {key for key in keys if key and key.startswith('python3-')} == {
         'python3-numpy',
@@ -146,8 +147,8 @@ def test_scripts_land_where_ros2_run_looks() -> None:
 
 
 def test_share_holds_what_ros_looks_for(tmp_path: Path) -> None:
-    # The way colcon installs a package: setup.py's own install command into a prefix. It is the
-    # data files that are wanted here, so the scripts and the code stay out of it.
+    # colcon installs a package in this way: setup.py's install command into a prefix. Only the
+    # data files are tested here, not scripts and code.
     subprocess.run(
         [
             *(sys.executable, 'setup.py', '-q', 'build', '--build-base', tmp_path / 'build'),

@@ -84,7 +84,8 @@ def test_overrides_arrive_and_whole_numbers_are_numbers() -> None:
         ('transition_time:=.nan', 'parameter `transition_time` must be between 0 and 3600'),
         ('temperature_timeout:=0', 'parameter `temperature_timeout` must be between 0.1'),
         ('input:=both', "parameter `input` must be one of counts, imu, got 'both'"),
-        # A serial that looks like a number would lose its zeros; the user is told to quote it.
+        # A serial that looks like a number would lose its zeros; the message tells the user to
+        # quote it.
         ('serial:=0042', 'parameter `serial` must be a string, got .*quote it'),
     ],
 )
@@ -151,7 +152,7 @@ def test_pages_hold_the_generated_table(root: Path) -> None:
 
 def test_the_parameter_file_states_the_defaults(root: Path) -> None:
     text = (root / 'config' / 'thermo_comp.params.yaml').read_text(encoding='utf-8')
-    # The QoS section stands in comments: names that are remapped would be overrides of nothing.
+    # The QoS section is commented out, as overrides of topics that are remapped have no effect.
     before, overrides_text = text.split('    # These are the defaults:\n    #\n')
     stated = yaml.safe_load(before)['/**']['ros__parameters']
     expected = {entry.name: entry.default for entry in fields(NodeConfig)}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A part of a bag is read as a bag of that part would be, before every test."""
+"""A part of a bag gives the same as a bag of that part, in every test."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 
 
 def bag_of(path, rest: Rest):
-    """Write a rest of 25 Hz with a board's thermometer of 2 Hz, which begins 3 s earlier."""
+    """Write a rest at 25 Hz with a board thermometer at 2 Hz that begins 3 s earlier."""
     stamp_ns = START_NS + np.rint(rest.time * 1e9).astype(np.int64)
     board_ns = START_NS + np.rint((rest.board_time - 3.0) * 1e9).astype(np.int64)
     with BagWriter(path) as writer:
@@ -57,7 +57,7 @@ def test_what_is_inside_is_there_and_nothing_else(bag, begin, end, n_messages, m
     got = np.concatenate([b.temperatures['board'].celsius for b in blocks])
     np.testing.assert_array_equal(got, board.celsius[own])
     assert since == (begin or 0.0)
-    # A reading counts from the same sample on as in the whole bag.
+    # A reading applies from the same sample on as in the whole bag.
     after = [np.sum(inside[:n]) for n in board.after[own]]
     begins = np.cumsum([0, *map(len, blocks)])
     found = [b.temperatures['board'].after + n for b, n in zip(blocks, begins, strict=False)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What no thermometer can say is not believed, and what one can say is never doubted."""
+"""Impossible readings of a thermometer are rejected, possible ones never."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def tracker_of(sensor='continuous', memory=None, board_lag_s=900.0, **config):
 
 
 def soak(tracker, celsius=20.0, seconds=60, start_s=0):
-    """Feed both sensors once a second with a flicker, as live ones have it; return the end."""
+    """Feed both sensors once a second with the flicker of working sensors; return the end."""
     for second in range(start_s, start_s + seconds):
         flicker = 0.004 * (-1) ** second
         tracker.read('board', second * SECOND_NS, celsius + flicker)
@@ -48,7 +48,8 @@ def soak(tracker, celsius=20.0, seconds=60, start_s=0):
 def test_a_step_of_40_degrees_is_no_temperature():
     """
     WHY: a loose wire or a stuck bit reads 60 degC on a board that was at 20 degC a second ago.
-    WHAT: such readings are left out; the first good one after them counts at once.
+
+    WHAT: such readings are not used; the first good one after them is used at once.
     """
     tracker = tracker_of()
     now = soak(tracker)
@@ -66,7 +67,7 @@ def test_a_step_that_stays_is_a_new_beginning_after_the_time_out():
     now = soak(tracker, seconds=4000)
     assert tracker.is_settled(now * SECOND_NS)
     taken = [tracker.read('board', (now + k) * SECOND_NS, 60.0 + 0.01 * k) for k in range(30)]
-    # The last good reading came a second before: what is older than 20 s is 19 readings later.
+    # The last good reading was a second earlier: an age above 20 s is reached 19 readings later.
     assert taken == [False] * 20 + [True] * 10
     end_ns = (now + 29) * SECOND_NS
     assert tracker.sample(end_ns)[BOARD] == pytest.approx(60.2, abs=0.1)
@@ -75,8 +76,9 @@ def test_a_step_that_stays_is_a_new_beginning_after_the_time_out():
 
 def test_a_small_step_is_believed_with_doubt():
     """
-    WHY: two kelvin at once are no temperature of a board either, but a sensor that came back.
-    WHAT: the new level counts, and for about a lag the variance says that it may be wrong.
+    WHY: a step of two kelvin is not the board's temperature either, but a sensor that recovered.
+
+    WHAT: the new level is used, and for about a lag the variance includes the step.
     """
     tracker = tracker_of()
     now = soak(tracker)
@@ -92,8 +94,9 @@ def test_a_small_step_is_believed_with_doubt():
 
 def test_what_a_sensor_says_first_may_be_wrong():
     """
-    WHY: a DS18B20 says 85 degC before its first conversion.
-    WHAT: the true readings after it are not taken for an impossible step.
+    WHY: a DS18B20 reads 85 degC before its first conversion.
+
+    WHAT: the correct readings after it are not taken for an impossible step.
     """
     tracker = tracker_of()
     tracker.read('board', 0, 85.0)
@@ -131,14 +134,14 @@ def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # Until then the sensor was off by what the other told: some quanta and a kelvin; a case is
-    # told by a board that follows it, here 10 K behind.
+    # Until then the error is the change of the other sensor: some quanta and a kelvin; that of a
+    # case is seen by a board that follows it, here 10 K behind.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead
     state = tracker.sample(second * SECOND_NS)
     assert math.sqrt(state[VAR_BOARD if frozen == 'board' else VAR_GRADIENT]) > 0.5
-    # Nothing it says counts until it says something else.
+    # The sensor is not used until its reading changes.
     assert not tracker.read(frozen, (second + 1) * SECOND_NS, last[frozen])
     assert tracker.read(frozen, (second + 2) * SECOND_NS, last[frozen] + 0.07)
     assert guard.fault == Fault.NONE
@@ -146,15 +149,17 @@ def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
 
 def test_two_sensors_that_stand_still_count_with_growing_doubt():
     """
-    WHY: a driver that hangs may repeat both last readings; a bench supply may give constants.
-    WHAT: the samples go on, and the temperature's variance grows as a ramp might carry it away.
+    WHY: a hanging driver may repeat both last readings; a bench supply may give constants.
+
+    WHAT: samples are still published, and the variance of the temperature grows with a possible
+    ramp.
     """
     tracker = tracker_of()
     for second in range(600):
         assert tracker.read('board', second * SECOND_NS, 20.0)
         assert tracker.read('case', second * SECOND_NS, 20.0)
     assert tracker.checks['board'].fault == tracker.checks['case'].fault == Fault.STILL
-    # The fastest ramp it is made for, 3 K/min, for ten minutes.
+    # The fastest supported ramp, 3 K/min, for ten minutes.
     sd = math.sqrt(tracker.sample(600 * SECOND_NS)[VAR_BOARD])
     assert sd == pytest.approx(30.0, rel=1e-3)
     assert tracker.read('board', 600 * SECOND_NS, 20.004)
@@ -183,14 +188,14 @@ def test_a_standstill_within_the_quantum_is_no_fault():
 
 
 def test_readings_that_chance_may_repeat():
-    # Noise of half a quantum: the same reading again with 68 %, 54 times with 1e-9.
+    # Noise of half a quantum: the same reading follows with 68 %, 54 times in a row with 1e-9.
     assert still_readings(ThermometerSettings(0.005, 0.01)) == 54
     assert still_readings(ThermometerSettings(0.005, 0.0)) == STILL_READINGS
 
 
 @cache
 def in_its_chamber(preset, sensor):
-    """Simulate a unit; return (stamp, whether of the case, degC) of its thermometers."""
+    """Simulate a unit; return (stamp, whether of the case, degC) of its readings."""
     settings = SENSORS[sensor]
     unit = unit_preset(preset, 1).with_thermometers(
         noise_sd=settings.noise_sd_c, quantum=settings.quantum_c
@@ -217,7 +222,7 @@ def test_a_unit_in_its_chamber_is_never_doubted(preset, sensor):
         assert tracker.checks['case'].fault == Fault.NONE
 
 
-# The lead of a board that follows within seconds does not reach over a kelvin.
+# A board that follows within seconds leads by less than a kelvin.
 @pytest.mark.parametrize(
     ('preset', 'sensor'),
     [
@@ -237,9 +242,9 @@ def test_swapped_topics_are_doubted(preset, sensor):
 
 
 def test_a_unit_that_was_switched_on_heats_itself_and_is_not_swapped():
-    # WHY: every start in the field looks like a ramp from rest in which the board leads; called
-    # swapped, the claim was twenty times too wide for the whole run.
-    # WHAT: 4 K of warm-up in 20 min, a third of it in the case, and then a ramp that it leads.
+    # WHY: every start in the field looks like a ramp in which the board leads; taken for exchanged
+    # topics, the claimed sd was twenty times too large for the whole run. WHAT: a warm-up by 4 K
+    # in 20 min, a third of it in the case, and then a ramp in which the case leads.
     tracker = tracker_of(memory=LAG)
     for second in range(3 * 3600):
         warm = 4.0 * (1.0 - math.exp(-second / 500.0))
@@ -252,8 +257,9 @@ def test_a_unit_that_was_switched_on_heats_itself_and_is_not_swapped():
 
 def test_a_regime_that_nobody_watched_is_unknown():
     """
-    WHY: after ten minutes without readings a ramp may have begun or ended unseen.
-    WHAT: the regime is unknown again, and with it the covariance larger.
+    WHY: in ten minutes without readings a ramp may have begun or ended.
+
+    WHAT: the regime is unknown again, and the covariance larger.
     """
     tracker = tracker_of()
     now = soak(tracker, seconds=1500)

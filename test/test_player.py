@@ -8,7 +8,6 @@ import hashlib
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,15 +48,8 @@ UNLIMITED = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPo
 NAMES = ('accel/counts', 'temperature/board', 'temperature/case')
 
 
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
-
-
 def bag_of(path: Path, n: int, rng: np.random.Generator) -> Path:
-    """Write n samples and a temperature of each sensor for every tenth."""
+    """Write n samples, and a temperature of each sensor at every tenth."""
     stamps = START_NS + np.arange(n) * CYCLE_NS
     with BagWriter(path) as writer:
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (n, 3)), 'imu_link')
@@ -74,7 +66,7 @@ def messages_of(path: Path) -> list[bytes]:
 
 
 class Listener:
-    """Hears all of the player's topics, in order of arrival over all of them."""
+    """Receives all topics of the player, in order of arrival."""
 
     def __init__(self, peer: Peer, prefix: str = '', qos: QoSProfile = UNLIMITED) -> None:
         self.peer = peer
@@ -104,7 +96,7 @@ def test_every_message_arrives_byte_for_byte(
     listener = Listener(peer)
     progress: list[float] = []
     report = play(bag, rate=rate, progress=progress.append)
-    # It has ended, so every reliable subscriber has got everything.
+    # The player has ended, so every reliable subscriber has received everything.
     listener.wait_for(4800)
     assert listener.topics == by_topic(bag)
     assert report.n_messages == {
@@ -142,7 +134,8 @@ print(digest.hexdigest())
 def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    # More than its middleware holds, which is 5000, and sent faster than an rclpy callback takes.
+    # More messages than the middleware holds (5000), sent faster than an rclpy callback takes
+    # them.
     with BagWriter(tmp_path / 'bag.mcap') as writer:
         stamps = START_NS + np.arange(7000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (7000, 3)), 'imu_link')
@@ -178,7 +171,7 @@ def test_says_who_does_not_listen_and_who_may_lose(
     report = play(bag, rate=0.0, wait_s=0.5)
     assert report.unheard == ['/accel/counts', '/temperature/board']
     assert report.lossy == ['/temperature/case']
-    # What nobody hears is sent all the same.
+    # A topic without subscriber is published all the same.
     assert report.n_messages['/accel/counts'] == 20
 
 
@@ -243,7 +236,7 @@ def test_refusals(tmp_path: Path, rng: np.random.Generator) -> None:
 def test_a_subscriber_that_takes_nothing_is_not_waited_for_without_end(
     peer: Peer, tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # It takes as many as its middleware holds, 5000, and then refuses.
+    # The middleware accepts 5000 messages and then refuses.
     with BagWriter(tmp_path / 'bag') as writer:
         stamps = START_NS + np.arange(8000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (8000, 3)))
@@ -289,7 +282,7 @@ def test_recorder_keeps_every_message_under_its_stamp(peer: Peer, tmp_path: Path
     imus = [row for row in rows if row[0].endswith('imu/data_raw')]
     assert [log_ns for _, log_ns, _ in imus] == [7 * 10**9 + k for k in range(500)]
     assert [deserialize_message(data, Imu) for _, _, data in imus] == sent
-    # What has no Imu's stamp stands at the newest one before it.
+    # A message without stamp is placed at the newest Imu stamp before it.
     flagged, unstamped = (row for row in rows if row not in imus)
     assert flagged[1] == unstamped[1] == 7 * 10**9 + 499
     assert deserialize_message(unstamped[2], DiagnosticArray) == DiagnosticArray()

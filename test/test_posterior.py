@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The posterior: covariance to factor and back, what it may leave out, and where parameters stand.
-"""
+"""The posterior: covariance to factor and back, its approximation, and the order of parameters."""
 
 from dataclasses import replace
 
@@ -21,7 +19,7 @@ from thermo_comp.unit.posterior import Block, Posterior, posterior_of
 
 
 def random_covariance(seed, n, spread=1.0):
-    """Make correlations of any strength, between units that lie decades apart."""
+    """Make random correlations between parameters whose units differ by decades."""
     rng = np.random.default_rng(seed)
     factor = rng.normal(size=(n, n)) * np.geomspace(1.0, 1e-4, n) ** spread
     covariance = factor @ factor.T
@@ -36,7 +34,7 @@ def test_variances_stay_and_correlations_miss_by_the_tolerance(seed, n, toleranc
     found = posterior_of(covariance, tolerance)
     sd = np.sqrt(np.diag(covariance))
     error = (found.covariance() - covariance) / sd / sd[:, np.newaxis]
-    # Single precision of the factor.
+    # The factor has single precision.
     np.testing.assert_allclose(np.diag(error), 0.0, atol=1e-6)
     np.testing.assert_allclose(error, 0.0, atol=tolerance + 2e-6)
     assert (found.variances <= (tolerance + 1e-6) * sd**2).all()
@@ -96,7 +94,7 @@ def test_layout_by_hand():
     value = calibration(
         static=regime_set(axis_set((0.0, 1.0, 2.0)), axis_set(), axis_set(scale=(1.0, 1e-4))),
         dynamic=regime_set(x=replace(axis_set(), bias_function=spline)),
-        response=(term('now'), term('board', tau_s=60.0)),
+        response=(term('gradient'), term('board', tau_s=60.0)),
     )
     layout = parameter_layout(value)
     # x: level t t^2 | level three knots | two weights.

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Holds what a calibration says of soaks, ramps and steps: by hand, and as the compensator has it.
-"""
+"""Predictions for soaks and ramps: against hand calculations and the compensator."""
 
 from __future__ import annotations
 
@@ -17,11 +15,13 @@ from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Layout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.posterior import posterior_of
-from thermo_comp.unit.prediction import ramp_states, sd_of_states, step_states
+from thermo_comp.unit.prediction import ramp_states, sd_of_states
 
 
 def slope_and_lag(variances: dict[int, float]):
-    """Give a unit a slope and a lag of 600 s, and variances to some parameters of its x axis."""
+    """
+    Make a unit with a slope and a lag of 600 s, and variances of some parameters of its x axis.
+    """
     one = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
@@ -34,17 +34,17 @@ def slope_and_lag(variances: dict[int, float]):
 
 
 def test_sd_by_hand():
-    # x: level and slope of the static bias, level and slope of the dynamic one, the lag's weight;
-    # then the scale's static and dynamic level.
+    # x: level and slope of the static bias, level and slope of the dynamic bias, weight of the
+    # lag; then static and dynamic level of the scale.
     one = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
     states = ramp_states(one, np.array([20.0, 30.0]), 0.0, np.inf)
     bias, scale = sd_of_states(one, states)
-    # sqrt(4e-4 + 100 * 1e-6) counts, 300 of them per m/s^2, and 30 um/s^2 that nothing explains.
+    # sqrt(4e-4 + 100 * 1e-6) counts, 300 of them per m/s^2, and 30 um/s^2 of unexplained residual.
     own = np.sqrt([4e-4, 5e-4]) / 300.0
     assert bias[:, 0] == pytest.approx(np.hypot(own, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
     assert scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
-    # 0.6 K/min for ever: 600 s behind are 6 K.
+    # An endless ramp of 0.6 K/min: 600 s behind are 6 K.
     bias, scale = sd_of_states(one, ramp_states(one, np.array([25.0]), 0.01, np.inf))
     assert bias[0, 0] == pytest.approx(np.sqrt(9e-4 + 36e-6) / 300.0, rel=1e-6)
     assert scale[0, 0] == pytest.approx(2e-6, rel=1e-6)
@@ -59,7 +59,7 @@ def test_what_is_known_has_no_sd():
 
 @pytest.mark.parametrize('rate', [0.01, -0.02])
 def test_ramp_is_what_the_memory_makes_of_one(rate):
-    # The second route: the memory of the fit goes through a ramp out of a soak, second by second.
+    # Second route: the memory of the fit goes through a ramp after a soak, second by second.
     one = replace(rich_calibration(), board_lag_s=100.0)
     spec = Correction(one).memory
     gradient = np.append(0.0, np.full(900, 100.0 * rate))
@@ -69,21 +69,11 @@ def test_ramp_is_what_the_memory_makes_of_one(rate):
     layout = Layout(spec)
     assert state[[BOARD, RATE, WEIGHT]].tolist() == [25.0, rate, 1.0]
     assert state[list(layout.gradients.values())] == pytest.approx(100.0 * rate)
-    # A reading of the gradient is not there at once but within a second of the 900.
+    # The gradient is reached within a second of the 900, not at once.
     for lag, place in layout.lags.items():
         assert state[place] == pytest.approx(lived[place - layout.first_lag], rel=2e-3), lag
     for (tau, width), place in layout.plays.items():
-        # Half an hour would push the play on the lag to its end too.
+        # Half an hour would also push the play on the lag to its end.
         if not tau:
             assert state[place] == pytest.approx(-width * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - layout.first_lag])
-
-
-def test_step_is_forgotten_with_each_lags_own_time():
-    one = rich_calibration()
-    layout = Layout(Correction(one).memory)
-    states = step_states(one, 21.0, np.array([0.0, 600.0, np.inf]))
-    assert states[:, BOARD].tolist() == [21.0] * 3
-    assert states[:, layout.lags['board', 600.0]] == pytest.approx([1.0, np.exp(-1.0), 0.0])
-    assert states[:, layout.lags['board', 2400.0]] == pytest.approx([1.0, np.exp(-0.25), 0.0])
-    assert not states[:, layout.lags['case', 240.0]].any()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Holds what an earlier calibration and siblings are worth to a fit that has little else."""
+"""The benefit of an earlier calibration and of siblings for a fit with little data."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builders import ArrayBlock
+from triads import sibling, triad
 
 from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError
@@ -19,15 +20,14 @@ from thermo_comp.fitting.priors import population
 from thermo_comp.fitting.selection import Selected, fit_all
 from thermo_comp.fitting.unknowns import InformativePrior, Prior
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import SimulatedRun, arrays
 from thermo_comp.unit.calibration import Calibration, parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
-KIND = unit_preset('products', 1)
-#: The groups that this kind has: the bank is a third of the whole, and a fit takes half as long.
+KIND = triad('products', 1)
+#: The groups of this kind of unit: a third of all columns, and half of the time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
@@ -35,7 +35,7 @@ def source(record: SimulatedRun) -> FitSource:
     block = ArrayBlock(
         record.accel_stamp_ns + 10**18,
         record.counts.astype(np.float64),
-        # Every eighth reading of a second: a ramp of 1 K/min is as well seen, eight times sooner.
+        # A reading every eight seconds: a ramp of 1 K/min is still detected, eight times faster.
         record.board_stamp_ns[::8] + 10**18,
         record.board[::8],
         record.case_stamp_ns[::8] + 10**18,
@@ -49,7 +49,7 @@ def test_of(number: int, first: int, last: int) -> tuple[SimulatedRun, ...]:
     """Record some of twelve positions of one sibling."""
     ups = positions(12, number)[first:last]
     stations = [Position(PROGRAM, up) for up in ups]
-    return tuple(arrays(KIND.sibling(number, 0.15), stations, 100 * number + first))
+    return tuple(arrays(sibling(KIND, number, 0.15), stations, 100 * number + first))
 
 
 test_of.__test__ = False
@@ -57,7 +57,7 @@ test_of.__test__ = False
 
 @cache
 def fitted(number: int) -> FitResult:
-    """Fit a sibling on nine of its twelve positions, which tell all that there is to tell."""
+    """Fit a sibling on nine of its twelve positions, which determine everything."""
     options = replace(OPTIONS, serial=f'unit-{number}')
     return fit([source(record) for record in test_of(number, 0, 9)], options)
 
@@ -88,7 +88,7 @@ def test_population_is_the_mean_unit_and_its_scatter():
     variance = np.diag(found.posterior.covariance())
     at = parameter_layout(found).bias[0].static + 1
     sd = np.sqrt(variance[at]) / found.axes.x.scale_factor
-    # The scatter of three units, and that of their mean; and what is not known of any.
+    # Scatter of three units and of their mean, and parameters that are not determined in any.
     own = []
     for one in siblings():
         assert one.posterior is not None
@@ -100,9 +100,9 @@ def test_population_is_the_mean_unit_and_its_scatter():
 
 
 def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch: pytest.MonkeyPatch):
-    # WHY: begun with a narrow prior of three units, the mounting offset took 190 ug of what they
-    # differ in, and the fit never came back: 271 ug held out, where this one leaves 0.9.
-    # WHAT: none of all that may be known beforehand is anywhere wider than what begins.
+    # WHY: a fit started with the narrow prior of three units attributed 190 ug of their
+    # differences to the mounting offset and stayed there: 271 ug held out instead of 0.9. WHAT: no
+    # prior is wider anywhere than the one of the start.
     seen: list[InformativePrior] = []
 
     def fitted_with(*given: Any) -> Selected:
@@ -124,13 +124,13 @@ def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch: pytest.M
 
 
 def test_siblings_make_one_position_worth_more():
-    # WHY: a unit with one position in the chamber shows nothing of its scale over temperature.
-    # WHAT: with its siblings' prior it is better than alone, on positions it has not seen.
+    # WHY: one position in the chamber does not determine the scale over temperature. WHAT: with
+    # the prior of siblings the fit is better than alone, in positions that were left out.
     few = [source(record) for record in test_of(9, 0, 1)]
     options = replace(OPTIONS, serial='unit-9')
     alone = fit(few, options).calibration
     helped = fit(few, replace(options, prior=population(siblings()))).calibration
-    truth = KIND.sibling(9, 0.15)
+    truth = sibling(KIND, 9, 0.15)
     errors = []
     for one in (alone, helped):
         relative = [axis.scale_factor for axis in (one.axes.x, one.axes.y, one.axes.z)]
@@ -149,8 +149,8 @@ def test_new_rests_make_an_old_calibration_better():
     later = [source(record) for record in test_of(9, 9, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5)
     new = fit(later, options).calibration
-    # Three positions measure three combinations of the six levels that have aged by 10 ug (bias)
-    # and 20 ug (scale): on average half of the variance that the ageing brought must be gone.
+    # Three positions measure three combinations of the six levels, which aged by 10 ug (bias) and
+    # 20 ug (scale): on average half of the variance due to ageing must be removed.
     grown = np.mean(sd_of_levels(old) ** 2 + options.ageing_bias**2)
     assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
     bias = [
@@ -162,9 +162,9 @@ def test_new_rests_make_an_old_calibration_better():
 
 
 def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
-    # WHY: who updates in the field has an hour at the temperature of the day, and no data sheet.
-    # WHAT: biases that moved by 200 ug are found although nobody said that they might have; the
-    # calibration holds where the old one did, and leaves there what that left before.
+    # WHY: an update in the field has an hour at the temperature of the day, and no data sheet.
+    # WHAT: biases that changed by 200 ug are estimated although no change was stated; the
+    # calibration is valid where the old one was, with the same residual.
     moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
     old = fitted(9).calibration
 
@@ -173,7 +173,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
         return replace(record, counts=record.counts + by.astype(record.counts.dtype))
 
     rests = [Position(day, up) for up in positions(6, 77)]
-    later = [source(aged(record)) for record in arrays(KIND.sibling(9, 0.15), rests, 999)]
+    later = [source(aged(record)) for record in arrays(sibling(KIND, 9, 0.15), rests, 999)]
     new = fit(later, replace(OPTIONS, serial='unit-9', prior=old)).calibration
     for now, before in zip(new.regime_sets(), old.regime_sets(), strict=True):
         assert now.temperature_range_c == before.temperature_range_c
@@ -186,8 +186,8 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
         for calibration, changed in ((old, lambda record: record), (old, aged), (new, aged))
     ]
     assert left[1] > 10.0 * left[0]
-    # Parts that lag by an hour began at a temperature that nobody saw, which ten minutes cannot
-    # tell from a bias: the claim has both, a few ug, and the error stays within it.
+    # Parts with a lag of an hour started at an unknown temperature, which ten minutes do not
+    # separate from a bias: the claimed sd includes a few ug for it, and the error is within it.
     sd = float(sd_of_levels(new).max())
     assert sd < 10e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
@@ -195,7 +195,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
 
 
 def left_by(calibration: Calibration, record: SimulatedRun) -> float:
-    """RMS of |f| - g in means of a minute."""
+    """Return RMS of |f| - g in means of a minute."""
     origin = record.accel_stamp_ns[0]
     board, case = (
         ((stamp[::8] - origin) * 1e-9, value[::8])
@@ -229,7 +229,7 @@ def test_prior_without_claim_is_refused():
 
 
 def test_another_units_calibration_is_no_prior():
-    # WHY: a sibling's nine constants are sure of themselves, and were taken for this unit's.
+    # WHY: the nine constants of a sibling have small sd, and were taken for this unit's.
     all_twelve = [source(record) for record in test_of(9, 0, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=fitted(1).calibration)
     with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit-9'):
@@ -238,12 +238,12 @@ def test_another_units_calibration_is_no_prior():
     said = [one.message for one in allowed.findings if one.name == 'prior']
     assert any('allowed: ' in one for one in said)
     assert any('bags contradict the prior' in one for one in said)
-    # What is blind to the regime cannot be told in the two curves of a prior.
+    # A model without regimes does not determine the two curves of a prior.
     assert not allowed.residuals[-1].one_set.n
 
 
 def test_prior_of_the_other_input_is_refused():
-    # WHY: its scale factors of counts were once taken for those of m/s^2.
+    # WHY: its scale factors in counts were once taken for those in m/s^2.
     with pytest.raises(ValueError, match=r'`prior` is in counts, the samples are in m/s\^2'):
         replace(OPTIONS, prior=fitted(1).calibration, input='m/s^2')
 

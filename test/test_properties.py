@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Properties: whatever comes, what goes out is finite, sound, in order and within what is possible.
+Properties: for any input the output is finite, valid, in order and within physical limits.
 
-The suite tries each a few times; `make nightly` ten thousand times.
+The suite tries each property a few times; `make nightly` ten thousand times.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ TREE = yaml.safe_load(dump_calibration(rich_calibration()))
 
 
 def leaves(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Name every place of a calibration file, the inner ones too."""
+    """List every place of a calibration file, including nested ones."""
     items = tree.items() if isinstance(tree, dict) else enumerate(tree)
     for key, value in items:
         yield (*path, key)
@@ -83,7 +83,7 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place: Any, value: Any
     if refusal is not None:
         text = str(refusal)
         assert '\n' not in text
-        # What is YAML of the accepted kind is refused for a key; the others for a line.
+        # An error of valid YAML names a key, any other a line.
         assert refusal.key or 'not valid YAML' in text or 'nested deeper' in text, text
         if refusal.key:
             assert refusal.key.split('.')[0].split('[')[0] in TREE, text
@@ -91,7 +91,7 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place: Any, value: Any
 
 EXAMPLE = Path(__file__).parents[1] / 'config' / 'calibration.example.yaml'
 TREES = (TREE, yaml.safe_load(dump_calibration(unit())), yaml.safe_load(EXAMPLE.read_text()))
-#: Every number and text of them, and every list of numbers.
+#: Every number, text and list of numbers of the file.
 EDITS = [(k, place) for k, tree in enumerate(TREES) for place in leaves(tree)]
 magnitudes = st.builds(
     lambda sign, digits, power: sign * digits * 10.0**power,
@@ -99,7 +99,7 @@ magnitudes = st.builds(
     st.floats(1.0, 9.99),
     st.integers(-308, 307),
 )
-#: The bounds themselves, and what is next to them.
+#: The bounds themselves, and the next values to them.
 edges = st.sampled_from(
     [
         near
@@ -113,7 +113,7 @@ factors = st.integers(-60, 60).map(lambda power: 2.0**power)
 
 
 class Edited(dict[str, Any]):
-    """A calibration file with some values changed, of which only these are shown."""
+    """A calibration file with some changed values; only these are shown."""
 
     edits: tuple[Any, ...] = ()
 
@@ -123,7 +123,7 @@ class Edited(dict[str, Any]):
 
 @st.composite
 def edited(draw: st.DrawFn) -> Edited:
-    """Change one to three values of a calibration file, by any magnitude."""
+    """Change one to three values of a calibration file by any magnitude."""
     which = draw(st.sampled_from(range(len(TREES))))
     tree = Edited(json.loads(json.dumps(TREES[which])))
     own = [place for k, place in EDITS if k == which]
@@ -135,7 +135,7 @@ def edited(draw: st.DrawFn) -> Edited:
                 branch = branch[key]
             value = branch[last]
         except (KeyError, IndexError, TypeError):
-            continue  # the edit before has taken its place away
+            continue  # an earlier change has removed its place
         if isinstance(value, str) and last in ('factor', 'rest'):
             shape = np.frombuffer(base64.b64decode(value), '<f4')
             factor = draw(factors)
@@ -157,7 +157,7 @@ def edited(draw: st.DrawFn) -> Edited:
 
 
 def whole_range(of: Calibration) -> list[tuple[str, int, Any]]:
-    """List messages that lead through and beyond all temperatures of a calibration."""
+    """List messages that pass through and beyond all temperatures of a calibration."""
     edges_c = [edge for one in of.regime_sets() for edge in one.temperature_range_c]
     middle = of.reference_temperature_c
     temperatures = [middle, middle + 0.5, *edges_c, middle, -273.0, 999.0, middle, middle]
@@ -167,7 +167,7 @@ def whole_range(of: Calibration) -> list[tuple[str, int, Any]]:
     now_ns = START_NS
     for k, (celsius, step_s) in enumerate(zip(temperatures, steps_s, strict=True)):
         for m in range(6):
-            # Six readings on the way, so that none is taken for a jump.
+            # Six readings between, so that none is taken for a jump.
             now_ns += round(step_s / 6.0 * 1e9)
             sent.append(('board', now_ns, celsius))
             sent += [(name, now_ns, celsius + 0.1 * m) for name in of.sensors]
@@ -182,8 +182,8 @@ def whole_range(of: Calibration) -> list[tuple[str, int, Any]]:
 @settings(deadline=None, max_examples=max(120, settings.default.max_examples))
 @given(edited())
 def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree: Edited) -> None:
-    # WHY: a delta of 1e300, a lag of 1e-300 s, a weight of 1e160 were accepted; what came of them
-    # was not finite, or no covariance.
+    # WHY: a delta of 1e300, a lag of 1e-300 s and a weight of 1e160 were accepted; the output was
+    # not finite, or its covariance invalid.
     content = yaml.dump(dict(tree), Dumper=yaml.CSafeDumper, allow_unicode=True).encode()
     try:
         of = parse_calibration(content, 'unit.yaml')
@@ -208,7 +208,7 @@ def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tre
             assert min(rate[3:]) > 0.0
     counters = compensator.counters
     assert counters.n_unsound == 0
-    # Faster than conversions can be is the only reason that is left, and stale temperatures.
+    # The only remaining reasons: samples faster than the converter, and stale temperatures.
     assert n_sound or counters.n_too_fast or counters.n_stale or counters.n_no_temperature
     status = compensator.status()
     assert all(map(math.isfinite, status.state))
@@ -240,9 +240,11 @@ configs = st.builds(
 
 
 def largest(axis: int, regime: RegimeSet, of: Calibration) -> tuple[float, float]:
-    """Bound an axis' |bias| without the reference's, and the distance of its scale from 1."""
+    """
+    Bound an axis' |bias| without that of the reference, and the distance of its scale from 1.
+    """
     edges = (*of.static.temperature_range_c, *of.dynamic.temperature_range_c)
-    # Curves go on along their tangents for a quarter of the span, or of the other set's.
+    # Curves continue along their tangents for a quarter of the span, or of the other set's.
     t = max(abs(edge - of.reference_temperature_c) for edge in edges)
     t += 0.25 * (max(edges) - min(edges))
     curves = regime.axes()[axis]
@@ -259,7 +261,7 @@ def largest(axis: int, regime: RegimeSet, of: Calibration) -> tuple[float, float
 
 
 def bound(of: Calibration) -> float:
-    """Bound the specific force that a unit can give, from its calibration alone [m/s^2]."""
+    """Bound the specific force that a unit can output, from its calibration [m/s^2]."""
     worst = 0.0
     for regime in (of.static, of.dynamic):
         for axis, reference in enumerate((of.axes.x, of.axes.y, of.axes.z)):
@@ -279,7 +281,7 @@ def test_any_messages_give_sound_numbers(
     limit = bound(of) * (1.0 + 1e-9)
     now_ns, last_ns, n_jumps, n_counts = START_NS, -math.inf, 0, 0
     for topic, step, value in sent:
-        # Stamps are those that a message can carry.
+        # Stamps that a message can contain.
         now_ns = min(max(now_ns + step, -(2**31) * 10**9), 2**31 * 10**9 - 1)
         if topic != 'counts':
             compensator.push(topic, now_ns, value)
@@ -328,5 +330,5 @@ def test_any_calibration_survives_its_file(
         )
         text = dump_calibration(value)
     except (ValueError, CalibrationError):
-        return  # one that the reader would refuse is not written
+        return  # a file that the reader would refuse is not written
     assert parse_calibration(text.encode()) == value

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""README, and the session on the page of the command line: their outputs and links are true."""
+"""The README and the session on the page of the command line: outputs and links are right."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 
 def test_the_shown_commands_give_the_shown_output(tmp_path: Path, cli: Cli, once: Once) -> None:
-    # The demo has a test of its own, test_cli_demo.
+    # The demo is tested in test_cli_demo.
     commands = shown()
     assert list(commands) == ['demo', 'fit', 'evaluate', 'replay', 'info']
     made = once('unit42.yaml', lambda folder: write_fit_of_the_readme(folder / 'unit42.yaml', cli))

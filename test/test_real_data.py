@@ -1,27 +1,23 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Recordings that other people made, through `fit`: what docs/real_data.md claims.
+Recordings by other people through `fit`, with the figures of docs/real_data.md.
 
-Skipped with a reason where the recordings are absent.
+Skipped with a reason if the recordings are absent.
 """
 
 from __future__ import annotations
 
 import re
 import subprocess
-import sys
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import ROOT
-from scipy.optimize import least_squares
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
 from recorded.data import GRAVITY, faces_bag, freezer_bag, handheld_bag
+from scipy.optimize import least_squares
 
 from thermo_comp.errors import FitError, RecordingError
 from thermo_comp.fitting import FitOptions, fit
@@ -40,7 +36,7 @@ def work(tmp_path_factory):
 
 @pytest.fixture(scope='module', params=[0, 1, 2])
 def unit(request, real_data, work):
-    """Fit a unit that was turned by hand, without any thermometer."""
+    """Fit a unit that was turned by hand, without a thermometer."""
     sources, _ = fit_sources([handheld_bag(real_data, work, request.param)])
     return fit(sources, OPTIONS)
 
@@ -58,7 +54,7 @@ def test_handheld_units_leave_what_their_noise_is(unit):
 
 
 def test_handheld_units_agree_with_a_direct_solution(unit):
-    # The nine-parameter cost |M (N - b) / K| - g over the positions' means, by scipy.
+    # Nine-parameter fit of |M (N - b) / K| - g to the means of the positions, by scipy.
     means = means_of(unit)
 
     def residual(parameters):
@@ -70,7 +66,7 @@ def test_handheld_units_agree_with_a_direct_solution(unit):
     direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
     calibration = unit.calibration
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
-    # Other weights of the same positions: a fraction of the sd of 1 mg, and of 1e-3.
+    # The weights of positions differ slightly: a fraction of the sd of 1 mg, and of 1e-3.
     np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
     M = np.array(calibration.misalignment)
@@ -84,7 +80,7 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     assert len(result.positions) == 6
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-3, rtol=0.01)
-    # By hand: half the sum and half the difference of opposite faces, each taken for level.
+    # By hand: half the sum and half the difference of opposite faces, assumed level.
     means = means_of(result)
     high, low = means.max(axis=0), means.min(axis=0)
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
@@ -95,14 +91,14 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
 
 
 def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
-    # Read off the plain plot of |a|: +20 mg at 366 s and +17 mg at 468 s; a third across gravity.
+    # Read from a plot of |a|: +20 mg at 366 s and +17 mg at 468 s; a third one across gravity.
     sources, _ = fit_sources([freezer_bag(real_data, work)])
     with pytest.raises(FitError, match='not a function of temperature') as refused:
         fit(sources, OPTIONS)
     jumps = re.findall(
         r'at ([\d.]+) s the sensor jumped by \+([\d.]+) mg along gravity', str(refused.value)
     )
-    # Times from the first sample, 1.5 s after the log's zero.
+    # Times from the first sample, 1.5 s after the zero of the log.
     assert [float(at) for at, _ in jumps] == pytest.approx([365.4, 465.4, 511.6], abs=0.2)
     assert [float(size) for _, size in jumps] == pytest.approx([20.0, 17.0, 2.0], abs=4.0)
 
@@ -111,7 +107,7 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
     topics = Topics(part=Part(47.5, 358.5))
     result = fit(fit_sources([freezer_bag(real_data, work)], topics)[0], OPTIONS)
     z = result.calibration.static.z
-    # The plain slope of |a| is 1.61 mg/K from 36 to 15 degC.
+    # The slope of |a| in the plot is 1.61 mg/K from 36 to 15 degC.
     slope = np.diff(z.bias_function.value(np.array([-4.0, 14.0])))[0] / 18.0 / MG
     assert slope == pytest.approx(1.61, abs=0.2)
     assert result.residuals[-1].fitted.rms / MG < 0.75
@@ -119,7 +115,7 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
 
 @pytest.mark.parametrize(('length', 'n_sets', 'mg'), [(71.0, 2, 0.3), (284.0, 5, 0.8)])
 def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(real_data, work, length, n_sets, mg):
-    # After the last jump, 1420 s in parts: each set of parts is corrected by a fit of the others.
+    # 1420 s after the last jump in parts: each set of parts is corrected by a fit of the others.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [Part(start, start + length) for start in starts]
@@ -131,14 +127,14 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(real_data, work, l
         ]
         calibration = fit(seen, OPTIONS).calibration
         for part in held_out:
-            # In some parts somebody knocked at the freezer: no minute of them is at rest.
+            # In some parts the freezer was knocked, so that no minute of them is at rest.
             with suppress(RecordingError):
                 judged = evaluate([bag], [('unit', calibration)], topics=Topics(part=part))
                 windows = judged.judgements['unit'].windows
                 raw += np.linalg.norm(windows.mean, axis=1).tolist()
                 left += windows.residual.tolist()
     assert len(raw) >= 17
-    # The drift: about its mean, as the constants of a single attitude are not known.
+    # The drift about its mean, as a single attitude does not determine the constants.
     assert np.std(raw) / MG == pytest.approx(2.1, abs=0.2)
     # White noise of 1.5 mg per root hertz leaves 0.19 mg in a minute; longer parts are
     # interpolated over a wider range, and the first of five parts is extrapolated.
@@ -147,8 +143,8 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(real_data, work, l
 
 def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
     bag = freezer_bag(real_data, work)
-    # After the last jump, from the first sample on, 1.5 s after the log's zero; near 860 and
-    # 1134 s somebody knocked.
+    # After the last jump; times from the first sample, 1.5 s after the zero of the log. The
+    # freezer was knocked near 860 and 1134 s.
     parts = [Part(518.5, 638.5), Part(860.5, 1130.5), Part(1134.5, 1938.5)]
     seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts]
     calibration = fit(seen, OPTIONS).calibration
@@ -160,13 +156,13 @@ def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
     assert section.raw_rms > 1.7 * floor
     assert section.rms < 1.3 * floor
     assert 0.3 < section.ratio < 2.0
-    # The datasheet of an MPU6050 has 5 mdeg/s per root hertz; 12.7 samples a second that nothing
-    # has filtered before hold what lies above 6 Hz, too.
+    # The datasheet of the MPU6050 states 5 mdeg/s/sqrt(Hz); 12.7 samples a second without a filter
+    # also contain the noise above 6 Hz.
     assert 30.0 < np.degrees(density) * 1e3 < 45.0
 
 
 def test_no_recording_is_in_the_project():
-    # Only plots and numbers: no file of the project holds a row of the freezer run.
+    # Only plots and numbers: no file of the project contains rows of the freezer run.
     tracked = subprocess.run(
         ['git', 'ls-files'], cwd=ROOT, capture_output=True, text=True, check=False, timeout=60
     ).stdout.split()

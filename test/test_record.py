@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A test recorded position by position: from a growing bag, and on real DDS with a driver."""
+"""A test recorded position by position: from a growing bag, and with a driver on real DDS."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import ROOT, Cli
+from triads import triad
 
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.growing import growing_blocks, leftovers, numbered_bags
@@ -23,18 +24,17 @@ from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
-from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import simulate_blocks
 from thermo_comp.unit.calibration_file import load_calibration
 
 N_POSITIONS, SOAK_S, TURN_S, RATE = 9, 100.0, 20.0, 10.0
-UNIT = unit_preset('plain', 1)
+UNIT = triad('plain', 1)
 UPS = positions(N_POSITIONS, 2)
 START_NS = 1_767_225_600_000_000_000
 
 
 def write_session(path: Path, ups: np.ndarray = UPS, chunk_bytes: int = 1 << 14) -> Path:
-    """Write one bag of a unit that rests in each position in turn, with hands on it between."""
+    """Write a bag of a unit that rests in each position in turn, and is handled between."""
     rng = np.random.default_rng(5)
     program = parse_cyclogram(f'20 {SOAK_S:g}s')
     start_ns = START_NS
@@ -72,7 +72,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def contents(paths: list[Path]) -> dict[str, list[bytes]]:
-    """Give the serialized messages of bags, one after the other, by topic."""
+    """Return the serialized messages of bags by topic, one bag after the other."""
     found: dict[str, list[bytes]] = {}
     for path in paths:
         with open_recording(path, require=()) as reader:
@@ -82,20 +82,20 @@ def contents(paths: list[Path]) -> dict[str, list[bytes]]:
 
 
 def check_positions(result: dict[str, Any]) -> None:
-    """Compare what was found with the truth."""
+    """Compare the result with the truth."""
     assert result['is_complete']
     for found, up in zip(result['positions'], UPS, strict=True):
-        # The unit's bias turns what is read by less than a degree.
+        # The unit's bias changes the measured direction by less than a degree.
         assert np.array(found['up']) @ up > np.cos(np.radians(1.0))
         assert found['reason'] == ''
         assert set(found['thermometers']) == {'board', 'case', 'lid'}
-        # Less the cells beside a motion, of three seconds at this rate.
+        # Without the cells next to a motion, of three seconds at this rate.
         assert found['still_s'] == pytest.approx(SOAK_S, abs=20.0)
 
 
 def check_fit(result: dict[str, Any], cli: Cli, folder: Path) -> None:
-    """Run the command that was printed, and compare the calibration with the truth."""
-    # The constants are what is looked at; the thermal response takes ten times as long.
+    """Run the printed command, and compare the calibration with the truth."""
+    # Only the constants are tested; the thermal response takes ten times as long.
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))
     assert words.pop(0) == 'thermo_comp'
@@ -107,7 +107,7 @@ def check_fit(result: dict[str, Any], cli: Cli, folder: Path) -> None:
     scale = np.array([one.scale_factor for one in axes])
     bias = np.array([one.bias for one in axes]) / scale
     sd = np.array([one['sd_g'] for one in result['positions']]).max() * 9.80665
-    # The claim before the fit is for the noise of the positions; its constants are at 20 degC.
+    # The claim before the fit includes the noise of the positions only; constants are at 20 degC.
     assert scale / UNIT.scale_factor == pytest.approx(1.0, abs=5.0 * max(result['scale_sd']))
     true_bias = np.array(UNIT.bias_at_reference) / UNIT.scale_factor
     assert bias == pytest.approx(true_bias, abs=5.0 * max(9.80665 * max(result['bias_sd_g']), sd))
@@ -175,7 +175,7 @@ class TestGrowing:
         bags = numbered_bags(tmp_path / 'bags')
         assert [str(one) for one in bags] == result['bags']
         assert [one.name for one in bags] == [f'{k:02d}.mcap' for k in range(1, N_POSITIONS + 1)]
-        # Nothing is lost, nothing comes twice, nothing changes its place.
+        # No message is lost, repeated or moved.
         assert contents(bags) == contents([session])
         assert f'position {N_POSITIONS}: good' in finished.stderr
 
@@ -187,7 +187,7 @@ class TestGrowing:
                 'record', bag, '--positions', '3', '--soak', '80s', '-o', bags, '--json', code=None
             )
             result = json.loads(finished.stdout)
-            # Not all of it is there yet, and the bag is over.
+            # The bag ends before the test is complete.
             assert finished.returncode == (0 if result['is_complete'] else 1)
             assert result['n_good'] == (2, 3)[number - 1]
         assert len(numbered_bags(bags)) == 3
@@ -207,7 +207,7 @@ class TestGrowing:
 def test_what_a_crash_has_left_is_told_and_finished(
     session: Path, cli: Cli, tmp_path: Path
 ) -> None:
-    # WHY: the hours of a run that was killed lay in a hidden file that nobody knew of.
+    # WHY: the hours of a killed run were in a hidden file that nobody knew of.
     bags = tmp_path / 'bags'
     killed = subprocess.run(
         [sys.executable, '-c', CRASH, session, bags, str(START_NS + 200 * 10**9)], check=False
@@ -229,7 +229,7 @@ def test_what_a_crash_has_left_is_told_and_finished(
     with open_recording(first, require=()) as reader:
         assert reader.info.truncated is None
         assert reader.info.metadata['serial'] == 'lab-7'
-    # What none can read stays where it is.
+    # An unreadable file stays in place.
     broken = bags / '.07.999999999-abcdef.partial.mcap'
     broken.write_bytes(b'no bag')
     said = cli(*arguments, '--finish', code=None).stderr
@@ -238,7 +238,7 @@ def test_what_a_crash_has_left_is_told_and_finished(
 
 
 class Recording:
-    """The command as a process of its own."""
+    """The command in a separate process."""
 
     def __init__(self, *arguments: str | Path) -> None:
         self.process = subprocess.Popen(
@@ -250,7 +250,7 @@ class Recording:
         )
 
     def wait_for(self, words: str) -> None:
-        """Read what it says until it says this."""
+        """Read its output up to this text."""
         assert self.process.stderr is not None
         for line in self.process.stderr:
             if words in line:
@@ -258,7 +258,7 @@ class Recording:
         raise AssertionError(f'it ended without: {words}')
 
     def end(self, number: signal.Signals | None = None) -> tuple[int, dict[str, Any], str]:
-        """Wait for its end, after a signal; give its exit code, result and last words."""
+        """Wait for its end, after a signal; return its exit code, result and last output."""
         if number is not None:
             self.process.send_signal(number)
         out, said = self.process.communicate(timeout=120)
@@ -287,7 +287,8 @@ class TestLive:
         assert code == 0
         check_positions(result)
         assert len(numbered_bags(bags)) == N_POSITIONS
-        # It ends when the last position is good: what came until then is there, byte for byte.
+        # It ends when the last position is good: all messages until then are recorded, byte for
+        # byte.
         sent, got = contents([session]), contents(numbered_bags(bags))
         assert got.keys() == sent.keys()
         for topic, messages in got.items():

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A clock that jumps: what a jump becomes, what it leaves alone, and what is no clock at all."""
+"""A clock that jumps: the shortened jump, the unchanged rest, and a clock that is refused."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path: Path, jump_ns: int)
     blocks = blocks_of(
         tmp_path / 'bag.mcap', true_ns + jump_ns * after, (true_ns + jump_ns * after)[::100]
     )
-    # A reading stands before the sample of its log time: the jump is before reading 5.
+    # A reading is before the sample of its log time: the jump is before reading 5.
     hour = LONGEST_PAUSE_NS * after
     found = joined(blocks, 'accel') - true_ns
     assert found[:500].tolist() == [0] * 500
@@ -84,8 +84,8 @@ def test_a_message_an_hour_is_no_recording(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(('zone_s', 'n'), [(3600, 40000), (-3600, 1000), (1800, 1000), (20, 1000)])
 def test_thermometers_of_another_time_zone_are_named(tmp_path: Path, zone_s: int, n: int) -> None:
-    # WHY: what was said was how many days the stamps span, or nothing at all, and `replay` gave
-    # out what it had made of the temperatures of another hour.
+    # WHY: the only message was the number of days, or none, and `replay` wrote samples corrected
+    # with the temperatures of another hour.
     true_ns = START_NS + STEP_NS * np.arange(n)
     said = f'board is stamped {zone_s:+} s from the samples around it: two clocks?'
     with suppress(RecordingError):

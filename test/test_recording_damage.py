@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Damage: a torn bag is read up to its last whole message and said to be torn; a corrupt one is one
-clear error; nothing crashes, hangs or takes memory that the file does not justify.
+A damaged bag: a truncated one is read to its last complete message and reported; a corrupt one is
+one clear error; no crash, no hang, no memory beyond the file's content.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def read(path: Path) -> Recording:
 
 
 def outcome(path: Path) -> Recording | RecordingError:
-    """Read a bag that may be damaged; any other exception than the right one fails the test."""
+    """Read a bag that may be damaged; any other exception than the expected one fails the test."""
     try:
         return read(path)
     except RecordingError as error:
@@ -44,7 +44,7 @@ def outcome(path: Path) -> Recording | RecordingError:
 
 
 def chunk_places(path: Path) -> list[tuple[int, int]]:
-    """Position and length of each chunk record, by the `mcap` library's reading of the summary."""
+    """Return position and length of each chunk record, from the summary read by `mcap`."""
     with path.open('rb') as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -53,7 +53,7 @@ def chunk_places(path: Path) -> list[tuple[int, int]]:
 
 @lru_cache(maxsize=8)
 def small_bag(compression: str, use_chunking: bool = True) -> tuple[bytes, int, int]:
-    """Bytes of a bag of 24 counts in three chunks, and the last chunk's position and length."""
+    """Return a bag of 24 counts in three chunks, and the last chunk's position and length."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         write_mcap(
@@ -68,7 +68,7 @@ def small_bag(compression: str, use_chunking: bool = True) -> tuple[bytes, int, 
 
 
 def every_cut(content: bytes, position: int, length: int) -> list[int]:
-    """Every byte of the last chunk, and every 17th of the indexes and the summary behind it."""
+    """Every byte of the last chunk, and every 17th of the indexes and the summary after it."""
     end = position + length
     return [*range(position, end), *range(end, len(content), 17), len(content) - 1]
 
@@ -76,7 +76,7 @@ def every_cut(content: bytes, position: int, length: int) -> list[int]:
 def test_cut_at_every_byte_of_the_last_chunk(tmp_path: Path) -> None:
     content, position, length = small_bag('none')
     messages = regular_messages(24)
-    # Where each message ends in the file, counted by hand from the layout of a chunk.
+    # The end of each message in the file, computed by hand from the layout of a chunk.
     at = position + 9 + 40
     last: list[int] = []
     while at < position + length:
@@ -112,13 +112,13 @@ def test_cut_inside_a_compressed_chunk_gives_a_prefix(tmp_path: Path, compressio
         counts.append(recording.info.n_messages)
         assert_columns(recording.columns, messages[: counts[-1]])
         assert recording.info.truncated is not None
-    assert counts == sorted(counts)  # a longer piece never holds less
+    assert counts == sorted(counts)  # a longer piece never contains fewer messages
     assert counts[-1] == len(messages)
 
 
 def test_most_of_a_large_torn_chunk_is_saved(tmp_path: Path) -> None:
     """
-    A streaming decompressor gives what stands before the cut: not the chunk is lost, but a block.
+    A streaming decompressor gives the content before the cut: a block is lost, not the chunk.
     """
     n = 60_000
     stamps = np.arange(n) * 2_500_000
@@ -131,8 +131,8 @@ def test_most_of_a_large_torn_chunk_is_saved(tmp_path: Path) -> None:
         ((position, length),) = chunk_places(path)
         path.write_bytes(content[: position + length // 2])
         columns = read(path).columns
-        # Incompressible numbers: half of the bytes hold nearly half of the messages. A block of
-        # zstd is 128 KiB of content, 1700 messages.
+        # Incompressible numbers: half of the bytes contain nearly half of the messages. A block of
+        # zstd has 128 KiB of content, 1700 messages.
         assert 0.4 * n < len(columns) < 0.6 * n
         assert (columns.accel == xyz[: len(columns)]).all()
 
@@ -148,7 +148,7 @@ def test_cut_anywhere(data: st.DataObject, compression: str) -> None:
         path.write_bytes(content[:cut])
         found = outcome(path)
         if isinstance(found, RecordingError):
-            assert cut < 60, found  # only a file without a whole header holds nothing at all
+            assert cut < 60, found  # only a file without a complete header contains nothing
         else:
             assert found.info.truncated is not None
             assert_columns(found.columns, regular_messages(24)[: found.info.n_messages])
@@ -156,8 +156,9 @@ def test_cut_anywhere(data: st.DataObject, compression: str) -> None:
 
 def test_zeros_at_the_end_are_no_messages(tmp_path: Path) -> None:
     """
-    WHY: after a power failure a file may have its full length and zeros for its last pages.
-    PROMISE: no message with a zeroed part is given out.
+    WHY: after a power failure a file may have its full length and zeros in its last pages.
+
+    PROMISE: no message with a zeroed part is returned.
     """
     messages = regular_messages(24)
     path = tmp_path / 'bag.mcap'
@@ -282,7 +283,7 @@ def test_claims_are_not_believed(tmp_path: Path, record: bytes, reason: str) -> 
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(RecordingError, match=reason):
         read(path)
-    # In KiB: no claim makes the reader take more than a whole ordinary chunk (64 MiB).
+    # In KiB: whatever length is stated, the reader takes no more than a usual chunk (64 MiB).
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 
@@ -295,7 +296,7 @@ def test_a_damaged_compressed_end_is_left_out(tmp_path: Path) -> None:
     recording = read(path)
     assert str(recording.info.truncated).endswith('; its last chunk is damaged and left out')
     assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
-    # The same chunk torn as well: what its decompressor gives before the damage.
+    # The same chunk truncated: the content before the damage.
     path.write_bytes(damaged[:-5])
     assert 'ends inside a chunk' in str(read(path).info.truncated)
 
@@ -305,7 +306,7 @@ def test_a_summary_that_is_nonsense(tmp_path: Path) -> None:
     path = tmp_path / 'bag.mcap'
     footer = len(content) - 37
     (summary,) = struct.unpack_from('<Q', content, footer + 9)
-    for at in (summary, summary + 9):  # the first record's opcode; its schema's number and name
+    for at in (summary, summary + 9):  # opcode of the first record; number and name of its schema
         changed = bytearray(content)
         changed[at : at + 8] = b'\xff' * 8
         path.write_bytes(changed)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag promises and what comes of it; what it may cost to open one."""
+"""The stated and the actual content of a bag; the cost of opening one."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_rows_deleted_from_a_database_are_missed(tmp_path: Path, cli: Cli) -> No
 def test_a_conversion_tells_what_the_bag_lacks(tmp_path: Path, cli: Cli) -> None:
     messages = regular_messages(400, accel=IMU_IN)
     for one in messages:
-        if one.topic == IMU_IN:  # gravity: another reading at rest is refused
+        if one.topic == IMU_IN:  # as gravity, since another magnitude at rest is refused
             one.numbers = (*one.numbers[:25], 0.0, 0.0, 9.81, *one.numbers[28:])
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     with sqlite3.connect(tmp_path / 'bag' / 'bag.db3') as database:
@@ -81,7 +81,7 @@ def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path: Path) -> None
     with open_recording(tmp_path / 'bag.mcap') as reader:
         kind = reader.info.topics[ACCEL][0]
         reader.info = replace(reader.info, topics={**reader.info.topics, ACCEL: (kind, 64)})
-        for _ in range(2):  # told once, however often it is read
+        for _ in range(2):  # reported once, however often it is read
             assert sum(map(len, reader.blocks())) == 40
         assert reader.info.truncated == f'{ACCEL}: 40 of the 64 messages listed are there'
 
@@ -139,7 +139,7 @@ def test_a_compressed_message_expands_within_limits(tmp_path: Path) -> None:
 def test_a_chunk_of_a_ros1_bag_expands_within_limits(
     tmp_path: Path, packing: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # WHY: a bag of 10 kB took a gigabyte.
+    # WHY: a bag of 10 kB took a gigabyte of memory.
     store, kind = get_typestore(Stores.ROS1_NOETIC), 'sensor_msgs/msg/Temperature'
     header, stamp = (
         store.types[name] for name in ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time')

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Reading: any bag that another tool wrote gives the columns of its messages in a player's order.
-"""
+"""Any bag written by another tool gives the columns of its messages in a player's order."""
 
 from __future__ import annotations
 
@@ -45,7 +43,7 @@ WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}
 @st.composite
 def bags(draw: st.DrawFn, accel: str = ACCEL, lowest: int = -3) -> list[Message]:
     """
-    Messages in the order of writing: ties and steps back in log time, mixed frames and orders.
+    Messages in order of writing, with equal and decreasing log times, mixed frames and orders.
     """
     frames = draw(st.lists(st.text('abcxyz_/é', max_size=24), min_size=1, max_size=3))
     topics = (accel, BOARD, CASE, OTHER)
@@ -98,8 +96,8 @@ def test_any_chunked_file_gives_its_messages_in_order_of_log_time(
         assert recording.info.start_ns == min(message.log_ns for message in messages)
         assert recording.info.end_ns == max(message.log_ns for message in messages)
         if options['index_types'] == IndexType.ALL and options['repeat']:
-            # The second route to the order: what rosbags yields for the very same file. At equal
-            # log times in different chunks its versions differ, so these may stand either way.
+            # Second route to the order: that of rosbags for the same file. Its versions differ for
+            # equal log times in different chunks, so that these may be in either order.
             order = [(log_ns, topic) for topic, log_ns, _ in read_with_rosbags(path)]
             wanted = [(m.log_ns, m.topic) for m in in_reading_order(messages)]
             assert [log_ns for log_ns, _ in order] == [log_ns for log_ns, _ in wanted]
@@ -168,7 +166,8 @@ def test_directories_written_by_rosbags(
 @settings(max_examples=10, deadline=None)
 @given(messages=bags(lowest=1))
 def test_ros_1_bags(messages: list[Message]) -> None:
-    # No equal log times: a ROS 1 bag has an index per topic, and no order between topics at a tie.
+    # No equal log times: a ROS 1 bag has an index per topic, and no order between topics for equal
+    # times.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.bag')
         write_rosbag1(path, messages)
@@ -206,7 +205,7 @@ def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path: Path
     assert [frame for block in blocks for frame in [block.frame_id] * len(block)] == frames
     before, n_accel = 0, 0
     for block in blocks:
-        # Each reading's place counts within its own block, so it can never exceed the block.
+        # The place of each reading counts within its block, so that it never exceeds the block.
         after = block.temperatures['board'].after
         assert ((after >= 0) & (after <= len(block))).all()
         before += len(after)
@@ -217,15 +216,17 @@ def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path: Path
 
 def test_overlapping_chunks_of_single_topics_are_merged(tmp_path: Path) -> None:
     """
-    WHY: a tool that writes a chunk per topic puts the temperatures behind the samples they are
-    for; read in file order, each would be applied a chunk too late. PROMISE: log-time order.
+    WHY: a tool that writes a chunk per topic puts the temperatures after the samples that they
+    belong to; in file order each would apply a chunk too late.
+
+    PROMISE: log-time order.
     """
     messages = regular_messages(200)
     by_topic = sorted(
         messages, key=lambda m: ((m.log_ns - START_NS) // 100_000_000, ALL_TOPICS.index(m.topic))
     )
     write_mcap(tmp_path / 'bag.mcap', by_topic, chunk_size=400)
-    # Ties in log time are in the order of the file, so there the counts come first here.
+    # For equal log times the order of the file counts, so here the counts come first.
     assert_columns(read(tmp_path / 'bag.mcap').columns, in_reading_order(by_topic))
 
 
@@ -234,7 +235,7 @@ def test_too_many_overlapping_chunks_are_refused(
 ) -> None:
     monkeypatch.setattr('thermo_comp.recording.mcap_file._MAX_HELD_BYTES', 4000)
     messages = regular_messages(200)
-    # Each chunk holds every 40th message, so all of them span the whole time.
+    # Each chunk has every 40th message, so that all of them cover the whole time.
     combed = [message for begin in range(40) for message in messages[begin::40]]
     write_mcap(tmp_path / 'bag.mcap', combed, chunk_size=400)
     with pytest.raises(RecordingError, match=r'too many of its chunks overlap in time'):
@@ -274,7 +275,7 @@ def test_split_files_follow_each_other(tmp_path: Path) -> None:
     assert recording.info.truncated is None
     assert recording.info.n_messages == len(messages)
 
-    # The recorder was killed: no metadata.yaml; the numbers in the names give the order.
+    # A killed recorder writes no metadata.yaml; the numbers in the names give the order.
     (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / 'bag' / 'bag_0.mcap')
     (tmp_path / 'bag' / 'bag_1.mcap').rename(tmp_path / 'bag' / 'bag_2.mcap')
     for text in (None, ''):
@@ -289,7 +290,7 @@ def test_split_files_follow_each_other(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_bags_is_no_bag(tmp_path: Path) -> None:
-    # WHY: bags of different positions were once read as the pieces of one that was cut off.
+    # WHY: bags of different positions were once read as the files of one truncated bag.
     for name in ('01.mcap', '02.mcap'):
         (tmp_path / name).write_bytes(b'')
     with pytest.raises(RecordingError, match=r'folder of 2 bags, .* give \*\.mcap'):
@@ -394,7 +395,7 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path: Path) ->
             '/imu/ticks, its only Vector3Stamped, is taken for counts; '
             '/imu/die, its only Temperature, is taken for board'
         )
-    # Neither where the user has named another, nor where there are two, nor a case for a board.
+    # Not if the user named another topic, nor if there are two, nor a case as the board.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):
@@ -408,7 +409,7 @@ def test_reading_twice_gives_the_same(tmp_path: Path, monkeypatch: pytest.Monkey
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:
-        first = next(iter(reader.blocks()))  # given up before its end
+        first = next(iter(reader.blocks()))  # abandoned before its end
         again = next(iter(reader.blocks()))
     assert first.accel.tobytes() == again.accel.tobytes()
 
@@ -434,6 +435,6 @@ def test_a_closed_recording_gives_nothing(tmp_path: Path) -> None:
     for name in ('bag.mcap', 'bag.bag'):
         with open_recording(tmp_path / name) as reader:
             pass
-        reader.close()  # once more does no harm
+        reader.close()  # a second call has no effect
         with pytest.raises(RecordingError, match=rf'{name}: the recording is closed'):
             next(reader.blocks())

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is refused: other layouts, other encodings, other topics, things that are no bags."""
+"""Refusals: other layouts, encodings and topics, and files that are not bags."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_ros_1_messages_in_an_mcap_file(tmp_path: Path) -> None:
     assert block.accel.tolist() == [[1.5, -2.5, 3.5]]
     assert block.accel_stamp_ns.tolist() == [12 * 10**9 + 34]
     assert block.frame_id == 'link'
-    # Given out raw, it is CDR like any other.
+    # Returned raw, it is CDR like any other.
     message = Message(ACCEL, 1, 12 * 10**9 + 34, 'link', (1.5, -2.5, 3.5))
     assert block.raw['accel'].data.tobytes() == serialize(message)
 
@@ -188,7 +188,7 @@ def test_two_topics_that_fit_are_ambiguous(tmp_path: Path) -> None:
 
 
 def test_names_from_a_bag_cannot_forge_lines(tmp_path: Path) -> None:
-    """WHY: a topic's name is whatever stands in the file; an error is one line of a terminal."""
+    """WHY: a topic's name may contain anything; an error must be one line of a terminal."""
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         for row in range(30):
@@ -212,5 +212,5 @@ def test_torn_bags_of_other_storages_are_one_line(tmp_path: Path) -> None:
 
 
 def test_wire_sizes_are_as_the_layout_says() -> None:
-    # 4 encapsulation + align8(12 + 6) = 24 + 3 * 8: the sizes that the tests above rely on.
+    # 4 encapsulation + align8(12 + 6) = 24 + 3 * 8: the sizes used by the tests above.
     assert len(serialize(Message(ACCEL, 0, 0, 'accel', (1.0, 2.0, 3.0)))) == 52

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which topic of a bag feeds which input, and what is said where none does."""
+"""The topic of each input, and the message if there is none."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from thermo_comp.recording.writer import BagWriter
 def driver_bag(
     path: Path, *topics: tuple[str, str], metadata: dict[str, str] | None = None
 ) -> Path:
-    """Write five messages on each topic: an Imu, or a Vector3Stamped or flag where it says so."""
+    """Write five messages on each topic: an Imu, or if stated a Vector3Stamped or a flag."""
     stamp_ns = START_NS + np.arange(5) * 10**7
     with BagWriter(path, metadata=metadata or {}) as bag:
         for topic, kind in topics:
@@ -38,19 +38,19 @@ def driver_bag(
 @pytest.mark.parametrize(
     ('topics', 'taken'),
     [
-        # REP 145: the driver's topic; a magnetometer beside it is a vector, too.
+        # REP 145: the driver's topic; the magnetometer's vector is not a force.
         ([('imu/data_raw', 'imu'), ('imu/mag', 'vector')], '/imu/data_raw'),
-        # Xsens: the free acceleration and the rate are vectors.
+        # Xsens: free acceleration and rate are vectors.
         ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
         ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
-        # A filter between them: its input.
+        # With a filter, its input is chosen.
         ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
         ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
         ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),
-        # Two that nothing tells apart, and vectors that are no force.
+        # Two equivalent topics, and vectors that are not forces.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
-        # The node's own output, which its regime stands beside.
+        # The node's output, recognised by the regime topics beside it.
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], None),
         ([('a/imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], '/a/imu/data_raw'),
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag'), ('d/imu', 'imu')], '/d/imu'),
@@ -82,7 +82,7 @@ def test_what_is_corrected_already_is_explained(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=told):
         open_recording(path, require=('accel',))
     assert told in str(inspect_recording(path).chosen)
-    # The user decides.
+    # The user's choice.
     with open_recording(path, Topics.named({'imu': 'imu/data_raw'}), require=('accel',)) as reader:
         assert reader.topics['accel'] == '/imu/data_raw'
 

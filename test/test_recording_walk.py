@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Finding records: by an index or without, as a plain loop finds them, whatever bytes there are.
-"""
+"""Records are found with and without an index as by a plain loop, whatever the bytes are."""
 
 from __future__ import annotations
 
@@ -13,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.recording.blocks import Messages
 from thermo_comp.recording.chunks import DamagedError, locate, walk
+from thermo_comp.recording.serialized import Messages
 
 MESSAGE, CHANNEL = 5, 4
 
@@ -30,7 +28,8 @@ def other(content: bytes) -> bytes:
 
 def one_by_one(data: bytes) -> tuple[list[tuple[int, int, int, int]], list[bytes], int]:
     """
-    Walk in a plain loop: place, size, channel, log time of each message; other contents; the end.
+    Scan in a plain loop: place, size, channel and log time of each message; other records; the
+    end.
     """
     at, messages, others = 0, [], []
     while at + 9 <= len(data):
@@ -51,7 +50,7 @@ def listed(messages: Messages) -> list[tuple[int, int, int, int]]:
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
-#: Contents that look like records themselves, of the very lengths that are around.
+#: Contents that look like records, with the lengths of real ones.
 DECEITFUL = [
     b'\x05' * 40,
     message(1, 5, b'\x05' * 9),
@@ -63,7 +62,7 @@ DECEITFUL = [
 
 @st.composite
 def records(draw: st.DrawFn) -> bytes:
-    """Long regular stretches with irregular ones between."""
+    """Long regular parts with irregular ones between."""
     pieces: list[bytes] = []
     for _ in range(draw(st.integers(1, 6))):
         content = draw(st.sampled_from(DECEITFUL) | st.binary(max_size=60))
@@ -93,7 +92,7 @@ def index_of(entries: list[tuple[int, int, int, int]]) -> bytes:
 def test_a_walk_equals_the_plain_loop_and_a_false_index_changes_nothing(
     data: bytes, cut: int, tail: bytes, drawn: st.DataObject
 ) -> None:
-    """WHY: offsets that point into payloads which look like records could give false samples."""
+    """WHY: offsets into payloads that look like records could give false samples."""
     torn = data[: len(data) - cut] + tail
     wanted, wanted_others, wanted_end = one_by_one(torn)
     if all(log_ns < 2**63 for _, _, _, log_ns in wanted):
@@ -101,7 +100,7 @@ def test_a_walk_equals_the_plain_loop_and_a_false_index_changes_nothing(
         messages, reason = walk(
             np.frombuffer(torn, np.uint8), lambda _, content: others.append(content)
         )
-        # The message before a record of zeros may end in zeros that are none of its own.
+        # The message before a record of zeros may end in zeros that are not its own.
         is_wiped = len(torn) >= wanted_end + 9 and torn[wanted_end] == 0
         assert listed(messages) == (wanted[:-1] if is_wiped else wanted)
         assert others == wanted_others
@@ -137,6 +136,6 @@ def test_what_is_no_sequence_of_records() -> None:
         located(struct.pack('<BQ', MESSAGE, 21) + bytes(21))
     with pytest.raises(DamagedError, match='log time beyond the year 2262'):
         located(message(1, 2**63, b''))
-    # What is no index is no hint, and what follows the message is none of it.
+    # An invalid index is no hint, and the bytes after the message are not part of it.
     for index in (whole, index_of([(0, 3, 1, 2)])[:-1], b'\0'):
         assert located(whole, index) == [(0, 3, 1, 2)]

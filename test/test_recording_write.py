@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writing: other tools read back what was written, all of it at once or nothing."""
+"""Other tools read the written bag; it is complete or does not exist."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_rosbags_and_mcap_read_back_what_was_written(
             '/regime/dynamic': 'b',
             '/diagnostics': 'r',
         }
-        # The file order: by group of calls, then log time, then the order of the calls.
+        # Order in the file: by group of calls, then log time, then order of the calls.
         wanted = [
             (log_ns, name) for _, log_ns, name in sorted(written, key=lambda entry: entry[:2])
         ]
@@ -109,7 +109,7 @@ def test_rosbags_and_mcap_read_back_what_was_written(
             assert rosbag.message_count == len(wanted)
             assert {c.topic for c in rosbag.connections} == set(names)
             found = [(log_ns, names[c.topic]) for c, log_ns, _ in rosbag.messages()]
-        # At equal log times across chunks, versions of rosbags differ in what goes first.
+        # For equal log times across chunks the order depends on the version of rosbags.
         assert [log_ns for log_ns, _ in found] == sorted(log_ns for log_ns, _ in wanted)
         assert sorted(found) == sorted(wanted)
         if counts[-1] and len(counts) == 1:
@@ -153,7 +153,7 @@ def test_metadata_comes_back(tmp_path: Path, name: str) -> None:
     pairs = {'serial': 'Ünit 7', 'git': 'a: b\n- c'}
     small(tmp_path / name, metadata=pairs)
     assert read_recording(tmp_path / name, require=()).info.metadata == pairs
-    if name == 'bag.mcap':  # even of a torn file
+    if name == 'bag.mcap':  # also of a truncated file
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content[: len(content) // 2])
         assert read_recording(tmp_path / name, require=()).info.metadata == pairs
@@ -192,7 +192,7 @@ def test_the_directory_is_what_rosbag2_writes(tmp_path: Path) -> None:
 
 
 def test_a_bare_file_names_itself(tmp_path: Path) -> None:
-    """WHY: it is written under another name first, and that one must not stand in its metadata."""
+    """WHY: a bag is written under a temporary name, which must not be in its metadata."""
     small(tmp_path / 'bag.mcap')
     with (tmp_path / 'bag.mcap').open('rb') as stream:
         (metadata,) = make_reader(stream).iter_metadata()
@@ -234,7 +234,7 @@ def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path: Path, nam
     with pytest.raises(KeyError):
         fail()
     assert value() == 1.0
-    assert [p.name for p in tmp_path.iterdir()] == [name]  # nothing is left lying about
+    assert [p.name for p in tmp_path.iterdir()] == [name]  # no file remains
     small(path, 3.0, overwrite=True)
     assert value() == 3.0
     assert [p.name for p in tmp_path.iterdir()] == [name]
@@ -258,7 +258,7 @@ def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path: Path) -
 
 @contextmanager
 def limited_file_size(n_bytes: int) -> Iterator[None]:
-    """Let no file of this process grow beyond a size: what a full disk does to a writer."""
+    """Limit the size of files of this process, which has the effect of a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
@@ -327,7 +327,7 @@ def test_a_killed_writer_leaves_the_old_output_and_a_readable_rest(
     (rest,) = (entry for entry in tmp_path.iterdir() if entry != path)
     recovered = read_recording(rest, require=())
     assert recovered.info.truncated is not None
-    # What is lost is the chunk being filled, of 14 000 messages.
+    # The chunk that is being filled is lost, of 14 000 messages.
     assert 76_000 <= len(recovered.columns) <= 90_000
 
 
@@ -370,7 +370,7 @@ def test_a_bag_without_messages_is_a_bag(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
 def test_regime_topics_are_offered_as_the_node_offers_them(tmp_path: Path, name: str) -> None:
-    # WHY: a bag of `replay` offered `regime/stamped` as volatile: who joined late got no regime.
+    # WHY: a bag of `replay` offered `regime/stamped` as volatile: a late subscriber got no regime.
     with BagWriter(tmp_path / name) as bag:
         bag.write_bool('imu0/regime/dynamic', [1], [True])
         for topic in ('imu0/regime/stamped', '/diagnostics'):

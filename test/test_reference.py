@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the documentation takes from the code is what the code says today."""
+"""Generated parts of the documentation agree with the code."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def test_json_schema_says_the_same() -> None:
     schema = make_reference.json_schema(Drawing)
     assert schema['required'] == ['name']
     assert schema['additionalProperties'] is False
-    assert schema['description'] == 'Something of everything.'
+    assert schema['description'] == 'A value of every kind.'
     assert schema['properties']['name'] == {'type': 'string', 'minLength': 2, 'maxLength': 20}
     assert schema['properties']['shapes'] == {
         'type': 'array',

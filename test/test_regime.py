@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The detector: early, quiet, never blind, in small; the long runs are in benchmarks/regime.py.
+The detector on short runs: early, few false alarms, no missed ramps; long runs are in
+benchmarks/regime.py.
 
 All runs are seeded. A limit on a median of n delays holds with the benchmark's spread: the median
 of 24 scatters by about 0.3 of the delays' sd, 1 s at 1 mK; of 12 with coarse steps by 4 s.
@@ -46,7 +47,9 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps and return what switched after each began, and how many began static."""
+    """
+    Run n ramps; return the switches after the start of each, and the number of static starts.
+    """
     settings = detector_settings(noise, quantum, lag)
     found, n_static = [], 0
     for seed in range(n):
@@ -65,7 +68,7 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
 
 @pytest.fixture(scope='module')
 def headline():
-    """Run the ramp that the requirement names: 0.5 K/min behind 15 min, 1 Hz, after a soak."""
+    """Run the ramp of the requirement: 0.5 K/min behind 15 min, 1 Hz, after a soak."""
     return {
         name: onsets(*sensor, 0.5, LAG_S, 12 if sensor[1] else 24, end_s=300.0, soak_s=2700.0)
         for name, sensor in SENSORS.items()
@@ -77,8 +80,8 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # Two edges must be crossed: with the second between 62.5 and 125 mK from the start the
-        # median cannot be below the time the case takes to move 94 mK, 146 s; of 12 runs it
+        # Two edges must be crossed: with the second at 62.5 to 125 mK from the start the median is
+        # at least the time in which the case changes by 94 mK, 146 s; the median of 12 runs
         # scatters by 6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
@@ -95,15 +98,15 @@ def test_onset_is_early(headline, sensor, median_s, late_s):
 
 @pytest.mark.parametrize(('sensor', 'threshold'), [('1 mK', 9.65), ('10 mK', 8.87)])
 def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
-    # The bound: Page's CUSUM that knows the ramp, the baseline and the noise; its thresholds (log
-    # likelihood ratios) for one false alarm in 50 h are those found in docs/regime.md.
+    # The bound: Page's CUSUM with known ramp, baseline and noise; its thresholds (log likelihood
+    # ratios) for one false alarm in 50 h are those of docs/regime.md.
     noise = SENSORS[sensor][0]
     rng = np.random.default_rng(4)
     k = np.arange(1.0, 121.0)
     signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
     delays = []
     for _ in range(40):
-        # onset known to the statistic is a lower bound on the CUSUM's delay, within a second
+        # A statistic with a known onset is a lower bound of the CUSUM's delay, within a second.
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])
@@ -138,14 +141,14 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
     found, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 4, dt=dt, end_s=end_s)
     for each in found:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # the slowest: 1 K steps in a ramp of 0.2 K/min, two edges 5 min apart behind 15 min
+        # The slowest: steps of 1 K in a ramp of 0.2 K/min, two edges 5 min apart behind 15 min.
         assert each[-1][0] < 0.5 * end_s
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_soaks_stay_static(sensor):
-    # 15 h of ripple and self-heating. At the required 0.05 switches an hour the expected number
-    # of openings is 0.4; more than 2 of them has a probability below 1 %. Found: none.
+    # 15 h of ripple and self-heating. At the required 0.05 switches an hour 0.4 openings are
+    # expected; more than 2 have a probability below 1 %.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -167,9 +170,10 @@ def test_soaks_stay_static(sensor):
 
 
 def test_false_alarms_keep_to_the_setting():
-    # Noise alone and no ripple to hide behind, 20 alarms an hour allowed. Rice's formula counts
-    # crossings, and those of one filter come in bunches and with those of the other, so the
-    # formula is a bound: 100 h give at most 2000 departures, not in bunches; and it is not idle.
+    # Noise without ripple, 20 alarms an hour permitted. Rice's formula counts crossings; those of
+    # one filter come in groups and coincide with those of the other, so that the formula is an
+    # upper bound: at most 2000 separate departures in 100 h. A lower limit checks that the test is
+    # not inactive.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -190,9 +194,9 @@ def test_false_alarms_keep_to_the_setting():
 
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_threshold_is_that_of_the_filters_noise(dt):
-    # Second route: the filter's steady gain from its Riccati equation, its noise and the
-    # correlation of neighbours from its impulse response, Rice's formula with those. The closed
-    # forms are first order in the pace, which is at most 0.3 here: within 4 %.
+    # Second route: steady gain of the filter from its Riccati equation, noise and correlation of
+    # successive values from its impulse response, then Rice's formula. The closed forms are first
+    # order in the pace, which is at most 0.3 here: within 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -231,7 +235,7 @@ def test_unknown_until_the_windows_are_filled():
 
 def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=8000.0, **parts):
     """
-    One run; `parts` may replace the case's or the board's readings by a function of (t, reading).
+    Run once; `parts` may replace the readings of case or board by a function of (t, reading).
     """
     rng = np.random.default_rng(8)
     t = np.arange(begin, end)
@@ -251,8 +255,8 @@ RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
 def test_dynamic_ends_when_the_lag_has_died():
-    # The board's true rate falls below the relaxed 0.05 K/min some 50 min after the chamber's
-    # stop; then it needs the dwell of 60 s, and the noise of the rate a margin of 10 %.
+    # The board's true rate falls below the relaxed 0.05 K/min about 50 min after the chamber's
+    # stop; the dwell adds 60 s, and the noise of the rate needs a margin of 10 %.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
     t = np.arange(3600.0, 12000.0)
@@ -269,16 +273,16 @@ def test_the_relaxed_rate_moves_the_end():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # the slower of two lags governs: half the rate, one more lag times ln 2
+    # The slower of two lags decides: half the rate takes one lag times ln 2 longer.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 
 
 @pytest.mark.parametrize('sensor', ['1 mK', '1 mK, 62.5 mK steps', '10 mK, 62.5 mK steps'])
 def test_it_closes_with_the_case_or_the_board(sensor):
-    # The case lags by 3 min, the board by 15 min more. After the ramp the case's rate falls as
-    # exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): to the relaxed rate, a tenth of
-    # the ramp's, 7 and 38 min after. Steps of 62.5 mK hide the case's last 5 min of that.
+    # The case lags by 3 min, the board by another 15 min. After the ramp the case's rate falls as
+    # exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): they reach the relaxed rate, a
+    # tenth of the ramp's, after 7 and 38 min. Steps of 62.5 mK hide the last 5 min of the case.
     noise, quantum = SENSORS[sensor]
     lag, behind = 180.0, 900.0
     board_too = DetectorSettings(
@@ -296,7 +300,7 @@ def test_it_closes_with_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # The same bits as without a board; and where the case is lost, the board leads as ever.
+    # The same bits as without a board; if the case is lost, the board decides.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
@@ -308,9 +312,8 @@ TRIANGLE = [(0.0, 0.5), (3600.0, -0.5), (7200.0, 0.5), (10800.0, 0.0)]
 @pytest.mark.parametrize('lost', [None, 'case', 'board'])
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
 def test_a_reversal_is_no_rest(lost, quantum):
-    # WHY: at the top of a triangle the rate passes through zero for minutes, and a coarse reading
-    # stands still.
-    # WHAT: one dynamic state from the first onset to the last relaxation.
+    # WHY: at the top of a triangle the rate is near zero for minutes, and a coarse reading is
+    # constant. WHAT: one dynamic state from the first onset to the last relaxation.
     parts = {lost: gone} if lost else {}
     changes = run_once(TRIANGLE, quantum=quantum, end=16000.0, **parts)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
@@ -332,15 +335,15 @@ def test_direction_follows_a_reversal():
         directions[t[k]] = detector.direction
     assert directions[-100.0] == 0
     assert directions[600.0] == directions[3600.0] == 1
-    # the case turns lag * ln(2 - exp(-ramp / lag)) after the chamber: 616 s
+    # The case turns lag * ln(2 - exp(-ramp / lag)) after the chamber: 616 s.
     turn = next(at for at in directions if at > 3600.0 and directions[at] == -1)
     assert turn == pytest.approx(3600.0 + 616.0, abs=60.0)
     assert directions[7199.0] == -1
 
 
 def test_a_held_reading_does_not_turn_the_direction():
-    # WHY: a sensor that measures every 30 s and is published every second makes a staircase,
-    # whose flat parts and steps look like turns.
+    # WHY: a sensor that measures every 30 s and is published every second gives a staircase, whose
+    # constant parts and steps look like reversals.
     settings = detector_settings(0.001, 0.0625, 300.0)
     case, board = Thermometer(settings.case), Thermometer(settings.board)
     detector = RegimeDetector(settings)
@@ -365,7 +368,7 @@ def test_a_start_in_a_ramp_is_dynamic():
 
 
 def test_a_lost_case_leaves_the_board():
-    # The board's second lag delays the onset; the end needs the board anyway.
+    # The board's additional lag delays the onset; the end depends on the board anyway.
     whole, alone = run_once(RAMP), run_once(RAMP, case=gone)
     assert [regime for _, regime, _ in alone] == [STATIC, DYNAMIC, STATIC]
     assert whole[1][0] < alone[1][0] < 300.0
@@ -404,7 +407,7 @@ def test_cooling_is_heating_upside_down(quantum):
 
 
 def test_switches_do_not_depend_on_the_origin_of_time():
-    # whole nanoseconds either way, so the same bits
+    # Whole nanoseconds in both cases, so the bits are the same.
     rng = np.random.default_rng(8)
     t = np.arange(0.0, 3000.0)
     settings = detector_settings(0.001)

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The offline run gives, bit for bit, what a compensator gives sample by sample in the bag's order.
-"""
+"""The offline run equals, bit for bit, a compensator that gets the samples in the bag's order."""
 
 from __future__ import annotations
 
@@ -37,7 +35,9 @@ SECOND_NS = 1_000_000_000
 def thermal_test(
     path: Path, minutes: float = 30.0, rate_hz: float = 10.0, serial: str = '', imu: bool = False
 ) -> Path:
-    """Write a recording with a ramp between two soaks, board lagging, in several write groups."""
+    """
+    Write a recording with a ramp between two soaks and a lagging board, in several write groups.
+    """
     rng = np.random.default_rng(7)
     n = round(minutes * 60.0 * rate_hz)
     stamps = START_NS + np.rint((np.arange(n) + 1.0) * (1e9 / rate_hz)).astype(np.int64)
@@ -81,7 +81,7 @@ def calibrated(**changes: object) -> Calibration:
 def one_by_one(
     block: Block, calibration: Calibration
 ) -> tuple[list[tuple[int, ...]], list[tuple[int, bool]]]:
-    """Run a whole recording through the streaming compensator, message by message."""
+    """Run a recording through the compensator message by message."""
     compensator = Compensator(calibration)
     readings = [
         (int(after), name, int(stamp), float(value))
@@ -104,7 +104,7 @@ def one_by_one(
 
 
 def output_of(path: Path) -> tuple[Block, list[tuple[int, bool]]]:
-    """Read a corrected bag through a library that is not ours."""
+    """Read a corrected bag with `rosbags`."""
     flags, stamped = [], []
     with AnyReader([path]) as reader:
         wanted = [c for c in reader.connections if c.topic == '/' + REGIME.name]
@@ -138,13 +138,13 @@ def test_equals_the_stream_bit_for_bit(tmp_path: Path) -> None:
     assert block.imu is not None
     full = expected[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]]
     assert block.imu.linear_acceleration_covariance.tobytes() == full.tobytes()
-    # What a counts message has not: neither orientation nor rate is claimed (REP 145).
+    # A message of counts has neither orientation nor rate, so none is stated (REP 145).
     assert set(block.imu.orientation_covariance[:, 0]) == {-1.0}
     assert set(block.imu.angular_velocity_covariance[:, 0]) == {-1.0}
     assert block.frame_id == 'imu_link'
     assert found_flags == flags
     assert result.n_flags == len(flags)
-    # Soak, ramp, soak: the detector sees the ramp.
+    # Soak, ramp, soak: the detector detects the ramp.
     assert [is_dynamic for _, is_dynamic in result.switches][:2] == [False, True]
     assert result.switches == switches(flags)
     assert result.counters.n_in == len(read_recording(bag).columns)
@@ -167,7 +167,7 @@ def test_constants_need_no_thermometer(tmp_path: Path) -> None:
     assert block.accel.tobytes() == np.ascontiguousarray(expected[:, :3]).tobytes()
     np.testing.assert_allclose(block.accel, (source.accel - 5.0) / 510.0, rtol=1e-14)
     assert flags == []
-    # One that has learnt what temperature does is not applied without any.
+    # A calibration with temperature functions is not applied without temperatures.
     with pytest.raises(RecordingError, match='temperature/board'):
         replay(bag, rich_calibration(), tmp_path / 'other')
 
@@ -216,11 +216,11 @@ def test_time_outs_and_lost_temperatures_are_counted(tmp_path: Path) -> None:
     with BagWriter(bag) as writer:
         stamps = START_NS + np.arange(2000) * 100_000_000
         writer.write_temperature(TOPICS.board, [START_NS + 10 * SECOND_NS], [20.0])
-        # Some 1 g in all, and alive.
+        # Magnitude of about 1 g, never constant.
         counts = 1700.0 + np.arange(2000)[:, None] % 2 + np.zeros(3)
         writer.write_counts(TOPICS.counts, stamps, counts)
     result = replay(bag, rich_calibration(), tmp_path / 'out')
-    # Nothing before the first reading at 10 s, nothing later than 60 s after the only one.
+    # No output before the first reading at 10 s, nor later than 60 s after the only one.
     assert result.counters.n_no_temperature == 100
     assert result.counters.n_stale == 2000 - 100 - 601
     assert result.counters.n_out == 601
@@ -242,7 +242,7 @@ def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path: Path) -> None:
     bag = thermal_test(tmp_path / 'bag', minutes=1.0, imu=True)
     with pytest.raises(CalibrationError, match=r'takes counts.*holds sensor_msgs/Imu'):
         replay(bag, rich_calibration(), tmp_path / 'out', topics=Topics(input='imu'))
-    # Without being told, it looks for what the calibration is for.
+    # Without options the input of the calibration is read.
     with pytest.raises(RecordingError, match='accel/counts'):
         replay(bag, rich_calibration(), tmp_path / 'out')
 
@@ -266,8 +266,8 @@ def test_progress_goes_from_nothing_to_all(tmp_path: Path) -> None:
 def test_memory_does_not_grow_with_the_bag(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Many blocks in the short bag, too; and a unit that converts at this rate, or all samples
-    # would be held back.
+    # The short bag has many blocks, too; the unit converts at this rate, or its samples would be
+    # dropped as too fast.
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 13)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)
@@ -284,7 +284,7 @@ def test_memory_does_not_grow_with_the_bag(
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         assert result.counters.n_out == minutes * 60.0 * 500.0
-    # Three times the messages: what is kept per bag are its flags, one per case reading.
+    # Three times the messages: memory only grows by the flags of the bag, one per case reading.
     assert peaks[1] < 1.1 * peaks[0]
     third = len(held) // 3
     assert max(held[-third:]) < 1.15 * max(held[:third])
@@ -356,7 +356,7 @@ def test_topics_that_cannot_be_copied_leave_nothing_behind(tmp_path: Path) -> No
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 def test_every_topic_is_copied(tmp_path: Path, storage: str) -> None:
-    # An INS needs the other topics of the recording, too.
+    # An INS also needs the other topics of the recording.
     inputs = thermal_test(tmp_path / 'inputs', minutes=2.0)
     mcap = tmp_path / 'bag'
     stamps = START_NS + np.arange(-3, 150) * 10**9

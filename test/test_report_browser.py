@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Holds what a browser makes of the page of a report: on a phone, and in print."""
+"""The page of a report in a browser: on a phone, and in print."""
 
 import re
 import shutil
@@ -27,7 +27,7 @@ def browser() -> str:
 
 
 def test_browser_draws_the_page_for_a_phone_whole_and_without_a_complaint(tmp_path):
-    # No window of a headless browser is as narrow as a phone; a frame in it is.
+    # A headless browser has no window as narrow as a phone, but a frame in it can be.
     (tmp_path / 'page.html').write_text(certificate(), encoding='utf-8')
     frame = tmp_path / 'frame.html'
     frame.write_text("""<iframe src="page.html" style="width:390px;height:800px;border:0"></iframe>
@@ -79,5 +79,5 @@ def test_no_printed_page_is_empty(tmp_path):
     assert 5 <= len(pages) <= 12
     for number in pages:
         drawn = re.search(rb'\n%s 0 obj.*?stream\r?\n' % number, printed, re.DOTALL)
-        # The margin alone takes some lines.
+        # The margin takes some lines.
         assert zlib.decompressobj().decompress(printed[drawn.end() :]).count(b'\n') > 200

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Holds the certificate of a laboratory: its statements, its uncertainties, its rounding."""
+"""The certificate of a laboratory: its statements, uncertainties and rounding."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_what_a_laboratory_states_is_printed_and_the_rest_is_blank(tmp_path):
         assert text in page, text
     # The address of the customer, and the place of the signature.
     assert page.count('class="blank"') == 2
-    # In the margin of each printed page: the certificate and the unit, whatever they are called.
+    # The margin of each printed page contains certificate and unit, whatever their names.
     margin = (
         'certificate\\0000202026\\00002d017\\00002c\\000020unit\\000020thermostatted\\00002d0001'
     )
@@ -146,7 +146,7 @@ def test_a_mistake_in_the_statements_is_one_sentence(tmp_path, text, said):
 def test_the_example_is_accepted_and_is_what_the_page_shows():
     example = ROOT / 'config' / 'lab.example.yaml'
     info = load_certificate_info(example)
-    # All but the serial, which the calibration knows, and the remarks.
+    # All fields except the serial, which the calibration contains, and the remarks.
     assert info.gravity.source == 'national gravity network'
     assert [one.name for one in info.instruments] == ['chamber', 'thermometers']
     page = (ROOT / 'docs' / 'recording.md').read_text(encoding='utf-8')
@@ -167,13 +167,13 @@ def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
     found = {one.name: one.standard for one in budget(evidence(), CertificateInfo())}
     assert found['gravity'] is None
     assert found['thermometers'] is None
-    # Noise, attitude and model are the claim, taken apart; the residual is within it.
+    # Noise, attitude and model together are the claimed sd; the residual is within it.
     windows = evidence().judgement.windows
     claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
     parts = [found[name] for name in ('noise', 'attitude', 'model')]
     assert float(np.linalg.norm(parts)) == pytest.approx(claim)
     assert found['repeatability'] == 0.0
-    # Gravity in doubt by 1 ug, and the thermometers by what a kelvin is worth.
+    # Gravity uncertain by 1 ug, and the thermometers by the effect of a kelvin.
     info = load_certificate_info(lab(tmp_path))
     stated = budget(evidence(), info)
     by_name = {one.name: one.standard for one in stated}
@@ -192,7 +192,7 @@ def test_residual_beyond_the_claim_is_repeatability():
 
 
 def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
-    # WHY: 0.00037 was printed for a scale factor whose gravity nobody had vouched for.
+    # WHY: 0.00037 was printed for a scale factor although gravity's uncertainty was not stated.
     rows = {one.quantity: one for one in results(evidence(), CertificateInfo(), ())}
     assert rows['scale factor x'].expanded == '–'
     assert rows['bias x'].expanded != '–'
@@ -201,7 +201,7 @@ def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
     assert 'combined, without gravity' in page
     info = load_certificate_info(lab(tmp_path))
     assert 'withheld' not in render_report(evidence(), figures=[], info=info)
-    # What the fit was told is in the covariance: it is known, and not counted twice.
+    # The gravity uncertainty given to the fit is in the covariance, and is not counted twice.
     told = replace(evidence(), gravity_sd=2e-5)
     assert 'withheld' not in render_report(told, figures=[])
     assert {one.name: one.standard for one in budget(told, info)}['gravity'] == 0.0
@@ -220,7 +220,8 @@ def test_table_over_temperature(tmp_path):
             at = float(row.temperature.replace('−', '-'))
             bias, sd, scale, scale_sd = in_a_soak(calibration, at)
             said = [float(cell.replace('−', '-')) for cell in row[2:]]
-            # Half a digit of two, and half a tenth of a kelvin of the ends of the range.
+            # Half a digit each of two values, and half a tenth of a kelvin at the ends of the
+            # range.
             slack = 0.06 * abs(table.bias_slope) + 0.06 * said[1]
             assert said[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)
             assert said[1] == pytest.approx(2.0 * sd[k] / MICRO_G, rel=0.06)
@@ -247,7 +248,7 @@ def test_gravity_in_doubt_is_the_scale_factors_doubt(tmp_path):
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
     rows = {one.quantity: one for one in results(evidence(), info, ())}
     scale = fitted().calibration.axes.x.scale_factor
-    # A thousandth of gravity, twice: much more than what the fit leaves open.
+    # A thousandth of gravity, twice: much more than the uncertainty of the fit.
     assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
     assert (
         rows['bias x']

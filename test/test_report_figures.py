@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Holds the figures: legible without colour, with units, and true to the numbers behind them."""
+"""The figures: legible without colour, with units, and equal to the numbers behind them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ import pytest
 from builders import axis_set, calibration, regime_set, rich_calibration, term
 from matplotlib.artist import Artist
 from matplotlib.colors import to_rgb
-from matplotlib.container import ErrorbarContainer
 from report_helpers import evidence, fitted
 
-from thermo_comp.judging.evaluation import history_of
 from thermo_comp.report import figures_bags as of_bags
 from thermo_comp.report import figures_unit as of_unit
 from thermo_comp.report.html import label_text, number
@@ -31,8 +29,8 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 
 def test_bias_and_scale_curves_by_hand():
-    # 3 counts per 10 K in a soak; while it heats at 1 K/min for 10 min, a lag of 600 s is
-    # 10 (1 - exp(-1)) K behind, and weighs 0.3 counts per K; 300 counts per m/s^2.
+    # 3 counts per 10 K in a soak; after heating at 1 K/min for 10 min a lag of 600 s is 10 (1 -
+    # exp(-1)) K behind, with a weight of 0.3 counts per K; 300 counts per m/s^2.
     static, dynamic = (
         regime_set(*[axis_set((0.0, 0.3), (1.0, 7e-5), delta=delta)] * 3, rate_range_k_min=(0, 2))
         for delta in (0.0, 0.5)
@@ -52,28 +50,10 @@ def test_bias_and_scale_curves_by_hand():
     assert heating.value[:, 0] == pytest.approx((0.3 * t + 0.5 + 0.3 * behind) * count)
     assert heating.value[:, 2] == pytest.approx((0.3 * t + 0.5) * count)
     assert heating.value[:, 4] == pytest.approx(70.0 * t + behind)
-    minutes, bias, scale = of_unit.step_answer(one)
-    left = np.exp(-minutes / 10.0)
-    assert bias[:, 0] == pytest.approx(0.3 * left * count)
-    assert scale[:, 1] == pytest.approx(left, abs=1e-9)
-    assert not bias[:, 1:].any()
-
-
-def test_hysteresis_loop_by_hand():
-    # 3 counts per kelvin of a play of 2 K: it is pushed from one end to the other within 4 K.
-    one = calibration(response=(term('play', (3.0, 0.0, 0.0), width_k=2.0),))
-    temperature, heating, cooling = of_unit.hysteresis_loop(one)
-    count = 1.0 / 300.0 / MICRO_G
-    lower, upper = one.static.temperature_range_c
-    up = np.maximum(2.0 - (temperature - lower), -2.0)
-    down = np.minimum(-2.0 + (upper - temperature), 2.0)
-    assert heating[:, 0] - cooling[:, 0] == pytest.approx(3.0 * (up - down) * count)
-    assert np.abs(heating - cooling)[len(temperature) // 2, 0] == pytest.approx(12.0 * count)
-    assert heating[:, 1:] == pytest.approx(cooling[:, 1:])
 
 
 def test_a_soak_measures_what_the_calibration_lacks():
-    # A scale that is wrong by 30 ppm in all soaks, in whatever direction gravity is.
+    # A scale that is wrong by 30 ppm in all soaks, in any direction of gravity.
     windows = evidence().windows
     up = np.array([one.up for one in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
@@ -82,7 +62,7 @@ def test_a_soak_measures_what_the_calibration_lacks():
     assert len(temperature) >= len(wrong.positions)
     bias, scale = errors[:, :3], errors[:, 3:]
     known = np.isfinite(scale)
-    assert known.any(axis=1).all()  # of three axes one has more than half of gravity
+    assert known.any(axis=1).all()  # one of three axes has more than half of gravity
     assert scale[known] == pytest.approx(30.0, rel=1e-4)
     assert np.linalg.norm(bias, axis=1) == pytest.approx(30.0, rel=1e-4)
 
@@ -96,7 +76,8 @@ def test_metres_of_a_navigator_by_hand():
 def test_map_of_the_sphere_keeps_areas():
     assert of_bags.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert of_bags.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 degrees is 1 - sin 45 of a hemisphere, so is its disc of the unit disc.
+    # The cap above 45 degrees is 1 - sin 45 of a hemisphere, and its disc the same part of the
+    # unit disc.
     x, y = of_bags.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
@@ -121,10 +102,8 @@ def test_trace_without_a_case_sensor_follows_the_board():
     assert any(stretch.regime == Regime.DYNAMIC for stretch in shown.stretches)
 
 
-def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
-    """Give what a reader without colours tells lines apart by: dashes, marker, darkness."""
-    if isinstance(line, ErrorbarContainer):
-        line = line.lines[0]
+def look(line: Artist) -> tuple[object, ...]:
+    """Return what distinguishes lines without colour: dashes, marker, darkness."""
     dashes, colour = line._unscaled_dash_pattern, line.get_color()
     marker = f'{line.get_marker()} {line.get_markerfacecolor()}'
     darkness = round(float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))), 1)
@@ -141,21 +120,16 @@ def look(line: Artist | ErrorbarContainer) -> tuple[object, ...]:
         of_unit.draw_functions,
         of_bags.draw_positions,
         of_bags.draw_every_position,
-        of_unit.draw_step,
-        of_unit.draw_hysteresis,
-        of_unit.draw_history,
     ],
 )
 def test_figures_are_legible_in_black_and_white(draw):
-    known = evidence().calibration
-    older = replace(known, provenance=replace(known.provenance, created='2020', sources=()))
     with drawing():
-        figure = draw(replace(evidence(), history=history_of([known, older])))
+        figure = draw(evidence())
         figure.draw_without_rendering()
         for axes in figure.axes:
             looks = [look(line) for line in axes.get_legend_handles_labels()[0]]
             assert len(set(looks)) == len(looks)
-            # Whatever is drawn over time or temperature carries a unit.
+            # Axes over time or temperature have a unit.
             if axes.axison and axes.get_ylabel():
                 assert any(
                     unit in axes.get_ylabel()
@@ -201,7 +175,7 @@ def test_rates_are_those_of_the_gyroscope():
         celsius, drawn = np.array(soak.get_data(), dtype=float)
         bias = np.degrees(curve.bias_function.value(celsius - 20.0)) * 1e3
         slope = np.polyfit(celsius, bias, 1)[0]
-        # To rounding; nothing of it in micro-g.
+        # Equal to rounding; no value in micro-g.
         np.testing.assert_allclose(drawn, bias - slope * (celsius - 20.0), atol=1e-9)
         assert f'{slope:+.3g}'.replace('-', '\u2212') in axes.get_title(loc='left')
     names = [one.name for one in figures_of(replace(evidence(), calibration=unit))]

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The full fit looks at its rests: a jump in any bag stops it, one attitude does, motion does not.
-"""
+"""The fit checks its rests: a jump in any bag stops it, a single attitude or motion does not."""
 
 from __future__ import annotations
 

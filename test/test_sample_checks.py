@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Samples that are none: stuck, zero, too fast, of another unit; stream = batch about all of them.
+Invalid samples (stuck, zero, too fast, of another unit) are treated alike in streams and blocks.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def run(compensator, events):
 
 
 def recording(n, rate_hz, sample, start_ns=0):
-    """Events of n samples, sample(k) giving the k-th, with both temperatures at 1 Hz."""
+    """Make events of n samples, sample(k) being the k-th, with both temperatures at 1 Hz."""
     events = []
     second = start_ns // SECOND_NS
     for k in range(n):
@@ -72,10 +72,10 @@ def recording(n, rate_hz, sample, start_ns=0):
 
 def test_a_converter_that_stands_still_is_not_believed_for_long(rng):
     compensator = Compensator(calibration())
-    stuck = (1060.0, -1400.0, 2354.0)  # 12 counts from where the live ones are
+    stuck = (1060.0, -1400.0, 2354.0)  # 12 counts from the other samples
     events = recording(1500, 100.0, lambda k: stuck if 200 <= k < 1200 else at_rest(rng))
     stamps, _ = run(compensator, events)
-    # Two seconds of them go out: until then it may be chance.
+    # Equal samples are published for two seconds, as they may be equal by chance.
     assert compensator.counters.n_stuck == 1000 - 201
     assert compensator.counters.n_out == 1500 - compensator.counters.n_stuck
     # The first sample that differs is published at once.
@@ -97,8 +97,8 @@ def test_few_equal_samples_are_chance_however_long_they_take(rng):
 )
 @settings(max_examples=300, deadline=None)
 def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_values):
-    # Runs of equal samples, each of one value that differs from its neighbours' in one axis; with
-    # few values samples far from each other are equal by chance.
+    # Runs of equal samples, whose value differs from the next run's in one axis; with few values
+    # distant samples are equal by chance.
     values = np.repeat(np.arange(len(lengths)) % n_values, lengths)
     samples = np.stack([values * (k == values % 3) for k in range(3)], axis=1) + 1.0
     stamps = np.arange(len(values), dtype=np.int64) * 20_000_000
@@ -120,7 +120,7 @@ def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_v
         begin = end
     assert found == expected
     assert many.n_same == one.n_same
-    np.testing.assert_array_equal(many.run, one.run)  # equal_nan: none before the first sample
+    np.testing.assert_array_equal(many.run, one.run)  # NaN before the first sample
 
 
 def test_noughts_are_no_measurement_from_the_first_on(rng):
@@ -139,8 +139,9 @@ def test_a_user_may_believe_any_sample():
 
 def test_counts_at_another_rate_are_of_another_scale(rng):
     """
-    WHY: a count is charge per cycle; at 2 kHz a cycle holds a twentieth of that at 100 Hz.
-    WHAT: samples that come faster than conversions can are held back, and let go again later.
+    WHY: a count is the charge of a cycle; a cycle at 2 kHz has a twentieth of that at 100 Hz.
+
+    WHAT: samples faster than the converter are dropped, and accepted again later.
     """
     compensator = Compensator(calibration())
     run(compensator, recording(500, 100.0, lambda _: at_rest(rng)))
@@ -150,12 +151,12 @@ def test_counts_at_another_rate_are_of_another_scale(rng):
     )
     stamps, _ = run(compensator, fast)
     assert compensator.thermal.rate.is_too_fast
-    # Noticed at the first event after the surplus has passed 50 samples: within 1 s.
+    # Detected at the first event after more than 50 surplus samples: within 1 s.
     assert len(stamps) <= 2000
     assert compensator.counters.n_too_fast == 20_000 - len(stamps)
     after, _ = run(compensator, recording(500, 100.0, lambda _: at_rest(rng), 16 * SECOND_NS))
     assert not compensator.thermal.rate.is_too_fast
-    # The surplus is forgiven within a second or two.
+    # The surplus decays within two seconds.
     assert after[-1] == 16 * SECOND_NS + 4_990_000_000
     assert len(after) > 250
 
@@ -181,14 +182,17 @@ def test_an_acceleration_at_another_rate_has_another_noise(rng):
         recording(8000, 400.0, lambda _: tuple(GRAVITY * u + rng.normal(0.0, 1e-3) for u in UP)),
     )
     assert len(rows) == 8000
-    # Four times as fast: a quarter of the time to average in, four times the variance.
+    # Four times as fast: each sample averages over a quarter of the time and has four times the
+    # variance.
     assert rows[-1][3] / rows[0][3] == pytest.approx(4.0, rel=1e-6)
 
 
 def test_a_reversed_axis_is_refused_when_the_platform_stands(rng):
     """
-    WHY: with an axis wired the wrong way round every number is wrong, and looks like one.
-    WHAT: |f| misses gravity by twice the bias; nothing goes out until it is gravity again.
+    WHY: with an axis wired with the wrong sign every number is wrong but plausible.
+
+    WHAT: |f| misses gravity by twice the bias; nothing is published until |f| equals gravity
+    again.
     """
     bias = 60.0  # 0.2 m/s^2
     unit = calibration(axes=Axes(*[AxisReference(K, bias)] * 3))
@@ -201,7 +205,7 @@ def test_a_reversed_axis_is_refused_when_the_platform_stands(rng):
 
     stamps, _ = run(compensator, recording(9000, 100.0, sample))
     published = np.array(stamps) / SECOND_NS
-    # One probe a second, five to a window, three windows and those cut by the change: some 25 s.
+    # One probe a second, five per window, three windows and those cut by the change: about 25 s.
     assert not ((published > 46.0) & (published < 60.0)).any()
     assert ((published > 76.0) & (published < 90.0)).any()
     assert compensator.counters.n_refuted > 1400
@@ -214,8 +218,8 @@ def test_gravity_is_that_of_the_place_or_of_the_calibration(rng):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
         run(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
         gravity = compensator.status().gravity
-        # 0.3 counts of noise, 0.29 of rounding: 1.4 mm/s^2 per probe, some 110 probes; and the
-        # fractions of a count that noise this small does not average out, a tenth of 0.5.
+        # 0.3 counts of noise and 0.29 of rounding: 1.4 mm/s^2 per probe, about 110 probes; and
+        # fractions of a count that this noise does not average, a tenth of 0.5.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
 
 
@@ -231,14 +235,14 @@ def test_a_long_excess_is_soon_forgiven():
     assert watch.is_too_fast
     for second in range(100, 103):
         watch.update(2000 * 99 + 100 * (second - 99), second * SECOND_NS)
-    # Down from twice the allowance at (1.5 - 1) of 100 samples per second.
+    # Decays from twice the allowance by (1.5 - 1) of 100 samples per second.
     assert BURST_SAMPLES <= (LARGEST_RATE - 1.0) * 100 * 2
     assert not watch.is_too_fast
 
 
 @st.composite
 def stretches(draw):
-    """Stretches of samples, each of one kind, with temperatures between them."""
+    """Draw stretches of samples of one kind each, with temperatures between."""
     events = []
     stamp_ns = 0
     k = 0

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Plain values to dataclasses: every hint takes what it says and refuses the rest by its key."""
+"""
+Plain values to dataclasses: every type hint accepts its values and refuses others by the key.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,7 @@ class Square:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Something of everything."""
+    """A value of every kind."""
 
     name: Annotated[str, Bounds(shortest=2, longest=20)]
     shapes: tuple[Circle | Square, ...] = ()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bytes of strangers stay bytes, and the node asks the network for what it needs and no more."""
+"""Bytes from outside stay data, and the node opens only the topics and services of the policy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NODE = 'thermo_comp'
 
 
 def allowed() -> dict[str, set[str]]:
-    """Read the full names that the policy allows, by what may be done with them."""
+    """Read the full names in the policy, by permission."""
     root = ET.parse(ROOT / 'config' / 'policy.xml').getroot()  # noqa: S314 - our own file
     (profile,) = root.iter('profile')
     assert (profile.get('ns'), profile.get('node')) == ('/', NODE)
@@ -63,7 +63,7 @@ BOMB = '\n'.join(
 
 
 def test_metadata_of_a_bag_is_no_bomb(tmp_path: Path) -> None:
-    # WHY: merge keys of aliases multiply, 30 lines of them to 10^28 entries.
+    # WHY: merge keys of aliases multiply: 30 lines of them to 10^28 entries.
     bag = tmp_path / 'bag'
     with BagWriter(bag) as writer:
         writer.write_temperature('temperature/board', [1], [20.0])

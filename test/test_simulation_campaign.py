@@ -1,30 +1,23 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A whole test in memory: the run of the bags, the units of every kind, the physics of their errors.
-"""
+"""A whole test in memory: runs as in a bag, units of every kind, physics of their errors."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from accuracy import corrected_by_truth
 from simulation_helpers import of_part
+from triads import TRIAD_NAMES, SlipEffect, sibling, triad
 
 from thermo_comp.simulation.campaign import PLAN_NAMES, Position, parse_cyclogram, plan
-from thermo_comp.simulation.drift import FlowEffect, PartHistory, SlipEffect
-from thermo_comp.simulation.presets import TRIAD_NAMES, unit_preset
+from thermo_comp.simulation.drift import FlowEffect, PartHistory
 from thermo_comp.simulation.run import arrays, simulate
 from thermo_comp.simulation.unit import SwitchedLoad, UnitModel
 from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
-from accuracy import corrected_by_truth
 
 PROGRAM = parse_cyclogram('20 10min, 30@1 20min, 24@0.5 10min')
 STATION = Position(PROGRAM, np.array([0.48, -0.6, 0.64]))
@@ -38,7 +31,7 @@ def _history(temperature: Floats, step: float = 1.0) -> PartHistory:
 
 @pytest.mark.parametrize('kind', ['own-lags', 'switched-load', 'slow-noise', 'convection'])
 def test_a_record_is_the_run_of_a_bag(kind: str) -> None:
-    unit = unit_preset(kind, 1)
+    unit = triad(kind, 1)
     _, record = arrays(unit, [STATION, STATION], 3)
     run = simulate(unit, PROGRAM, STATION.up, rate_hz=4.0, seed=3001, start_ns=0)
     np.testing.assert_array_equal(record.counts, run.counts)
@@ -52,8 +45,8 @@ def test_a_record_is_the_run_of_a_bag(kind: str) -> None:
 
 @pytest.mark.parametrize('kind', TRIAD_NAMES)
 def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
-    """The floor that every table is held against: 0.65 ug of |g| over 60 s, 1.12 of the vector."""
-    unit = unit_preset(kind, 2)
+    """The floor of every accuracy table: 0.65 ug of |g| over 60 s, 1.12 ug of the vector."""
+    unit = triad(kind, 2)
     errors, norms = [], []
     for record in arrays(unit, plan('held-out', 2), 7):
         found = corrected_by_truth(record) / MICRO_G
@@ -61,17 +54,18 @@ def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
         norms.append(np.linalg.norm(found, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # The walk's mean square over 7.3 h is 9 * 7.3 / 2 per axis; three runs scatter widely.
+        # The mean square of the walk over 7.3 h is 9 * 7.3 / 2 per axis; three runs scatter
+        # widely.
         assert 4.0 < vector < 20.0
     else:
-        # 1311 means: 2 % and 1.2 %, five of each.
+        # 1311 means scatter by 2 % and 1.2 %; five of each.
         assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
         assert vector == pytest.approx(1.12, abs=0.07)
 
 
 def test_siblings_are_near_and_not_the_same() -> None:
-    unit = unit_preset('between', 1)
-    first, again, second = (unit.sibling(seed) for seed in (1, 1, 2))
+    unit = triad('between', 1)
+    first, again, second = (sibling(unit, seed) for seed in (1, 1, 2))
     assert first == again
     assert first.serial != second.serial
     for other in (first, second):
@@ -103,7 +97,7 @@ def test_plans_are_what_their_names_say() -> None:
         ups = np.array([p.up for p in plan(name, 1)])
         np.testing.assert_allclose(np.linalg.norm(ups, axis=1), 1.0)
         assert np.any(ups != np.array([p.up for p in plan(name, 2)]))
-    # No axis of a bench tumble's chamber positions sees one gravity only.
+    # In the chamber positions of a bench tumble no axis has the same gravity throughout.
     assert np.ptp(np.array([p.up for p in plan('tumble-3', 1)][18:]), axis=0).min() > 0.5
     fitted = np.array([p.up for p in plan('chamber-18', 1)])
     held_out = np.array([p.up for p in plan('held-out', 1)])
@@ -113,17 +107,17 @@ def test_plans_are_what_their_names_say() -> None:
 
 
 def test_a_joint_that_slips_goes_round_a_loop() -> None:
-    """Rate-independent: the way back differs from the way there, and time does not matter."""
+    """Independent of the rate: the way back differs from the way there, and time has no effect."""
     there_and_back = np.concatenate([np.linspace(0, 5, 200), np.linspace(5, 0, 200)])
     for is_gradual in (False, True):
         effect = SlipEffect('a', 1.0, is_gradual, bias=(2.0, 0.0, 0.0))
         quick, _ = effect.change(_history(there_and_back))
         slow, _ = effect.change(_history(np.repeat(there_and_back, 7), 60.0))
         np.testing.assert_array_equal(slow[::7], quick)
-        # It gives way at its width, each way.
+        # It slips at its width in each direction.
         assert quick[199, 0] == pytest.approx(2.0, rel=0.01)
         assert quick[-1, 0] == pytest.approx(-2.0, rel=0.02)
-        # Once round once more closes the loop.
+        # A second cycle closes the loop.
         twice, _ = effect.change(_history(np.concatenate([there_and_back] * 2)))
         assert twice[-1, 0] == pytest.approx(quick[-1, 0], rel=0.02)
 
@@ -146,8 +140,8 @@ def test_a_limited_flow_is_a_matter_of_on_and_off() -> None:
 
 
 def test_a_switched_load_heats_its_part() -> None:
-    """By what the heat balance of an endless spell says, and not before it is on."""
-    unit = unit_preset('own-lags', 1)
+    """The warming equals the heat balance of an endless spell, and is zero before it is on."""
+    unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
     loaded: UnitModel = replace(unit, load=load)

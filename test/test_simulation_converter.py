@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The charge-balancing converter: nothing lost, nothing that depends on blocks."""
+"""The charge-balancing converter: no charge is lost, and no result depends on blocks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_sum_of_counts_is_the_integral_within_one_count(rng: np.random.Generator
     charge = rng.uniform(-3000.0, 3000.0, (200_000, 3))
     start = first_charge(7)
     counts, _ = balanced(charge, start)
-    # At every instant, not only at the end; 1e-6 is the rounding of the float sum here.
+    # At every cycle, not only at the end; 1e-6 is the rounding of the float sum here.
     short = np.cumsum(charge, axis=0) + start / 2.0**40 - np.cumsum(counts, axis=0)
     assert short.min() > -1e-6
     assert short.max() < 1.0 + 1e-6
@@ -23,8 +23,9 @@ def test_sum_of_counts_is_the_integral_within_one_count(rng: np.random.Generator
 
 def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing() -> None:
     """
-    WHY: a float running sum of 1e9 counts has no digits left for the fraction. WHAT: whole and
-    fraction are kept apart, so a day ends on the exact count.
+    WHY: a float sum of 1e9 counts has no digits left for the fraction.
+
+    WHAT: integer and fraction are separate, so that a day ends at the exact count.
     """
     charge = np.full((400_000, 1), 2978.0 + 1.0 / 3.0)
     remainder = np.zeros(1, dtype=np.int64)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The chamber's program: presets and the user's own list."""
+"""The chamber's program: ready-made ones and those typed by the user."""
 
 from __future__ import annotations
 

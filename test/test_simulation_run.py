@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated run: its columns follow its truth, its seeds, and nothing else."""
+"""The columns of a simulated run depend on its truth and its seeds only."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_blocks_are_the_whole_bit_for_bit(name: str, block_size: int) -> None:
         np.testing.assert_array_equal(
             _joined(blocks, column, is_truth=True), getattr(whole.truth, column)
         )
-    # Readings stand in the block whose cycles they fall among.
+    # A reading is in the block that contains the cycle of its time.
     for block in blocks[:-1]:
         assert block.board_stamp_ns[-1] <= block.accel_stamp_ns[-1]
 
@@ -91,7 +91,7 @@ def test_one_noisy_axis_leaves_the_others_exactly_equal(unit: UnitModel) -> None
 
 def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None:
     """
-    Noise of the thermometer leaves the rest; a drifting bias comes on top of the same white noise.
+    Noise of the thermometer does not change the rest; a drifting bias is added to the same noise.
     """
     plain = simulate(unit, SHORT, UP)
     noisy = simulate(replace(unit, board=replace(unit.board, noise_sd=0.05)), SHORT, UP)
@@ -103,7 +103,7 @@ def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None
         plain.truth.scale - 1.0
     ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
-    # Two converters with the same starting phase: each within one count of its own integral.
+    # Two converters with the same starting phase: each is within one count of its integral.
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
@@ -136,13 +136,16 @@ def test_axes_permute() -> None:
     one, two = simulate(a, SHORT, UP), simulate(b, SHORT, UP[order])
     np.testing.assert_array_equal(one.truth.bias[:, order], two.truth.bias)
     np.testing.assert_array_equal(one.truth.scale[:, order], two.truth.scale)
-    # Each channel's integrator starts with its own charge: sums differ by less than a count.
+    # The integrator of each channel starts with a separate charge: sums differ by less than a
+    # count.
     sums = np.cumsum(one.counts[:, order] - two.counts, axis=0)
     assert np.abs(sums).max() <= 1
 
 
 def test_counts_follow_the_truth(unit: UnitModel) -> None:
-    """Without noise the running sum of the counts is that of ``bias + K scale inverse(M) f``."""
+    """
+    Without noise the running sum of the counts equals that of ``bias + K scale inverse(M) f``.
+    """
     run = simulate(noiseless(unit), DEMO, UP, rate_hz=50.0)
     truth = run.truth
     s = truth.specific_force @ np.linalg.inv(unit.M).T
@@ -161,14 +164,14 @@ def test_white_noise_has_its_density(unit: UnitModel) -> None:
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
-    # The converter carries its remainder, so its own noise rises with f^2: 1 (ug)^2/Hz at 0.4 Hz.
+    # The converter carries its remainder, so that its noise rises with f^2: 1 (ug)^2/Hz at 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
     # 128 lines of 87 half-overlapping averages scatter by 1 %.
     np.testing.assert_allclose(
         power[band].mean(axis=0), 2.0 * np.array(unit.noise_density) ** 2, rtol=0.05
     )
     means = accel.reshape(-1, 3000, 3).mean(axis=1)
-    # 240 means: 4.6 % of scatter in a standard deviation, three of them.
+    # The standard deviation of 240 means scatters by 4.6 %; three of these.
     np.testing.assert_allclose(
         means.std(axis=0), np.array(unit.noise_density) / np.sqrt(60.0), rtol=0.15
     )
@@ -193,7 +196,8 @@ def test_thermometers_have_their_rate_and_noise(unit: UnitModel, rate_hz: float)
         (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, of_part(run.truth, 'case')
     )
     error = run.case - true
-    # 540 readings at the least of 5 mK: the mean to 0.2 mK, the deviation to 3 %; five of each.
+    # At least 540 readings of 5 mK: the mean is good to 0.2 mK, the deviation to 3 %; five of
+    # each.
     assert error.mean() == pytest.approx(0.0, abs=1.1e-3)
     assert error.std() == pytest.approx(0.005, rel=0.16)
 
@@ -203,8 +207,8 @@ def test_thermometers_have_their_rate_and_noise(unit: UnitModel, rate_hz: float)
 )
 def test_positions_tell_the_nine_terms_apart(n: int, least: float) -> None:
     """
-    Six faces leave the products of axes to the few degrees of a hand; from nine positions on all
-    terms of a quadric (bias, scale, misalignment) are seen, with the evenness of their number.
+    Six faces determine the products of axes only by their tilts of a few degrees; nine and more
+    positions determine all terms of a quadric (bias, scale, misalignment).
     """
     up = positions(n, 5)
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermal network against hand-solved cases, an integrator and its own heat balance."""
+"""The thermal network against cases solved by hand, an integrator and its heat balance."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from triads import TRIAD_NAMES, unit_of
 
 from thermo_comp.simulation.campaign import parse_cyclogram
 from thermo_comp.simulation.drift import CreepEffect, PartHistory
 from thermo_comp.simulation.network import AIR, Link, ThermalNetwork, ThermalResponse
 from thermo_comp.simulation.presets import UNIT_NAMES, unit_preset
 
-# Solved in closed form, so only rounding remains; temperatures are tens of degrees.
+# Both are closed forms, so only rounding differs; temperatures are tens of degrees.
 ROUNDING = 1e-9
 
 
@@ -38,7 +39,7 @@ def test_one_part_follows_a_ramp_as_the_textbook_says() -> None:
 
 def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
     """
-    Air - case - board with back-loading: eigenvalues from the quadratic formula, lags from the
+    Air - case - board with heat flow back: eigenvalues from the quadratic formula, lags from the
     heat balance of an endless ramp, amplitudes from the start at rest.
     """
     c0, c1, g0, g1, rate = 700.0, 300.0, 3.0, 0.4, 1.0 / 60.0
@@ -48,7 +49,7 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
     trace, determinant = -(g0 + g1) / c0 - g1 / c1, g0 * g1 / (c0 * c1)
     root = math.sqrt(trace * trace - 4.0 * determinant)
     modes = np.array([(trace + root) / 2.0, (trace - root) / 2.0])
-    # In a ramp the path to the air feeds both capacities, the inner path the board's.
+    # In a ramp the path to the air heats both capacities, the inner path the board's.
     lag = np.array([(c0 + c1) / g0, (c0 + c1) / g0 + c1 / g1])
     shapes = np.array([modes + g1 / c1, [g1 / c1, g1 / c1]])
     amplitude = np.linalg.solve(shapes, lag)
@@ -60,9 +61,9 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
     np.testing.assert_allclose(response.temperatures(time), expected, atol=ROUNDING)
 
 
-@pytest.mark.parametrize('name', UNIT_NAMES)
+@pytest.mark.parametrize('name', [*UNIT_NAMES, *TRIAD_NAMES])
 def test_presets_agree_with_a_numerical_integrator(name: str) -> None:
-    unit = unit_preset(name, 3)
+    unit = unit_of(name, 3)
     program = parse_cyclogram('demo')
     response = response_of(unit.network, program.time_s, program.temperature_c)
     network = unit.network
@@ -83,23 +84,23 @@ def test_presets_agree_with_a_numerical_integrator(name: str) -> None:
         atol=1e-10,
         max_step=60.0,
     )
-    # The integrator steps over the corners of the program; that is its error, not ours.
+    # The integrator steps over the corners of the program, which is its error.
     np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
 
 
 def test_creep_relaxes_towards_its_part() -> None:
-    """What creeps after a part that warms by a step lags it by its own exponential."""
+    """The creep after a step of a part lags it by its time constant."""
     step = np.full((7201, 1), 10.0)
     step[0] = 0.0
     history = PartHistory(('case',), step, np.zeros(1), 1.0)
     bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
-    # The step itself takes 1 s, 1.4e-4 of the time constant.
+    # The step takes 1 s, 1.4e-4 of the time constant.
     np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)
     np.testing.assert_array_equal(scale, 0.0)
 
 
 def test_still_state_obeys_the_heat_balance() -> None:
-    """With everything settled all power leaves through the air's path and nothing changes."""
+    """In the steady state all power leaves through the path to the air."""
     unit = unit_preset('bare-quartz', 5)
     warm = unit.network.equilibrium(12.0)
     to_air = next(link for link in unit.network.links if AIR in (link.a, link.b))
@@ -136,7 +137,7 @@ def test_thermostat_holds_its_part_and_spends_what_leaks() -> None:
     program = parse_cyclogram('fast')
     response = response_of(network, program.time_s, program.temperature_c)
     grid = np.arange(0.0, program.duration_s, 30.0)
-    # 30 K outside, 3 K/min: an oven of this class keeps the head to better than 0.2 K.
+    # At 30 K outside and 3 K/min an oven of this class keeps the head within 0.2 K.
     assert np.ptp(response.temperatures(grid)[:, head]) < 0.2
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is a rest: not a flight, with or without a gyroscope; short rests by hand, each of them."""
+"""Rests: none in a flight, with or without a gyroscope; each short rest of a hand-held unit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 
 
 def source(accel, gyro=None) -> FitSource:
-    """Make a bag of samples, without a thermometer."""
+    """Make a bag of samples without thermometers."""
     stamps = START_NS + np.rint(np.arange(len(accel)) * 1e9 / RATE_HZ).astype(np.int64)
     nothing = np.zeros(0)
     imu = None if gyro is None else Imu(gyro)
@@ -39,7 +39,10 @@ def ground(rng, seconds: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def hover(rng, seconds: float, vibration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Thrust about g, a slow sway of some degrees at some deg/s, and what the propellers shake."""
+    """
+    Make a flight: thrust of about g, a slow sway by some degrees at some deg/s, and propeller
+    vibration.
+    """
     time = time_of(seconds)
     tilt = np.radians(3.0) * np.sin(2.0 * np.pi * time[:, None] / np.array((5.0, 7.0)))
     thrust = GRAVITY * (1.0 + 0.03 * np.sin(2.0 * np.pi * time / 11.0))
@@ -59,7 +62,7 @@ def test_a_flight_is_no_rest(rng, with_gyro):
 
 
 def test_a_smooth_flight_is_told_by_its_gyroscope(rng):
-    # Vibration of 15 mg is within what a noisy sensor shows; 4 deg/s is what none does.
+    # A noisy sensor at rest may show 15 mg of vibration, but none shows 4 deg/s.
     accel, gyro = hover(rng, 120.0, vibration=15.0 * MG)
     with pytest.raises(FitError, match='its angular rate is never that of a rest'):
         reduce_bag(source(accel, gyro), OPTIONS)
@@ -93,7 +96,7 @@ def test_a_gyroscope_that_drifts_with_temperature_rests(rng):
 
 
 def by_hand(rng, n_rests: int, rest_s: float, shaky: tuple[int, ...], misalignment: float = 0.0):
-    """Make rests by hand with turns between them; the shaky ones scatter four times as much."""
+    """Make hand-held rests with turns between; the shaky ones scatter four times as much."""
     ups = positions(n_rests, 4)
     matrix = np.eye(3)
     matrix[1, 0] = matrix[2, 1] = misalignment
@@ -116,14 +119,14 @@ def test_each_short_rest_is_found(rng, rest_s, shaky):
     result = fit([source(accel)], OPTIONS)
     assert len(result.positions) == 10
     axes = result.calibration.axes
-    # 350 samples of 3 to 12 mg in each rest: 0.2 to 0.6 mg, over ten of them.
+    # 350 samples of 3 to 12 mg in each rest: 0.2 to 0.6 mg, in ten of them.
     np.testing.assert_allclose([axes.x.bias, axes.y.bias, axes.z.bias], (0.3, -0.2, 0.1),
                                atol=1.5 * MG)  # fmt: skip
     assert result.residuals[-1].fitted.rms < 2.0 * MG
 
 
 def test_motion_does_not_pass_for_a_rest_in_the_scan(rng):
-    # Two more stretches, as quiet as the shaky rests, in which the unit is pushed about.
+    # Two more stretches with the noise of the shaky rests, in which the unit is pushed.
     accel = by_hand(rng, 14, 6.0, (3,), misalignment=5e-3)
     time = time_of(10.0)
     push = GRAVITY * np.array((0.0, 0.6, 0.8)) * 1.04 + 0.0 * time[:, None]
@@ -144,9 +147,9 @@ def test_the_shortest_rest_is_yours_to_say(rng):
 
 
 def test_a_ramp_moves_no_unit_at_rest(rng):
-    # WHY: a quiet unit of 60 ug/K in a ramp of 2 K/min changes by 60 ug from one cell of 30
-    # samples at 1 Hz to the next, 60 times the noise of their means, and has not moved.
-    # WHAT: it is one position; a knock of 0.1 mrad within the ramp still makes it two.
+    # WHY: a quiet unit with 60 ug/K in a ramp of 2 K/min changes by 60 ug between cells of 30
+    # samples at 1 Hz, 60 times the noise of their means, without moving. WHAT: it is one position;
+    # a knock of 0.1 mrad within the ramp still makes two.
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG

@@ -4,15 +4,10 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import ROOT
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
 import strangers
 import strangers_cases as cases
 from strangers_helpers import ATTITUDES, LEVEL, unit

@@ -10,13 +10,10 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, regime_set
-from conftest import ROOT
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
 import strangers
 import strangers_cases as cases
+from builders import axis_set, calibration, regime_set
+from conftest import ROOT
 from strangers_baselines import Minutes, by_drift, by_norm, minutes
 from strangers_helpers import ATTITUDES, LEVEL, ZEROS, unit
 from strangers_limits import LIMITS, Limit, Result, Score, best_baseline, misses, rows_of

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A look at a recording tells what a fit would miss in it."""
+"""A survey of a recording names what a fit would miss."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_a_good_recording(tmp_path: Path) -> None:
     assert result.still_s == pytest.approx(3600.0, abs=15.0)
     board = result.thermometers['board']
     assert (board.lowest, board.highest) == (5.0, 35.0)
-    # 30 K in 20 minutes, and again down.
+    # 30 K in 20 minutes, up and down.
     assert board.steepest_heating_k_min == pytest.approx(1.5, rel=0.01)
     assert board.steepest_cooling_k_min == pytest.approx(-1.5, rel=0.01)
 
@@ -95,7 +95,7 @@ def test_one_direction_only(tmp_path: Path) -> None:
 
 
 def test_a_quantum_is_no_ramp(tmp_path: Path) -> None:
-    # Whole degrees that flip: 1 K within a second is a step of the sensor, not 60 K/min.
+    # Whole degrees that alternate: 1 K within a second is a step of the sensor, not 60 K/min.
     flips = 20.0 + (np.arange(3600) % 2)
     result = survey(tmp_path / 'bag', flips)
     board = result.thermometers['board']

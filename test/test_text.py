@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Text that somebody else chose: shown, never obeyed; a serial is one printable line at every entry.
+Text from outside is shown and never interpreted; a serial is one printable line everywhere.
 
-WHY: serials, topics and metadata of a bag reached the terminal raw, with escape sequences and
-lines that looked like the program's own; a Cyrillic serial ended a command on a latin-1 terminal.
+WHY: serials, topics and metadata of a bag reached the terminal unchanged, with escape sequences
+and lines that looked like the program's; a Cyrillic serial ended a command on a latin-1 terminal.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def test_one_line_is_one_harmless_line(text: str) -> None:
 
 
 def test_an_error_is_one_harmless_line() -> None:
-    # WHY: of what the node prints and logs, other hands wrote paths, keys and topics.
+    # WHY: paths, keys and topics in the node's messages come from outside.
     for error in (
         ThermoCompError(FORGED),
         CalibrationError('cannot be read', FORGED, FORGED),
@@ -154,7 +154,7 @@ def test_any_terminal_can_show_it(
         said = terminal.read()
         assert ('Блок' if encoding == 'utf-8' and not more else r'\u0411') in said
         assert r'not \udcff utf-8.yaml' in said
-    if encoding == 'latin-1':  # one of them as a user has it
+    if encoding == 'latin-1':  # as the user wrote it
         assert r'\u0411' in cli('info', name, PYTHONIOENCODING=encoding).stdout
     absent = cli('info', tmp_path / os.fsdecode(b'no\xff.mcap'), code=1)
     assert r'no\udcff.mcap: ' in absent.stderr

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermal tracker: memory against its closed form, cross-over, lost sensors, restart."""
+"""The thermal tracker: memory against its closed form, blend of sets, lost sensors, restart."""
 
 import math
 
@@ -35,8 +35,8 @@ def test_memory_of_a_ramp_is_the_closed_form(step_s):
     feed(tracker, 20.0 + rate * np.maximum(t - soak_s, 0.0), step_s=step_s)
     end_ns = int(t[-1]) * SECOND_NS
     expected = rate * TAU_S * (1.0 - math.exp(-ramp_s / TAU_S))
-    # The thermometer needs some readings to bend into the ramp: m remembers at most that lag,
-    # tens of mK, of a value of 6.5 K.
+    # The thermometer needs some readings to follow the ramp: m remembers at most that lag, tens of
+    # mK of 6.5 K.
     assert tracker.sample(end_ns)[Layout(LAG).first_lag] == pytest.approx(expected, abs=0.05)
     assert tracker.is_settled(end_ns)
 
@@ -45,7 +45,7 @@ def test_memory_start_is_unknown_and_settles():
     tracker = ThermalTracker(DetectorSettings(), LAG)
     feed(tracker, np.full(10, 20.0))
     assert not tracker.is_settled(10 * SECOND_NS)
-    # 3 K for a lag of an hour are 1.5 K for one of 900 s: 50 mK after 3.4 of them, 3061 s.
+    # 3 K for a lag of an hour are 1.5 K for one of 900 s: 50 mK after 3.4 of these, 3061 s.
     feed(tracker, np.full(5000, 20.0), start_s=10)
     settled_s = TAU_S * math.log(1.5 / MEMORY_SETTLED_SD)
     assert not tracker.is_settled(round((settled_s - 10.0) * 1e9))
@@ -78,7 +78,7 @@ def test_results_do_not_depend_on_the_origin_of_time():
 
 
 def ramp(tracker):
-    """Feed a soak and then a ramp; return the weight at every second of the ramp."""
+    """Feed a soak and a ramp; return the weight at every second of the ramp."""
     soak = np.full(1200, 20.0)
     feed(tracker, soak, soak)
     assert tracker.detector.regime == Regime.STATIC
@@ -116,7 +116,7 @@ def test_lost_case_is_replaced_by_the_boards_rate():
     assert tracker.sample(999 * SECOND_NS)[GRADIENT] == pytest.approx(6.0, abs=0.05)
     feed(tracker, 20.0 + 0.01 * np.arange(1000, 1100), start_s=1000)
     state = tracker.sample(1099 * SECOND_NS)
-    # lag times rate, the closed form of a first-order lag in a ramp.
+    # Lag times rate, the closed form of a first-order lag in a ramp.
     assert state[GRADIENT] == pytest.approx(600.0 * 0.01, abs=0.1)
     assert math.sqrt(state[VAR_GRADIENT]) >= LOST_GRADIENT_RELATIVE_SD * 5.9
 

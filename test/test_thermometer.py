@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermometer against closed-form temperatures: error, honesty, robustness, invariance."""
+"""
+The thermometer against closed-form temperatures: error, claimed variance, outliers, invariance.
+"""
 
 import math
 
@@ -55,7 +57,7 @@ def state(thermometer):
 
 
 def settled(noise=0.001, n=600, **changes):
-    """Return a thermometer after n readings of 20 degC, one a second."""
+    """Return a thermometer after n readings of 20 degC at 1 Hz."""
     thermometer = Thermometer(ThermometerSettings(noise, **changes))
     rng = np.random.default_rng(5)
     run(thermometer, np.arange(n), read(np.full(n, 20.0), noise, 0.0, rng))
@@ -65,7 +67,8 @@ def settled(noise=0.001, n=600, **changes):
 @pytest.fixture(scope='module')
 def errors():
     """
-    Squared errors and variances of all sensors over a soak, a ramp and a soak, three runs each.
+    Return squared errors and variances of all sensors over a soak, a ramp and a soak, three runs
+    each.
     """
     found = {}
     for name, (noise, quantum, dt) in SENSORS.items():
@@ -99,10 +102,10 @@ PARTS = {
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_variances_are_honest(errors, sensor, part):
-    # Mean squared error over claimed variance, 1 when honest. In the soak and in the ramp the
-    # claim contains the bends that might have begun, so it is up to a few times too wide; at the
-    # onset and the end the bend really is there and not yet found. Coarse cells make few
-    # independent errors in three runs, so their mean scatters by a factor of 2.
+    # Mean squared error over claimed variance, ideally 1. In soaks and ramps the claim includes
+    # changes that might have begun, and is up to a few times too large; at the onset and the end
+    # the change is real and not yet detected. Coarse sensors have few independent errors in three
+    # runs: their mean scatters by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -125,8 +128,8 @@ def test_variances_are_honest(errors, sensor, part):
     ],
 )
 def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
-    # Limits at about 1.5 times what was found: the noise averaged over the filter's memory. A
-    # sensor of 1 K steps crosses an edge every two minutes and still knows the rate to 10 %.
+    # Limits at about 1.5 times the measured errors: noise averaged over the filter's memory. A
+    # sensor with steps of 1 K crosses an edge every two minutes and determines the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
@@ -134,27 +137,28 @@ def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
 
 
 def test_cells_beat_taking_the_reading_for_the_temperature(errors):
-    # A stair of 62.5 mK is off by 18 mK rms; edges locate the temperature ten times better.
+    # A staircase of 62.5 mK has an error of 18 mK RMS; edges locate the temperature ten times
+    # better.
     rows = errors['1 mK, 62.5 mK steps']
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < 0.0625 / math.sqrt(12.0) / 5.0
 
 
 def test_a_crossed_edge_locates_the_temperature():
-    # 20 degC reads 20.0 until the temperature passes 20.5: then it is 20.5, not 21.
+    # A reading of 20.0 becomes 21.0 when the temperature passes 20.5: then the estimate is 20.5.
     thermometer = Thermometer(ThermometerSettings(0.01, 1.0))
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0)
     assert thermometer.var_temperature == pytest.approx(1.0 / 12.0, rel=0.2)
     thermometer.update(600 * SECOND_NS, 21.0)
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
-    # the edge is as sharp as the noise and the way within the one second, a few mK
+    # The edge is as precise as the noise and the change within one second, a few mK.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
 def test_an_unchanged_coarse_reading_is_not_an_ever_better_one():
-    # WHY: a cell read a thousand times still only says "within the cell".
-    # WHAT: the claimed sd stays that of a uniform position, 1 / sqrt(12) of a quantum.
+    # WHY: a thousand equal readings still only say "within the cell". WHAT: the claimed sd stays
+    # that of a uniform distribution, 1 / sqrt(12) of a quantum.
     thermometer = Thermometer(ThermometerSettings(0.001, 0.0625))
     for k in range(5000):
         thermometer.update(k * SECOND_NS, 20.0)
@@ -171,7 +175,7 @@ def test_a_constant_without_noise_is_exact():
 
 
 def test_a_straight_line_without_noise_is_found():
-    # The rate begins with an sd of 3 K/min and is measured by 5 mK over minutes.
+    # The rate starts with an sd of 3 K/min and is measured by 5 mK over minutes.
     thermometer = Thermometer(ThermometerSettings())
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0 + 0.01 * k)
@@ -230,7 +234,7 @@ def test_a_blend_has_the_moments_of_the_mixture():
     out, back = mix(*states, 0.25, 0.75)
     np.testing.assert_allclose(back, out, rtol=1e-12)
     mixed = np.concatenate(samples)
-    # 400 000 samples of sds of a few: 1 % of the covariances
+    # 400 000 samples with an sd of a few: 1 % of the covariances.
     np.testing.assert_allclose(out[:3], mixed.mean(axis=0), atol=0.02)
     np.testing.assert_allclose(out[3:], np.cov(mixed.T)[upper], atol=0.1)
 
@@ -259,13 +263,14 @@ def test_a_single_jump_of_40_degrees_is_not_believed():
     assert not thermometer.update(600 * SECOND_NS, 60.0)
     assert thermometer.temperature == before
     assert thermometer.update(601 * SECOND_NS, 20.0)
-    # the noise of one reading, 1 mK, is the scale of what may have moved
+    # The noise of one reading, 1 mK, is the scale of a possible change.
     assert thermometer.temperature == pytest.approx(20.0, abs=0.002)
     assert (thermometer.n_in_row, thermometer.n_restarts) == (601, 0)
 
 
 def test_a_small_jump_counts_less_than_a_reading():
-    # 15 sigma: within five limits of 6 sigma, so it is used, with the influence of one limit.
+    # 15 sigma: within five limits of 6 sigma, so the reading is used with the influence of one
+    # limit.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004
@@ -301,8 +306,8 @@ def test_a_gap_widens_and_a_long_gap_starts_anew():
 
 def test_noise_declared_too_small_is_learnt():
     # WHY: real die sensors scatter by 0.1 K; with 5 mK declared every reading was an outlier.
-    # WHAT: the factor is found within 20 % (chi-square over some 400 readings: 4 %, and the
-    # bending mode takes a share), and the variance is honest.
+    # WHAT: the factor is estimated within 20 % (chi-square over about 400 readings: 4 %, and the
+    # mode of changing rates takes a share), and the variance is right.
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)
     out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))
@@ -337,7 +342,7 @@ def test_extrapolation_is_linear_then_held():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # not knowing whether the ramp went on for the other 55 s
+    # It is unknown whether the ramp continued for the other 55 s.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 
@@ -378,7 +383,7 @@ def test_reset_forgets_the_readings():
     thermometer = settled()
     thermometer.reset()
     assert thermometer.stamp_ns is None
-    assert thermometer.update(0, 30.0)  # older than before: time has jumped back
+    assert thermometer.update(0, 30.0)  # older than the previous one: a jump of time
     assert thermometer.temperature == 30.0
 
 

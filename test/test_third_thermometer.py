@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A third thermometer: found in the bags, fitted, applied by replay, and of use where it sees more.
+A third thermometer is found in the bags, fitted, applied by replay, and improves the result.
 
-The unit's electronics under the lid are switched on and off at random. Neither the board nor the
-case feels that, so what the lid's temperature does to the axes is seen by its own sensor alone.
+The electronics under the lid are switched at random, which board and case do not feel, so that
+only the lid's thermometer explains the effect on the axes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 10min, 40@1 25min, 5@1 25min')
 MICRO_G = STANDARD_GRAVITY * 1e-6
-#: What a kelvin of the lid does to the axes [ug], and what the load adds to it [K].
+#: Effect of a kelvin of the lid on the axes [ug], and warming of the lid by the load [K].
 LID_UG_K = (12.0, -9.0, 15.0)
 LOAD_K = 5.0
 
@@ -70,8 +70,8 @@ def record(path: Path, run: SimulatedRun) -> Path:
 
 def fitted(bags: list[Path]) -> Calibration:
     sources, _ = fit_sources(bags)
-    # The lid's effect is of its temperature now, and the bank of these is a sixth of the whole.
-    groups = ('curve', 'now', 'board')
+    # The effect follows the present temperature of the lid; these columns are a sixth of the bank.
+    groups = ('curve', 'gradient', 'board')
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups)).calibration
 
 
@@ -108,7 +108,7 @@ def test_a_third_thermometer_explains_what_the_others_do_not_see(
         index = np.searchsorted(runs[-1].accel_stamp_ns, corrected.accel_stamp_ns)
         error = corrected.accel - truth.specific_force
         use = truth.cycle_s[index] > 600.0
-        # A minute's means, about their own: neither noise nor constants are what is asked for.
+        # Means of a minute less their mean: noise and constants do not matter here.
         n = int(use.sum()) // 120 * 120
         means = error[use][:n].reshape(-1, 120, 3).mean(axis=1)
         errors[sees_lid] = float(np.sqrt(np.mean(np.var(means, axis=0)))) / MICRO_G
@@ -116,11 +116,11 @@ def test_a_third_thermometer_explains_what_the_others_do_not_see(
         assert judged is not None
         norms = np.linalg.norm(judged.windows.force, axis=1)
         spreads[sees_lid] = float(np.std(norms)) / MICRO_G
-    # The switched load alone is worth this much on the axes together, RMS.
+    # RMS effect of the switched load on the axes.
     switched = float(np.sqrt(np.mean(np.square(LID_UG_K)))) * LOAD_K / 2.0
     assert errors[False] > 0.3 * switched
     assert errors[True] < 0.05 * switched
-    # With the lid's temperature the noise of a minute is what is left.
+    # With the temperature of the lid only the noise of a minute remains.
     noise = float(np.mean(calibration.noise_density_m_s2_sqrt_hz)) / math.sqrt(60.0) / MICRO_G
     assert spreads[False] > 2.0 * noise
     assert spreads[True] < 1.3 * noise

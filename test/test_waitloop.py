@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The one file that leaves rclpy's documented API: these tests fail loudly when rclpy changes."""
+"""The only file that uses undocumented parts of rclpy: these tests fail if rclpy changes them."""
 
 from __future__ import annotations
 
@@ -40,15 +40,8 @@ def node() -> Iterator[Node]:
     context.try_shutdown()
 
 
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
-
-
 class Running:
-    """A loop in a thread; keeps what its raw subscription brings."""
+    """A loop in a thread; stores the data of its raw subscription."""
 
     def __init__(self, node: Node) -> None:
         self.loop = WaitLoop(node)
@@ -115,7 +108,7 @@ def test_messages_come_serialized_in_order_with_their_time(node: Node, peer: Pee
         running.wait_for(lambda: len(running.messages) == 500)
     values = [deserialize_message(data, Vector3Stamped).vector.x for data in running.messages]
     assert values == [float(k) for k in range(500)]
-    # The times order what comes on several subscriptions, so they must be there and rise.
+    # The reception times order several subscriptions, so they must exist and rise.
     assert running.received_ns == sorted(running.received_ns)
     assert running.received_ns[0] > 0
 
@@ -180,7 +173,7 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node: Node, peer: Pee
         flooding = threading.Thread(target=flood, daemon=True)
         flooding.start()
         try:
-            # Not before they flow: a loop that waits for anything serves the rest in any case.
+            # Only while samples flow: a waiting loop serves everything in any case.
             running.wait_for(lambda: len(running.messages) > 100)
             n_ticks = len(ticks)
             ordinary.publish(Bool(data=True))
@@ -189,7 +182,7 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node: Node, peer: Pee
         finally:
             stop.set()
             flooding.join(TIMEOUT)
-    # A reload within 100 ms needs some for itself and some for its client.
+    # A reload within 100 ms, including the time of its client.
     assert OTHERS_PERIOD_NS <= 20_000_000
 
 
@@ -213,7 +206,7 @@ def test_a_regular_call_goes_on_with_and_without_samples(node: Node, peer: Peer)
             publisher.publish(Vector3Stamped())
             running.wait_for(lambda n=n_sent: len(running.messages) == n)
         running.wait_for(lambda: len(called) > n_before and called[-1] == 50)
-        # Another one takes its place, and comes when it is due, not before.
+        # Another timer replaces it, and fires when it is due, not earlier.
         again: list[float] = []
         start = time.monotonic()
 
@@ -235,7 +228,7 @@ def test_a_callback_that_fails_stops_no_samples(node: Node, peer: Peer) -> None:
 
     def fail() -> None:
         failed.append(len(failed))
-        # The middleware's own, and any other.
+        # The middleware's exceptions, and any others.
         raise RCLError('the client went away') if len(failed) % 2 else KeyError('key')
 
     running = Running(node)
@@ -285,7 +278,7 @@ def test_quality_of_service_is_open_to_overrides(node: Node) -> None:
     qos = QoSProfile(depth=7)
     loop.subscribe(Vector3Stamped, 'samples', qos)
     loop.subscribe(Vector3Stamped, 'others', qos)
-    # rclpy writes an override into the profile it is given: another user must not see it.
+    # rclpy writes an override into the given profile, which another user must not see.
     assert qos.depth == 7
     depth = node.get_parameter('qos_overrides./samples.subscription.depth')
     assert depth.value == 7

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Closed-form temperatures behind thermal lags, and sensors that read them, for the tests."""
+"""Closed-form temperatures behind thermal lags, and sensors that read them."""
 
 import numpy as np
 
@@ -14,7 +14,10 @@ BOARD_LAG_S = 600.0
 
 
 def lagged(t, corners, lag):
-    """Response of a first-order lag to a chamber whose rate [K/min] changes at corners [s]."""
+    """
+    Return the response of a first-order lag to a chamber whose rate [K/min] changes at corners
+    [s].
+    """
     out = np.zeros(len(t))
     before = 0.0
     for at, rate in corners:
@@ -25,7 +28,7 @@ def lagged(t, corners, lag):
 
 
 def lagged_twice(t, corners, lag, other):
-    """Let two different lags in a row respond."""
+    """Return the response of two different lags in series."""
     out = np.zeros(len(t))
     before = 0.0
     for at, rate in corners:
@@ -37,19 +40,19 @@ def lagged_twice(t, corners, lag, other):
 
 
 def ripple(t, lag, period, phase=0.0, amplitude=0.1):
-    """Let a lag respond to a chamber's control ripple."""
+    """Return the response of a lag to the ripple of a chamber's control."""
     omega = 2.0 * np.pi / period
     return amplitude / np.hypot(1.0, omega * lag) * np.sin(omega * t + phase)
 
 
 def read(truth, noise, quantum, rng):
-    """White noise, then rounding."""
+    """Add white noise, then round."""
     reading = truth + rng.normal(0.0, noise, len(truth))
     return np.round(reading / quantum) * quantum if quantum else reading
 
 
 def detector_settings(noise, quantum=0.0, lag=LAG_S, **changes):
-    """Shipped defaults for a unit of known lags and sensors."""
+    """Default settings for a unit of known lags and sensors."""
     return DetectorSettings(
         case=ThermometerSettings(noise, quantum, lag_s=lag),
         board=ThermometerSettings(noise, quantum, lag_s=lag + BOARD_LAG_S),

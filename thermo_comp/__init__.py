@@ -9,12 +9,12 @@ Thermal-drift compensation of a three-axis accelerometer, after Golovach (2016).
     out = cal.correct(time_s, counts, board=board, case=case)
     out.specific_force, out.covariance, out.dynamic
 
-This page owns the public names and the conventions; every other docstring relies on them.
+This page owns the public names and the conventions of all other docstrings.
 
 Units
     SI and degrees Celsius. Temperature differences and rates are in K and K/s. A name carries a
-    unit suffix only where its reader has no docstring (file keys, ROS parameters, command-line
-    flags, columns) or where the unit is foreign (`rate_k_min`).
+    unit suffix only where there is no docstring to read (file keys, ROS parameters, command-line
+    flags, columns) or where the unit is another one (`rate_k_min`).
 Counts
     Raw accelerometer outputs are signed counts per conversion cycle: an increment, quantized,
     saturating at the converter's full scale. Where a unit already reports m/s^2, "counts" means
@@ -27,14 +27,15 @@ Temperatures
     ``T_case - T_board``. The case sensor leads, the board sensor lags.
 Regimes
     Static (S = 0) and dynamic (S = 1), decided by a detector with memory; unknown until the
-    detector has seen enough. The static set applies while it is unknown.
+    detector has enough readings. The static set applies while the regime is unknown.
 Frames
     The output frame is fixed by the sensitivity axes: x along the x sensitivity axis, y in the
     plane of the x and y sensitivity axes (the misalignment matrix is lower triangular with a
     unit diagonal).
 Time
-    ``stamp_ns`` integers; a time difference in seconds is always formed from an integer
-    difference, so no result depends on an origin and a stream gives the bits of a batch.
+    ``stamp_ns`` integers. A time difference in seconds is always computed from an integer
+    difference, so that no result depends on the origin of time, and single samples give the same
+    bits as blocks.
 
 References
 ----------
@@ -72,7 +73,7 @@ __all__ = [
     'save',
 ]
 
-# Where public names are at home, so that each is imported only when it is asked for.
+# Modules of the public names; each is imported at its first use.
 _HOMES = {
     'Calibration': 'unit.calibration',
     'Compensator': 'online.compensator',

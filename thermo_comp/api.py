@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way of arrays: a bag read into them, their correction, and a calibration fitted to them.
+Owns the functions for scripts that work on arrays: read a recording, correct, fit a calibration.
 
-Times are seconds since an origin of the caller's, or datetime64. Whatever numpy makes an array of
-will do: lists, columns of pandas, arrays of xarray.
+Times are seconds since any origin, or datetime64. Anything that numpy converts to an array is
+accepted: lists, pandas columns, xarray arrays.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from .recording.topics import Topics
 from .typing import Bools, Floats, Ints
 from .unit.calibration import Calibration
 
-#: A temperature: one value for each sample, or (time_s, value) of readings of their own.
+#: A temperature: one value for each sample, or (time_s, value) with separate times.
 Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
 
 #: `Columns.start_ns` is a multiple of this, so that times count from a whole minute.
 _MINUTE_NS = 60_000_000_000
-_LONGEST_S = 4e9  # farther from their origin than this times are not in seconds [s]
+_LONGEST_S = 4e9  # largest time accepted [s]; larger ones are most likely not in seconds
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
     """
-    A recording as arrays: what `read` gives, and what `fit` takes.
+    A recording as arrays, returned by `read` and accepted by `fit`.
 
     Parameters
     ----------
@@ -47,13 +47,13 @@ class Columns:
     counts : ndarray, shape (n, 3)
         The raw samples: counts per conversion cycle, or m/s^2 from a unit that reports these.
     temperatures : dict of str to (ndarray, ndarray)
-        Of each thermometer, by name, the times since `start_ns` [s] and the readings [degC].
+        Times since `start_ns` [s] and readings [degC] of each thermometer, by its name.
     start_ns : int, optional
-        The stamp that times count from: the whole minute before the first message [ns].
+        Stamp of time 0 [ns]: the whole minute before the first message.
     serial : str or None, optional
-        The unit's, where the recording says it.
+        Serial of the unit, if the recording contains it.
     name : str, optional
-        What messages call the recording.
+        Name of the recording in messages.
 
     """
 
@@ -68,18 +68,18 @@ class Columns:
 @dataclass(frozen=True, eq=False)
 class Corrected:
     """
-    What `Calibration.correct` gives, one row for each sample.
+    Result of `Calibration.correct`, one row for each sample.
 
     Attributes
     ----------
     specific_force : ndarray, shape (n, 3)
         Corrected specific force [m/s^2]; NaN where the node would publish nothing.
     covariance : ndarray, shape (n, 3, 3)
-        Of that sample [m^2/s^4]; NaN as above.
+        Covariance of the specific force [m^2/s^4]; NaN where that is NaN.
     dynamic : ndarray of bool, shape (n,)
         Whether the regime was dynamic; False while it is unknown.
     counters : Counters
-        How many samples and readings were used, and why others were not.
+        Numbers of samples and readings used, and of those dropped for each reason.
 
     """
 
@@ -99,24 +99,24 @@ def correct(
     **sensors: Temperature,
 ) -> Corrected:
     """
-    Correct arrays of samples, with the bits of the node and of ``thermo_comp replay``.
+    Correct arrays of samples; the result equals that of the node and of ``replay`` bit for bit.
 
     Parameters
     ----------
     calibration : Calibration
-        The unit's; ``calibration.correct(time_s, ...)`` is the same.
+        Calibration of the unit; ``calibration.correct(time_s, ...)`` is the same call.
     time_s : array_like, shape (n,)
         Time of each sample, rising: seconds since any origin, or datetime64.
     counts : array_like, shape (n, 3)
         The raw samples, in the calibration's input unit.
     board : array_like, shape (n,), or (array_like, array_like), optional
-        Board temperature [degC]: beside the samples (NaN where it was not read), or as
-        (time_s, value) at times of its own. A reading counts from the first sample not before it.
-        Constants alone need none.
+        Board temperature [degC]: a value for each sample (NaN where there was no reading), or
+        (time_s, value) with separate times. A reading applies from the first sample with an equal
+        or later time. A calibration without temperature functions needs none.
     config : CompensatorConfig or None, optional
         The node's settings.
     **sensors : as `board`
-        The other thermometers that the calibration names: ``case`` in most.
+        The other thermometers that the calibration names, in most of them ``case``.
 
     Returns
     -------
@@ -163,7 +163,7 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
     Returns
     -------
     Columns
-        Samples and readings, in the order of the recording.
+        Samples and readings in the order of recording.
 
     Raises
     ------
@@ -210,18 +210,18 @@ def fit(
     Parameters
     ----------
     recordings : str, Path or Columns, or sequence of them
-        The bags, tables or logs; or arrays with the temperatures ``'board'``, ``'case'`` and any
-        more.
+        Bags, tables or logs, or arrays with the temperatures of ``'board'``, ``'case'`` and any
+        further thermometers.
     gravity : float
         Local gravity [m/s^2].
     **options
-        As the fields of `fitting.FitOptions`: `serial`, `model`, `prior`, ...; `input` is
-        ``'m/s^2'`` for arrays in this unit.
+        Fields of `fitting.FitOptions`: `serial`, `model`, `prior`, ...; for arrays in m/s^2,
+        `input` must be ``'m/s^2'``.
 
     Returns
     -------
     Calibration
-        The unit's; `save` writes its file, `Calibration.correct` applies it.
+        Calibration of the unit; `save` writes it to a file, `Calibration.correct` applies it.
 
     Raises
     ------
@@ -230,7 +230,7 @@ def fit(
     RecordingError
         If a file cannot be read.
     FitError
-        If the data cannot carry a fit, or gravity is none of the Earth's.
+        If the data do not suffice for a fit, or gravity does not occur on Earth.
 
     """
     from .convert.readers import as_bags
@@ -245,7 +245,7 @@ def fit(
             options.setdefault('input', 'counts' if kind == 'counts' else 'm/s^2')
         for one in items:
             if isinstance(one, Columns):
-                # What a fit reads of a thermometer that is not there.
+                # A thermometer that was not recorded has no readings.
                 nothing: Temperature = ([], [])
                 readings = {'board': nothing, 'case': nothing, **one.temperatures}
                 block = _block(one.time_s, one.counts, readings, one.start_ns)
@@ -256,7 +256,7 @@ def fit(
 def _block(
     time_s: npt.ArrayLike, counts: npt.ArrayLike, given: Mapping[str, Temperature], start_ns: int
 ) -> Block:
-    """Check arrays of a caller's; a reading comes just before its sample."""
+    """Check the caller's arrays; a reading is placed just before the sample of its time."""
     stamps = _stamps('time_s', time_s)
     samples = _numbers('counts', counts)
     if samples.shape != (len(stamps), 3):
@@ -264,11 +264,13 @@ def _block(
             f'`counts` must have the shape ({len(stamps)}, 3), a row for each time, '
             f'got {samples.shape}'
         )
-    found = {}
+    readings = {}
     for name, value in given.items():
-        own, celsius = _readings(name, value, stamps, _is_date(time_s))
-        found[name] = Readings(own + start_ns, celsius, np.searchsorted(stamps, own))
-    return Block(stamps + start_ns, samples, '', None, found, {})
+        reading_ns, celsius = _readings(name, value, stamps, _is_date(time_s))
+        readings[name] = Readings(
+            reading_ns + start_ns, celsius, np.searchsorted(stamps, reading_ns)
+        )
+    return Block(stamps + start_ns, samples, '', None, readings, {})
 
 
 def _is_date(value: object) -> bool:
@@ -283,7 +285,7 @@ def _numbers(name: str, value: npt.ArrayLike) -> Floats:
 
 
 def _stamps(name: str, value: npt.ArrayLike) -> Ints:
-    """Turn times into nanoseconds, strictly rising."""
+    """Convert times to nanoseconds; they must rise strictly."""
     given = np.asarray(value)
     if given.ndim != 1:
         raise ValueError(f'`{name}` must have one dimension, got the shape {given.shape}')
@@ -308,17 +310,20 @@ def _stamps(name: str, value: npt.ArrayLike) -> Ints:
 
 
 def _readings(name: str, value: Temperature, stamps: Ints, is_date: bool) -> tuple[Ints, Floats]:
-    """Give stamps and values of a thermometer's readings."""
+    """Return stamps and values of a thermometer's readings."""
     if isinstance(value, tuple) and len(value) == 2:
         if np.size(value[0]) and _is_date(value[0]) != is_date:
-            raise ValueError(f'the times of `{name}` must be of the kind of `time_s`')
-        own = _stamps(f'{name} time_s', value[0])
-        values = _numbers(name, value[1])
-        if values.shape != own.shape:
             raise ValueError(
-                f'`{name}` must have as many values as times, {len(own)}, got {values.shape}'
+                f'the times of `{name}` must be seconds or datetime64, as those of `time_s`'
             )
-        return own, values
+        reading_ns = _stamps(f'{name} time_s', value[0])
+        values = _numbers(name, value[1])
+        if values.shape != reading_ns.shape:
+            raise ValueError(
+                f'`{name}` must have as many values as times, {len(reading_ns)}, '
+                f'got {values.shape}'
+            )
+        return reading_ns, values
     values = _numbers(name, cast('npt.ArrayLike', value))
     if values.shape != stamps.shape:
         raise ValueError(

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the exception tree: everything the world can do wrong, said in one line.
+Owns the exceptions for errors that a user can cause and correct; the message is one line.
 
-A caller's mistake in the numeric core is a plain `ValueError`; the classes here are for what
-comes from outside: files, bags, data that cannot carry a fit. The command line prints
-`str(error)` and nothing else.
+They are raised for files, bags and data that do not suffice for a fit. A caller's mistake in the
+numeric core is a plain `ValueError`. The command line prints `str(error)` and nothing else.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ from .text import one_line
 
 
 class ThermoCompError(Exception):
-    """Any failure that a user can cause and mend; its text is one line: file, key, message."""
+    """An error that a user can correct; its text is one line: file, key, message."""
 
-    # `rule` is for those who may not read the file, where message or key quote one that is none.
+    # `rule` is the message without any content of the file, for a peer that may not read it.
     def __init__(
         self,
         message: str,
@@ -28,7 +27,7 @@ class ThermoCompError(Exception):
     ) -> None:
         self.message, self.key, self.rule = message, key, rule
         self.path = None if path is None else str(path)
-        # A file, a bag or the network may have chosen some of it.
+        # The text may contain control characters from a file, a bag or the network.
         super().__init__(one_line(': '.join(part for part in (self.path, key, message) if part)))
 
 
@@ -45,4 +44,4 @@ class OutputError(ThermoCompError):
 
 
 class FitError(ThermoCompError):
-    """Data that cannot carry the fit asked of it: what is missing, and what to record."""
+    """Data that do not suffice for the fit; the text says what is missing and what to record."""

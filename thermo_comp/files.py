@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns how a file is read within bounds and how an output comes to be, for all that write one.
+Owns the reading of files of limited size, and the writing of all output files.
 
-An output never replaces what the command reads; without `overwrite` it never replaces anything,
-whoever else writes at the same time; with it, only what is of the same kind. It takes its name
-when it is whole. A link is written through: it goes on pointing where it did.
+An output never replaces an input of the same command. Without `overwrite` it replaces no existing
+file, even if another process writes at the same time; with `overwrite`, only a file of the same
+kind. The file gets its final name once it is complete. If the name is a symbolic link, the link
+stays and its target is written.
 """
 
 from __future__ import annotations
@@ -29,15 +30,15 @@ _INDEX = 'metadata.yaml'
 
 @dataclass(frozen=True)
 class Kind:
-    """What an output is: a file known by a pattern in its head, a folder by its files' names."""
+    """The kind of an output: files are recognised by their first bytes, folders by file names."""
 
     name: str
     mark: bytes
     is_folder: bool = False
-    suffixes: tuple[str, ...] = ()  # any, if there are none
+    suffixes: tuple[str, ...] = ()  # accepted suffixes; empty: any
 
     def refusal(self, path: Path) -> str:
-        """Say why what stands under a name is not of this kind; nothing where it is."""
+        """Say why an existing file or folder is not of this kind; empty if it is."""
         if path.is_dir() != self.is_folder:
             return f'it is a {"folder" if path.is_dir() else "file"}'
         if self.is_folder:
@@ -68,7 +69,7 @@ BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z'
 
 
 def bag_kind(path: str | Path, others: str = '') -> Kind:
-    """Tell by the suffix what a bag is to be; `others` is what else may be, for the message."""
+    """Choose the kind of a bag by its suffix; `others` are further suffixes for the message."""
     suffix = Path(path).suffix
     if suffix == '.mcap':
         return MCAP
@@ -80,7 +81,7 @@ def bag_kind(path: str | Path, others: str = '') -> Kind:
 
 
 def shown_name(path: str | Path) -> str:
-    """Give the last part of a path as text that can be written anywhere, UTF-8 or not."""
+    """Return the last part of a path; bytes that are not UTF-8 are replaced."""
     return os.fsencode(Path(path).name).decode('utf-8', 'replace')
 
 
@@ -98,11 +99,11 @@ def open_regular(path: str | Path) -> BinaryIO:
 
 def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> bytes:
     """
-    Read a regular file; ValueError if it is larger than `limit` bytes, PermissionError if what was
-    opened lies outside of the folder `within`, OSError as above.
+    Read a regular file. ValueError if it is larger than `limit` bytes, PermissionError if it lies
+    outside of the folder `within`, OSError as in `open_regular`.
     """
     with open_regular(path) as file:
-        # Asked of the file itself: links may be exchanged between a look and the opening.
+        # Check the opened file: a link could be exchanged between a check and the opening.
         if within is not None and not _opened(file).is_relative_to(within):
             raise PermissionError(errno.EPERM, 'outside of its folder', str(path))
         size = os.fstat(file.fileno()).st_size
@@ -121,7 +122,7 @@ def _opened(file: BinaryIO) -> Path:
 def check_output(
     path: str | Path, kind: Kind, *, overwrite: bool = False, others: Iterable[str | Path] = ()
 ) -> None:
-    """Refuse an output before any work is done for it, `others` being never replaced."""
+    """Refuse an output that must not be written; `others` are files that it must not replace."""
     target = Path(os.path.realpath(path))
     for other in others:
         if _overlaps(target, Path(os.path.realpath(other))):
@@ -133,7 +134,7 @@ def check_output(
     if target.exists():
         if not overwrite:
             raise OutputError('exists already; --force overwrites it', path)
-        with _told(path):
+        with _output_errors(path):
             refusal = kind.refusal(target)
         if refusal:
             raise OutputError(f'is not replaced: {refusal}', path)
@@ -146,7 +147,7 @@ def check_output(
 
 
 class Draft:
-    """An output in the making: it stands under a hidden name, `partial`, until it is whole."""
+    """An output that is being written, under the hidden name `partial` until it is complete."""
 
     def __init__(self, path: str | Path, kind: Kind, *, overwrite: bool = False) -> None:
         check_output(path, kind, overwrite=overwrite)
@@ -154,14 +155,14 @@ class Draft:
         self._is_replacing = overwrite
         self._target = Path(os.path.realpath(path))
         self.partial = _hidden_sibling(self._target)
-        with _told(path):
+        with _output_errors(path):
             self._target.parent.mkdir(parents=True, exist_ok=True)
             if kind.is_folder:
                 self.partial.mkdir()
 
     def publish(self) -> None:
-        """Give the finished output its name; OutputError if somebody else was first."""
-        with _told(self._path):
+        """Give the complete output its name; OutputError if another process took the name."""
+        with _output_errors(self._path):
             if self.partial.is_dir():
                 _sync(self.partial)
                 self._move_folder()
@@ -176,13 +177,13 @@ class Draft:
                 except FileExistsError:
                     raise
                 except OSError:
-                    # No hard links here, as on FAT: whoever makes the name has it.
+                    # A file system without hard links, such as FAT: reserve the name first.
                     os.close(os.open(self._target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
                     self.partial.replace(self._target)
             _sync(self._target.parent)
 
     def drop(self) -> None:
-        """Remove what was written so far."""
+        """Remove the incomplete output."""
         with suppress(OSError):
             if self.partial.is_dir():
                 shutil.rmtree(self.partial)
@@ -192,7 +193,7 @@ class Draft:
     def _move_folder(self) -> None:
         old = None
         if self._is_replacing and self._target.exists():
-            # Of folders the system replaces none but an empty one.
+            # The operating system only replaces an empty folder.
             old = self._target.rename(_hidden_sibling(self._target))
         try:
             self.partial.rename(self._target)
@@ -206,10 +207,10 @@ class Draft:
 
 @contextmanager
 def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
-    """Give a place to write to; what the block leaves there becomes the output, if it succeeds."""
+    """Give a temporary path to write to; without an exception its content becomes the output."""
     draft = Draft(path, kind, overwrite=overwrite)
     try:
-        with _told(path):
+        with _output_errors(path):
             yield draft.partial
             _sync(draft.partial)
         draft.publish()
@@ -219,7 +220,7 @@ def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterato
 
 
 def write_atomically(path: str | Path, data: bytes, kind: Kind, *, overwrite: bool = True) -> None:
-    """Write a file so that its readers see the old content or the new one, never a part."""
+    """Write a file so that its readers see the old or the new content, never a part of it."""
     with drafted(path, kind, overwrite=overwrite) as partial:
         partial.write_bytes(data)
 
@@ -234,15 +235,15 @@ def _sync(path: Path) -> None:
 
 
 @contextmanager
-def _told(path: str | Path) -> Iterator[None]:
-    """Say which output failed, and not the hidden name, which nobody knows of."""
+def _output_errors(path: str | Path) -> Iterator[None]:
+    """Turn OSError into OutputError, with the output's name instead of the hidden one."""
     try:
         yield
     except OSError as error:
-        said = f'cannot be written: {error.strerror or error}'
+        reason = f'cannot be written: {error.strerror or error}'
         if error.errno in (errno.EEXIST, errno.ENOTEMPTY):
-            said = 'exists already; --force overwrites it'
-        raise OutputError(said, path) from error
+            reason = 'exists already; --force overwrites it'
+        raise OutputError(reason, path) from error
 
 
 def _hidden_sibling(path: Path) -> Path:
@@ -251,16 +252,16 @@ def _hidden_sibling(path: Path) -> Path:
 
 
 def _overlaps(target: Path, other: Path) -> bool:
-    """Say whether a target is, holds or lies in another file, by whatever names and links."""
+    """Whether two paths are the same or one contains the other, also through links."""
     is_within = other in (target, *target.parents) or target in other.parents
     return is_within or not _identities(target).isdisjoint(_identities(other))
 
 
 def _identities(path: Path) -> set[tuple[int, int]]:
-    """Identify a file, or a folder with the files in it."""
-    found = set()
+    """Return device and inode of a file, or of a folder and its entries."""
+    identities = set()
     for one in (path, *(path.iterdir() if path.is_dir() else ())):
         with suppress(OSError):
             status = one.stat()
-            found.add((status.st_dev, status.st_ino))
-    return found
+            identities.add((status.st_dev, status.st_ino))
+    return identities

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns YAML as plain values: mappings, lists, texts, numbers, true, false and null, of bounded size.
+Owns the reading of YAML as plain values: mappings, lists, texts, numbers, true, false and null.
 
-Scalars are those of YAML 1.2, so 1e-05 is a number and `no` is a text. No aliases, so no alias
-bombs; no tags, so no objects; no key twice. One pass over the events of the parser, so no depth
-and no number of nodes is reached before it is refused.
+Scalars are those of YAML 1.2, so 1e-05 is a number and `no` is a text. Aliases are refused, so
+small files cannot expand; tags are refused, so no objects are built; a repeated key is refused.
+The parser's events are read in one pass, so that a too deep or too large file is refused before
+it is built.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from .errors import ThermoCompError
 from .files import read_bounded
 
 DEPTH_LIMIT = 12
-#: Keys, values, lists and mappings: some ten times those of the largest calibration.
+#: Largest number of keys, values, lists and mappings: ten times that of the largest calibration.
 NODE_LIMIT = 20_000
-_FILE_LIMIT = 1 << 16  # what a user writes by hand takes some kB
+_FILE_LIMIT = 1 << 16  # largest file written by hand [bytes]; usual ones have a few kB
 _INTEGER_DIGITS = 20  # digits of the longest integer accepted; a float64 needs no more
 _INTEGER = re.compile(r'[-+]?[0-9]+')
 _FLOAT = re.compile(r'[-+]?(?:(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf)|\.nan')
@@ -33,7 +34,7 @@ _LOADER: type[yaml.SafeLoader] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 class PlainYamlError(ValueError):
-    """A text that is not YAML of plain values; the detail may quote it, the problem does not."""
+    """A text that is not plain YAML; `detail` may quote the text, `problem` does not."""
 
     def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
         where = '' if line is None else f' (line {line})'
@@ -42,7 +43,7 @@ class PlainYamlError(ValueError):
 
 
 def load_plain_yaml(text: str | bytes, node_limit: int = NODE_LIMIT) -> Any:
-    """Read one YAML document of plain values, null of an empty text, or raise PlainYamlError."""
+    """Read one YAML document of plain values (empty text: None); PlainYamlError if it is none."""
     try:
         return _load(text, node_limit)
     except yaml.YAMLError as error:
@@ -55,7 +56,7 @@ def load_plain_yaml(text: str | bytes, node_limit: int = NODE_LIMIT) -> Any:
 
 
 def read_plain_yaml(path: str | Path) -> Any:
-    """Read a small YAML file of a user's; ThermoCompError, which names it, where it is none."""
+    """Read a user's YAML file; a ThermoCompError that names the file if it is not plain YAML."""
     try:
         return load_plain_yaml(read_bounded(path, _FILE_LIMIT).decode())
     except OSError as error:
@@ -67,7 +68,7 @@ def read_plain_yaml(path: str | Path) -> Any:
 
 
 def is_plain_text(text: str) -> bool:
-    """Say whether an unquoted scalar is a text here."""
+    """Whether this reader takes an unquoted scalar as a text."""
     return not (text in _WORDS or _INTEGER.fullmatch(text) or _FLOAT.fullmatch(text))
 
 

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the bounds of every quantity that a calibration is made of: one table, from the physics.
+Owns the table of the physical bounds of every quantity in a calibration.
 
-They lie far beyond any instrument and far within what floating point can carry, so that whatever
-keeps them gives finite numbers. What hangs on a unit's own full scale and temperatures (bias,
-curves, weights, their deviations) is in `unit.reach`.
+The bounds are far wider than any instrument needs and far narrower than the range of a float, so
+that a calibration within them gives finite results. Bounds that depend on the unit's full scale
+and temperature range (bias, curves, weights and their deviations) are in `unit.reach`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, Final
 
 from .text import counted
 
-#: When a bound is kept, and what is said where it is not.
+#: The test of each kind of bound, and the words for it in an error message.
 _RULES: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
     'above': (operator.gt, 'be greater than'),
     'at_least': (operator.ge, 'be at least'),
@@ -34,7 +34,7 @@ _RULES: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
 
 @dataclass(frozen=True)
 class Bounds:
-    """Where a number must lie, or how long a text or a list must be; and what says so."""
+    """Bounds of a number, or of the length of a text or list; `why` gives the reason."""
 
     above: float | None = None
     at_least: float | None = None
@@ -47,14 +47,14 @@ class Bounds:
     why: str = ''
 
     def fault(self, value: Any) -> str | None:
-        """Say what is expected of a value that does not comply."""
+        """Return the violated rule as text, None if the value is within the bounds."""
         is_sized = isinstance(value, str | tuple)
         what = 'character' if isinstance(value, str) else 'number'
-        for name, (is_kept, said) in _RULES.items():
+        for name, (is_kept, rule) in _RULES.items():
             limit = getattr(self, name)
             if limit is not None and not is_kept(len(value) if is_sized else value, limit):
                 shown = counted(limit, what) if is_sized else f'{limit:g}'
-                return f'must {said} {shown}'
+                return f'must {rule} {shown}'
         return None
 
 
@@ -84,7 +84,7 @@ _PREPARED: dict[str, Bounds] = {
     'angular rate': _between(-1e3, 1e3, 'rad/s', '57000 deg/s'),
     # Temperatures.
     'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='0 K; solder melts'),
-    'temperature span': _positive(1e-2, 1273.15, 'K', 'what a thermometer tells apart'),
+    'temperature span': _positive(1e-2, 1273.15, 'K', 'resolution of a thermometer'),
     'temperature rate': _between(-1e5, 1e5, 'K/min', 'a thermal shock is 1e3'),
     'rate span': _positive(1e-6, 2e5, 'K/min', 'a kelvin in two years'),
     'time constant': _positive(1e-3, 1e8, 's', 'a bare wire; three years'),
@@ -92,9 +92,9 @@ _PREPARED: dict[str, Bounds] = {
     # The response.
     'value of a column': _between(-1e10, 1e10, 'of its kind', 'the cube of 1273 K is 2e9'),
     'span of a column': _positive(1e-9, 2e10, 'of its kind', 'a millionth of a rate of 0.1 K/min'),
-    'width': _nil_or(1e-4, 1e4, 'K', 'what a thermometer tells apart; beyond any difference'),
+    'width': _nil_or(1e-4, 1e4, 'K', 'resolution of a thermometer; above any difference'),
     'gradient': _between(-1273.15, 1273.15, 'K', '0 K to where solder melts'),
-    'power': Bounds(at_least=0, at_most=4, why='beyond the third nobody has seen one'),
+    'power': Bounds(at_least=0, at_most=4, why='powers above the third are not observed'),
     # Noise and deviations.
     'noise density': _positive(1e-12, 1e3, 'm/s^2/sqrt(Hz)', 'a thousandth of the best; 100 g'),
     'rate noise density': _positive(1e-12, 1e3, 'rad/s/sqrt(Hz)', 'of the best; 57000 deg/s'),
@@ -103,24 +103,24 @@ _PREPARED: dict[str, Bounds] = {
     'deviation': _up_to(1e4, 'm/s^2', '1000 g: nothing is known'),
     'rate deviation': _up_to(1e3, 'rad/s', '57000 deg/s: nothing is known'),
     'misalignment deviation': _up_to(1.0, 'rad', 'nothing is known'),
-    # What a fit tells of itself, and of its bags.
+    # Results of a fit and numbers of samples.
     'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
-    'number': _up_to(1e15, '', 'a float tells all of them apart'),
-    'log evidence': _between(-1e15, 1e15, '', 'of so many samples'),
+    'number': _up_to(1e15, '', 'exact as a float'),
+    'log evidence': _between(-1e15, 1e15, '', 'sum over at most 1e15 samples'),
     'deviation of a weight': _up_to(1e16, 'of its column', 'the largest full scale'),
     # Thermometers and detector.
-    'reading noise': _positive(1e-6, 1e2, 'K', 'a microkelvin thermometer; none at all'),
-    'quantum': _up_to(1e2, 'K', 'coarser than any'),
+    'reading noise': _positive(1e-6, 1e2, 'K', 'a microkelvin thermometer; a useless one'),
+    'quantum': _up_to(1e2, 'K', 'coarser than any sensor'),
     'ramp': _positive(1e-6, 1e5, 'K/min', 'a kelvin in two years; a thermal shock is 1e3'),
     'false alarms': _positive(1e-12, 1e4, '1/h', 'one in the age of the Earth; three a second'),
-    'ripple': _up_to(1e3, 'K', 'more than any chamber'),
+    'ripple': _up_to(1e3, 'K', 'larger than in any chamber'),
     'dwell': _up_to(1e7, 's', 'four months'),
-    # How much a file may hold of one kind.
+    # Lengths of lists in a file.
     'coefficients': Bounds(shortest=1, longest=12, why='t^11 follows any curve'),
     'knots': Bounds(longest=100, why='ten per ten kelvins'),
-    'columns': Bounds(longest=2000, why='the bank of ten thermometers'),
+    'columns': Bounds(longest=2000, why='all columns of ten thermometers'),
 }
-#: By name; the keys of a calibration take theirs from here.
+#: Bounds by the name of the quantity; the keys of a calibration refer to them.
 QUANTITIES: Final[Mapping[str, Bounds]] = MappingProxyType(_PREPARED)
 
 
@@ -129,12 +129,13 @@ def _bounds_of(cls: type) -> dict[str, tuple[Bounds, ...]]:
     hints = typing.get_type_hints(cls, include_extras=True)
     notes = {name: getattr(hint, '__metadata__', ()) for name, hint in hints.items()}
     return {
-        name: tuple(one for one in own if isinstance(one, Bounds)) for name, own in notes.items()
+        name: tuple(note for note in of_key if isinstance(note, Bounds))
+        for name, of_key in notes.items()
     }
 
 
 def refuse_impossible(value: Any) -> None:
-    """Raise ValueError, with the name of the key, where a dataclass does not keep its bounds."""
+    """Raise ValueError with the name of the key if a field of a dataclass violates its bounds."""
     cls: type = type(value)
     for name, bounds in _bounds_of(cls).items():
         for one in bounds:

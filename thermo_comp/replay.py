@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the offline run of the node: a whole bag through the compensator into another bag.
+Owns the offline run of the node: the correction of a whole bag into another bag or a table.
 
-The same code corrects, block by block instead of sample by sample, and a temperature counts from
-the first sample that stands behind it in the bag: so the values are those, bit for bit, of a node
-that got the bag's messages in this order. Memory is bounded by one block.
+The node's code corrects blocks of samples instead of single samples. A temperature applies from
+the first sample after it in the bag. The result therefore equals, bit for bit, that of a node
+which receives the messages in the order of the bag. Memory is limited to one block.
 """
 
 from __future__ import annotations
@@ -28,39 +28,41 @@ from .files import shown_name
 from .online.batch import CompensatedBlock, process_block
 from .online.compensator import CONTINUED, SWAPPED, Compensator
 from .online.status import CompensatorConfig, Counters
-from .recording.blocks import Block, ImuColumns, Messages, RecordingInfo, Role
+from .recording.blocks import Block, ImuColumns, RecordingInfo, Role
 from .recording.reader import RecordingReader, open_recording
+from .recording.serialized import Messages
 from .recording.topics import Topics
 from .recording.writer import TABLES, BagWriter, WriteRows, table_writer
 from .topics import FLAGS, IMU_OUT, OUTPUTS, TEMPERATURE, thermometer
 from .typing import Ints
 from .unit.calibration import Calibration
 
-# Readings between these quantiles are no glitches; thermometers have this noise [K].
+# Quantiles of the board readings that are compared with the calibrated range, so that single
+# wrong readings do not count; excess [K] that thermometer noise can explain.
 _BULK, _NOISE_K = (0.01, 0.99), 0.1
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """The account of a replay: what came in, what went out, and why some did not."""
+    """Summary of a replay: its input and output, and the numbers of dropped messages."""
 
     info: RecordingInfo
     output: Path
     counters: Counters
     n_flags: int
-    #: The first flag, and each that differs from the one before.
+    #: The first regime flag, and each flag that differs from the previous one.
     switches: list[tuple[int, bool]]
-    #: What the node would warn of: exchanged thermometers, temperatures beyond the calibration.
+    #: Warnings as in the node: exchanged thermometers, temperatures outside the calibrated range.
     notes: list[str]
 
 
-#: Takes a block of a recording, what the compensator made of it, and flags: stamp and regime.
+#: Writes a block of a recording with its corrected samples and regime flags (stamp, is dynamic).
 WriteBlock = Callable[[Block, CompensatedBlock, list[tuple[int, bool]]], None]
 
 
 def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None = None) -> None:
-    """Refuse a calibration that is for another unit (an empty serial is any) or kind of input."""
+    """Refuse a calibration of another unit or input; an empty serial accepts any unit."""
     expected = info.metadata.get('serial', '') if serial is None else serial
     if expected and expected != calibration.unit.serial:
         raise CalibrationError(
@@ -77,7 +79,7 @@ def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None
 
 
 def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
-    """Choose what is read for a calibration: for ``auto``, counts if it is in counts, else Imu."""
+    """Choose the input topics: ``auto`` reads counts for a calibration in counts, else Imu."""
     topics = topics or Topics()
     if topics.input != 'auto':
         return topics
@@ -85,7 +87,7 @@ def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
 
 
 def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
-    """Say what a recording must hold to be corrected: constants need no thermometer."""
+    """Return the roles that a recording must have; constants need no thermometer."""
     return ('accel', 'board') if any(one.needs_temperature for one in calibrations) else ('accel',)
 
 
@@ -104,10 +106,10 @@ def replay(
     progress: Callable[[float], None] | None = None,
 ) -> ReplayResult:
     """
-    Correct a recording and write what the node would publish: a bag, or by its suffix a table.
+    Correct a recording and write what the node would publish, as a bag or (by suffix) a table.
 
-    `keep_inputs` copies the input messages at their stamps; `all_topics` these and every other
-    topic at their log times, but none that bears an output's name.
+    `keep_inputs` also copies the input messages, with their stamps as log times. `all_topics`
+    copies in addition all other topics with their log times, except topics named like an output.
     """
     compensator = Compensator(calibration, config)
     wanted = topics_for(calibration, topics)
@@ -143,22 +145,22 @@ def replay(
         notes = [SWAPPED] if is_swapped else []
         if beyond:
             notes.append(f'board temperature {beyond:+.2f} K {CONTINUED}')
-        counters, told = compensator.counters, switches(flags)
-        return ReplayResult(reader.info, Path(output), counters, len(flags), told, notes)
+        counters, changes = compensator.counters, switches(flags)
+        return ReplayResult(reader.info, Path(output), counters, len(flags), changes, notes)
 
 
 def _beyond(calibration: Calibration, block: Block) -> float:
-    """Say how far a block's board readings, but for glitches, lie beyond all ranges [K]."""
+    """Return how far the board readings lie outside all ranges [K], single outliers ignored."""
     ranges = [one.temperature_range_c for one in calibration.regime_sets()]
     lower, upper = min(one[0] for one in ranges), max(one[1] for one in ranges)
     celsius = block.temperatures['board'].celsius
-    found = np.nanquantile(celsius, _BULK) if np.isfinite(celsius).any() else np.array([lower])
-    excess = float(max(found - np.clip(found, lower, upper), key=abs))
+    bulk = np.nanquantile(celsius, _BULK) if np.isfinite(celsius).any() else np.array([lower])
+    excess = float(max(bulk - np.clip(bulk, lower, upper), key=abs))
     return excess if calibration.needs_temperature and abs(excess) > _NOISE_K else 0.0
 
 
 def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
-    """Keep the first flag (stamp, regime) and each that differs from the one before."""
+    """Keep the first flag (stamp, regime) and each flag that differs from the previous one."""
     return [next(run) for _, run in groupby(flags, key=itemgetter(1))]
 
 
@@ -166,7 +168,7 @@ def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
 def _messages_of(
     bag: BagWriter, reader: RecordingReader, serial: str, frame_id: str, all_topics: bool
 ) -> Iterator[WriteBlock]:
-    """Write blocks as the node's messages, and beside them what was recorded until then."""
+    """Write blocks as the node's messages, with the copied messages in order of time."""
     with bag as writer:
         taken = {topic.name for topic in OUTPUTS}
         taken |= {reader.topics[one].strip('/') for one in reader.topics.keys() - reader.fields}
@@ -199,7 +201,7 @@ def _messages_of(
                 for topic, pack in FLAGS.items():
                     packed = [pack(*flag, serial) for flag in new]
                     writer.write_raw(topic.name, topic.type, times, packed)
-            # Their log time becomes their stamp, as that of the outputs is.
+            # As for the outputs, the log time of a copied input is its stamp.
             for role, messages in block.raw.items():
                 name, kind = reader.topics[role], ''
                 if role in reader.fields:
@@ -215,7 +217,7 @@ def _messages_of(
 
 @contextmanager
 def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
-    """Write blocks as rows, one for each corrected sample."""
+    """Write blocks as rows of a table, one for each corrected sample."""
     regime = 0
 
     def write(block: Block, corrected: CompensatedBlock, flags: list[tuple[int, bool]]) -> None:
@@ -241,7 +243,7 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 
 def _imu_of(block: Block, corrected: CompensatedBlock) -> ImuColumns | None:
-    """Give what goes out beside the force; a rate that is none (-1 in its covariance) stays."""
+    """Return the Imu fields other than the force; a rate with covariance -1 stays unchanged."""
     if block.imu is None:
         return None
     imu = block.imu.take(corrected.index)

@@ -1,29 +1,29 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns how texts are made fit to print: what somebody else chose, and nouns with their number."""
+"""Owns the safe printing of texts from outside, and nouns with their number."""
 
 from __future__ import annotations
 
 import os
 import sys
 
-LONGEST_SERIAL = 64  # a serial stands in file names, parameter files and tables
+LONGEST_SERIAL = 64  # characters; serials are used in file names, parameter files and tables
 
 
 def counted(n: int, noun: str, ending: str = 's') -> str:
-    """Give a number with its noun, as in ``1 window`` and ``2 windows``."""
+    """Return a number with its noun, as in ``1 window`` and ``2 windows``."""
     return f'{n} {noun}{ending * (n != 1)}'
 
 
 def one_line(text: str) -> str:
-    """Return a text as one line that a terminal shows and never obeys: the rest as literals."""
+    """Return a text as one printable line; control characters become escape sequences."""
     if text.isprintable():
         return text
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def hold_standard_streams() -> None:
-    """Open what of the three is closed: no file may get a number that libraries write to."""
+    """Open closed standard streams, so that no other file gets their descriptors 0 to 2."""
     for number, name in enumerate(('stdin', 'stdout', 'stderr')):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)

@@ -19,7 +19,7 @@ TEMPERATURE = 'sensor_msgs/msg/Temperature'
 BOOL = 'std_msgs/msg/Bool'
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 
-#: Types that are a std_msgs/Header and float64 numbers alone: how many numbers.
+#: Number of float64 values of the message types that consist of a std_msgs/Header and float64s.
 N_NUMBERS = {VECTOR3_STAMPED: 3, IMU: 37, TEMPERATURE: 2}
 
 _ENCAPSULATION = b'\0\1\0\0'
@@ -71,7 +71,7 @@ def thermometer(name: str) -> str:
     return f'temperature/{name}'
 
 
-# 2000 samples are 0.2 s at 10 kHz: so many may wait for one wake-up, in and out.
+# Queue of 2000 samples, in and out: 0.2 s at 10 kHz.
 COUNTS = NodeTopic('accel/counts', VECTOR3_STAMPED, 'counts per cycle', 2000, is_reliable=False)
 IMU_IN = NodeTopic(
     'imu/uncompensated',
@@ -107,7 +107,7 @@ STAMPED = NodeTopic(
 )
 STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz, hardware_id = serial', 10)
 
-#: The samples by the value of the parameter `input`; all inputs by their names in `Topics`.
+#: Topics of the samples by the value of the parameter `input`; all inputs by name in `Topics`.
 SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}
 INPUTS = {**SAMPLES, 'board': BOARD, 'case': CASE}
 #: The regime flags with their packers; all topics of the bag that `replay` writes.

@@ -21,7 +21,7 @@ from typer import rich_utils
 from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
-from . import bags, convert, demo, fit, judge, output, record, simulate
+from . import bags, convert, demo, fit, fleet, judge, output, record, simulate
 from .shared_options import expanded, option
 
 # Base class of all errors in a command line, which typer does not export.
@@ -64,8 +64,8 @@ for _command in (
     *(simulate.simulate, demo.demo),
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))
-_fleet = typer.Typer(name='fleet', help='Fit many units, and see what they tell together.')
-_fleet.command('fit')(expanded(fit.fleet_fit))
+_fleet = typer.Typer(name='fleet', help='Fit many units, and compare them.')
+_fleet.command('fit')(expanded(fleet.fleet_fit))
 app.add_typer(_fleet)
 
 

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``fit`` (bags to a calibration), ``prior`` (calibrations to a prior), ``fleet fit``."""
+"""Owns ``fit`` (bags to a calibration) and ``prior`` (calibrations to a prior)."""
 
+import re
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -10,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 
 from ..files import CALIBRATION, PAGE, check_output
-from ..text import counted, one_line
+from ..text import counted
 from . import shared_options as options
 from .convert import flags_named, tell_guess
-from .output import Cell, Output, micro, micro_g, millidegrees, picked
+from .output import Cell, Output, micro_g, millidegrees, picked
 from .shared_options import argument, option
 
 if TYPE_CHECKING:
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from ..fitting import FitResult
     from ..fitting.selection import Trial
 
+#: Largest width of a model in a table [characters].
+_MODEL_WIDTH = 46
 Curve = Literal['linear', 'quadratic', 'cubic', 'spline', 'exponential']
 
 
@@ -64,9 +67,10 @@ def fit(
     misalignment. Parameters that the bags do not determine keep their prior
     and its uncertainty. Local gravity must be given.
 
-    Groups: curve, set, now, board, neighbour, product, mixed, square, even,
-    change, play. A group stays if data that took no part are corrected better
-    with it.
+    Groups: curve, set, gradient, board, gradient_lag, product,
+    gradient_x_temperature, square, gradient_even, gradient_even_about_rest,
+    play. A group is kept if it improves the correction of data left out of
+    the fit.
 
     Example:
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
@@ -151,121 +155,6 @@ def prior(
     save_calibration(found, output, overwrite=force)
     out.line(f'{output}: what {len(units)} units have in common, {len(found.response)} columns')
     out.end(output=output, units=[one.unit.serial for one in units])
-
-
-def fleet_fit(
-    folder: str = argument('DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR'),
-    output: Path = option(
-        'Folder of the results; an earlier run is continued.', ..., '--output', '-o'
-    ),
-    settings: dict[str, Any] = options.fitting,
-    scheduler: str | None = option(
-        'Address of a running Dask scheduler, as tcp://host:8786; default: this machine alone.',
-        metavar='URL',
-    ),
-    workers: int | None = option('Processes on this machine; default: all processors.', min=1),
-    no_certificates: bool = option(
-        'Write no certificates, which halves the work.', False, '--no-certificates'
-    ),
-    with_prior: bool = option(
-        'Fit units with incomplete data again, with the prior of the others.',
-        False,
-        '--with-prior',
-    ),
-    earlier: list[Path] | None = option(
-        'fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'
-    ),
-    topics: Any = options.reading,
-    out: Output = options.out,
-) -> None:
-    """
-    Fit every unit below a folder.
-
-    Each folder of bags is a thermal test of a unit; bags directly in DIR are
-    sorted by the serial in them. Results go to OUT/units, the table to
-    OUT/fleet.parquet and .csv, its statistics to OUT/fleet.html, the prior of
-    the valid units (as by `thermo_comp prior`) to OUT/prior.yaml. A second
-    run only does what is missing or has changed. Exit code 1 if a unit has no
-    valid calibration from all of its bags.
-
-    Example:
-      thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates
-    """
-    from ..fitting import FitOptions
-    from ..fleet.run import fit_fleet
-    from ..fleet.table import read_parquet
-    from ..fleet.work import FleetOptions
-
-    with options.usage_of():
-        wanted = FleetOptions(
-            fit=FitOptions(**settings), topics=topics, certificates=not no_certificates
-        )
-    before = [row for path in earlier or () for row in read_parquet(path)]
-    state = 'no test has begun'
-    with out.progress('fitting') as show:
-
-        def tell(n: int, total: int, _row: object) -> None:
-            nonlocal state
-            state = f'{n} of {counted(total, "test")} done'
-            show(n / total)
-
-        try:
-            result = fit_fleet(
-                folder,
-                output,
-                wanted,
-                with_prior=with_prior,
-                scheduler=scheduler,
-                n_workers=workers,
-                earlier=before,
-                tell=tell,
-            )
-        except KeyboardInterrupt:
-            out.note(f'interrupted: {state}, kept in {output}; the same command does the others')
-            raise
-    summary = result.summary
-    out.table(
-        ('test', 'serial', 'verdict', 'static ug', 'dynamic ug', 'bags'),
-        [
-            (
-                *(_short(row['name']), _short(row['serial']), row['verdict']),
-                *(_micro(row[name]) for name in ('static_ug', 'dynamic_ug')),
-                f'{row["n_bags"]}-{row["n_left_out"]}' if row['n_left_out'] else row['n_bags'],
-            )
-            for row in result.rows
-        ],
-        title='|f| - g at rest, RMS',
-    )
-    out.told((row['name'], str(row['chosen']), None) for row in result.rows)
-    for row in result.rows:
-        # Of a test with a calibration the reservations name the bags left out, too.
-        said = (row['problem'], row['reservations'] or row['left_out'])
-        out.points(f'{row["name"]}: {one}' for one in said if one)
-    out.points(
-        f'{one.name}: {one.label} {one.value:.4g} {one.unit}, median {one.middle:.4g}: '
-        f'{one.z:+.1f} sd'
-        for one in summary.outliers
-    )
-    out.points(
-        f'{one.serial}: {one.worst.constant} changed by {one.worst.change:+.4g} {one.worst.unit} '
-        f'(sd {one.worst.sd:.2g}) from {one.earlier} to {one.later}'
-        for one in summary.drifts
-        if one.is_significant
-    )
-    if result.prior is not None:
-        out.line(f'{result.prior}: what the units that hold have in common')
-    elif with_prior:
-        out.line(f'- fitted without a prior: {result.no_prior}')
-    out.line(
-        f'{result.page}: {result.n_fitted} of {counted(len(result.rows), "test")} calibrated; '
-        f'{counted(result.n_done, "test")} done in this run, '
-        f'{len(result.rows) - result.n_done} in an earlier one'
-    )
-    out.end(
-        int(not result.is_whole),
-        **picked(result, 'rows n_fitted n_done parquet csv page prior'),
-        **picked(summary, 'verdicts outliers drifts'),
-    )
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -366,7 +255,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
 
 
 def _say_models(out: Output, trials: Sequence['Trial']) -> None:
-    """Print what each model leaves on data left out of its fit, and what the columns mean."""
+    """Print the error of each model on data left out of its fit, and explain the columns."""
     columns = {
         'positions': 'drift of an axis in a position left out',
         'sections': 'drift of an axis in a part of the program left out',
@@ -377,17 +266,14 @@ def _say_models(out: Output, trials: Sequence['Trial']) -> None:
     if not kept or len(trials) < 2:
         return
     names = [list(columns)[k] for k in kept]
+    rows: list[tuple[Cell, ...]] = []
+    for one, row in zip(trials, left, strict=True):
+        first, *more = _wrapped(_named(one.groups))
+        mark = '*' if one.is_chosen else '~' if one.is_near else ''
+        rows.append((mark, *(row[k] for k in kept), first))
+        rows += [('', *[''] * len(kept), line) for line in more]
     out.table(
-        ('', *names, 'model'),
-        [
-            (
-                '*' if one.is_chosen else '~' if one.is_near else '',
-                *(row[k] for k in kept),
-                _named(one.groups),
-            )
-            for one, row in zip(trials, left, strict=True)
-        ],
-        title='models compared on data left out of the fit, RMS in ug',
+        ('', *names, 'model'), rows, title='models compared on data left out of the fit, RMS in ug'
     )
     for name in names:
         out.line(f'{name}: {columns[name]}')
@@ -401,8 +287,18 @@ def _named(groups: tuple[str, ...]) -> str:
     return ''.join(f'+{one}' for one in groups[1:])
 
 
+def _wrapped(name: str) -> list[str]:
+    """Break the name of a model before a group, so that the table fits 80 columns."""
+    lines = ['']
+    for part in re.split(r'(?=\+)', name):
+        if len(lines[-1]) + len(part) > _MODEL_WIDTH:
+            lines.append('  ')
+        lines[-1] += part
+    return lines
+
+
 def _model(trial: 'Trial') -> dict[str, Any]:
-    """Say of a model that was looked at what it left on data left out [m/s^2]."""
+    """Return the groups of a compared model, and its error on data left out [m/s^2]."""
     names = ('positions', 'sections', 'norms')
     left_out = {name: folds.rms for name, folds in zip(names, trial.score.kinds, strict=True)}
     return {'groups': trial.groups, 'is_chosen': trial.is_chosen, 'left_out_rms_m_s2': left_out}
@@ -415,19 +311,9 @@ def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> s
 def _steps(
     rows: Iterable[Any], steps: Iterable[str], shown: Callable[[float], str | None], axes: int = 1
 ) -> list[tuple[Cell, ...]]:
-    """Give what each step of the model leaves in each section; the last is a new attitude's."""
+    """Return the residual of each section after each step of the model, and on data left out."""
     return [
         (row.section, row.fitted.n // axes, *(shown(getattr(row, x).rms) for x in steps))
         for row in rows
         if row.fitted.n
     ]
-
-
-def _micro(value: object) -> str | None:
-    return micro(value) if isinstance(value, float) else None
-
-
-def _short(name: object) -> str:
-    """Keep the end of a long name, which tells units apart, so that the table fits 80 columns."""
-    clean = one_line(str(name))
-    return clean if len(clean) <= 22 else f'~{clean[-21:]}'

@@ -162,7 +162,7 @@ def aligned(head: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''
     cells = [[text(cell) for cell in row] for row in rows]
     if title:
         yield title
-    right = [all(_NUMBER.fullmatch(row[i]) for row in cells) for i in range(len(head))]
+    right = [all(_NUMBER.fullmatch(row[i]) for row in cells if row[i]) for i in range(len(head))]
     lines = [list(head), *cells]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for row in lines:

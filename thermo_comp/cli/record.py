@@ -67,7 +67,7 @@ def record(
     _tell_leftovers(out, output, finish)
     known = numbered_bags(output)
     # Each existing bag is a position, and holds the serial of its unit.
-    with out.progress('reading what is there', total=len(known)) as done:
+    with out.progress('reading the existing bags', total=len(known)) as done:
         for number, path in enumerate(known, 1):
             with open_recording(path, require=()) as reader:
                 own = reader.info.metadata.get('serial')

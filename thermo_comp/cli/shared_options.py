@@ -171,7 +171,7 @@ def reading(input_: Input = INPUT, names: dict[str, str] = names) -> Any:
     return _reading(input_, names, None, None)
 
 
-#: Gravity in mountains differs from that of the ellipsoid by this much, sd [m/s^2]: some 50 mGal
+#: Sd of the difference between gravity in mountains and on the ellipsoid [m/s^2]: some 50 mGal
 #: (EGM2008, Pavlis et al., Journal of Geophysical Research 117 (2012): anomalies of 30 mGal RMS).
 NORMAL_GRAVITY_SD = 5e-4
 

@@ -25,13 +25,10 @@ def simulate(
         'Bag to write; with several positions a directory of them.', ..., '--output', '-o'
     ),
     unit: str = option(
-        'Kind of unit: thermostatted, bare-quartz, mems; or a kind of physics: '
-        'own-lags, between, products, hysteresis, even, convection, switched-load, paper, '
-        'slow-noise, plain, demo.',
+        'Kind of unit: thermostatted, bare-quartz, mems, or demo (that of the sample bags).',
         'thermostatted',
     ),
     unit_seed: int = option('Seed of the specimen of that kind.', 1, min=0),
-    sibling: int | None = option('Another unit of its type, +-15 % in everything.', min=0),
     plan: str | None = option(
         'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
         'tumble, tumble-3, tumble-1 or held-out.'
@@ -79,8 +76,6 @@ def simulate(
             raise options.usage('--plan is a whole test: leave out --profile and --positions')
         else:
             stations = campaign.plan(plan, position_seed)
-    if sibling is not None:
-        specimen = specimen.sibling(sibling)
     n = len(stations)
     names = [output] if n == 1 else [output / f'{i:02d}.mcap' for i in range(1, n + 1)]
     for name in names:

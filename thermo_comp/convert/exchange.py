@@ -23,6 +23,7 @@ from ..unit.calibration import Calibration
 from ..unit.functions import Polynomial
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
 from ..unit.prediction import bias_and_scale, ramp_states
+from ..unit.provenance import Provenance
 from ..unit.rate_bias import MILLIDEGREE, Gyroscope, RateCurve, RateSet
 from ..unit.rate_triad import rate_triad
 from .tools import TOOLS, Content, Tool, ql, turned
@@ -221,9 +222,7 @@ def import_calibration(
         dynamic=regime,
         noise_density_m_s2_sqrt_hz=(noise_density,) * 3,
         misalignment=((1.0, 0.0, 0.0), (yx, 1.0, 0.0), (zx, zy, 1.0)),
-        provenance=unit.Provenance(
-            model=content.source, notes=(*content.notes, *turned(rotation))
-        ),
+        provenance=Provenance(model=content.source, notes=(*content.notes, *turned(rotation))),
         gyroscope=gyroscope,
     )
 

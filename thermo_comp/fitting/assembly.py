@@ -20,17 +20,15 @@ from ..unit.calibration import (
     AxisReference,
     AxisSet,
     Calibration,
-    Provenance,
     RegimeSet,
-    ResidualSummary,
     ResponseTerm,
-    Source,
     Unit,
     parameter_layout,
 )
 from ..unit.columns import USUAL_BOARD_LAG_S, Column
 from ..unit.functions import TemperatureFunction
 from ..unit.posterior import posterior_of
+from ..unit.provenance import Provenance, ResidualSummary, Source
 from .bayes_factors import group_evidence
 from .claim import Claim
 from .data_checks import Finding
@@ -101,7 +99,10 @@ def build_calibration(
     span = temperatures[1] - temperatures[0]
     n_curves = len(model.sets.levels())
     for at, k in enumerate(used):
-        if not state.weights[:, :, n_curves + k].any() and model.columns[k].kind != 'even':
+        if (
+            not state.weights[:, :, n_curves + k].any()
+            and model.columns[k].kind != 'gradient_even'
+        ):
             most = span ** model.columns[k].order
             seen[at] = union((seen[at], (-most, most)))
     columns = [
@@ -280,7 +281,7 @@ def _triple(values: Floats) -> tuple[float, float, float]:
 
 
 def _column_range(column: Column, values: Floats) -> tuple[float, float]:
-    if column.kind == 'even':
+    if column.kind == 'gradient_even':
         return column.range
     return _widened(values, _LINEAR_REACH**column.order, 0.01)
 

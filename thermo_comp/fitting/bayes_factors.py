@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from ..typing import Floats, Ints
-from ..unit.calibration import GroupEvidence
+from ..unit.provenance import GroupEvidence
 from .equations import as_vector
 from .regression import Posterior, Regression
 from .unknowns import Prior

@@ -44,8 +44,8 @@ COUNTS_FULL_SCALE = 32767.0
 CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
 #: What evidence judges: curve and set of the two sets, then the groups of the response.
 GROUPS = (
-    'curve', 'set', 'now', 'board', 'neighbour', 'product', 'mixed', 'square', 'even', 'change',
-    'play', 'bend',
+    'curve', 'set', 'gradient', 'board', 'gradient_lag', 'product', 'gradient_x_temperature',
+    'square', 'gradient_even', 'gradient_even_about_rest', 'play', 'bend',
 )  # fmt: skip
 _ORDERS = {'linear': 1, 'quadratic': 2, 'cubic': 3}
 _SPLINE_PIECES = 4

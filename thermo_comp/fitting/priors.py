@@ -20,15 +20,9 @@ from scipy.linalg import solve_triangular
 from .. import __version__
 from ..errors import FitError
 from ..typing import Floats
-from ..unit.calibration import (
-    POPULATION,
-    Calibration,
-    Provenance,
-    RegimeSet,
-    Source,
-    parameter_layout,
-)
+from ..unit.calibration import POPULATION, Calibration, RegimeSet, parameter_layout
 from ..unit.columns import Column
+from ..unit.provenance import Provenance, Source
 from .assembly import blank_terms, file_parameters, parameters_of, union, with_parameters
 from .equations import as_vector
 from .options import FitOptions

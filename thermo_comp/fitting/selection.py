@@ -37,8 +37,8 @@ _TRIALS = 3
 # temperature, (t - m)^2 = t^2 - 2 t m + m^2; where m is of the flow between two thermometers, the
 # product is mixed.
 #: Groups that are linear in a temperature difference.
-LAGS = ('now', 'board', 'neighbour')
-_TOGETHER = (('product', 'square'), (*LAGS, 'product', 'mixed', 'square'))
+LAGS = ('gradient', 'board', 'gradient_lag')
+_TOGETHER = (('product', 'square'), (*LAGS, 'product', 'gradient_x_temperature', 'square'))
 # So many columns of knees are asked for in a round.
 _MOST_BENDS = 16
 # The noise is sought in steps of this factor, then of its roots; its white part follows in so many

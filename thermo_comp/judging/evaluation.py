@@ -21,9 +21,10 @@ from ..recording.stillness import STILL_SD
 from ..recording.topics import Topics
 from ..replay import check_unit, needed_roles, topics_for
 from ..typing import Floats
-from ..unit.calibration import AXES, Calibration, Source
+from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from ..unit.prediction import in_a_soak
+from ..unit.provenance import Source
 from .judgement import Judgement, judge
 from .windows import WINDOW_S, corrected_windows, sum_length
 

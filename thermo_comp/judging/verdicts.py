@@ -37,7 +37,7 @@ class Verdict(Enum):
     RECALIBRATE = 'recalibrate'
     NO_BETTER = 'no better than raw'
     OUTSIDE = 'outside the calibrated range: not judged'
-    SWAPPED = 'thermometers in doubt: not judged'
+    SWAPPED = 'thermometers probably exchanged: not judged'
     NO_CLAIM = 'no claim'
 
     @property

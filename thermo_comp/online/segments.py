@@ -204,7 +204,7 @@ class ThermalSide:
         return Segment(start_ns, is_new, rate.is_too_fast, rate.noise_excess, start, end, slow)
 
     def bias_sd(self, correction: Correction, variances: Sequence[float]) -> tuple[float, ...]:
-        """Return the bias sd of each axis: of the whole variance less a sample's noise."""
+        """Return the bias sd of each axis: the root of its variance minus a sample's noise."""
         excess = 1.0 + self.rate.noise_excess
         pairs = zip(variances, correction.noise, strict=False)
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns batches of messages, blocks of columns on one clock, and the description of a bag.
+Owns blocks of columns on one clock, and the description of a bag.
 
 A column is a numpy array with one row per message. All times are integer nanoseconds: ``stamp`` is
 the stamp in the message's header, ``log`` the time when the recorder received it.
@@ -10,16 +10,16 @@ the stamp in the message's header, ``log`` the time when the recorder received i
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import RecordingError
-from ..typing import Bools, Bytes, Floats, Ints
+from ..typing import Bools, Floats, Ints
+from .serialized import Messages, join_messages, scatter
 
 Input = Literal['auto', 'counts', 'imu']
 Role = str  # ``accel``, or the name of a thermometer
@@ -44,29 +44,6 @@ _REPEAT_NS = 10_000_000_000
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
-def gather(buffer: Bytes, at: Ints, n_bytes: int) -> Any:
-    """Copy `n_bytes` from each position, all before the buffer's end, as rows of void."""
-    return _everywhere(buffer, n_bytes)[at] if len(at) else np.empty(0, (np.void, n_bytes))
-
-
-def scatter(buffer: Bytes, at: Ints, rows: NDArray[Any]) -> None:
-    """Copy rows to positions of a buffer, the inverse of `gather`."""
-    if len(at):
-        _everywhere(buffer, rows.itemsize)[at] = rows
-
-
-def _everywhere(buffer: Bytes, n_bytes: int) -> Any:
-    shape = (buffer.size - n_bytes + 1,)
-    return np.ndarray(shape, np.dtype((np.void, n_bytes)), buffer.data, strides=(1,))
-
-
-def number_at(rows: NDArray[Any], offset: int, kind: str) -> Any:
-    """View a number in each gathered row, by its offset [bytes] and numpy type."""
-    if len(rows) == 0:
-        return np.empty(0, kind)
-    return np.ndarray((len(rows),), kind, rows.data, offset=offset, strides=(rows.itemsize,))
-
-
 class Topic(NamedTuple):
     """The topic of a channel: name, message type, encoding and number of messages."""
 
@@ -74,80 +51,6 @@ class Topic(NamedTuple):
     type: str
     encoding: str
     n_messages: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Messages:
-    """Serialized messages, shape (n,): their positions and lengths in `data`."""
-
-    data: Bytes
-    start: Ints
-    size: Ints
-    channel: NDArray[np.uint16]
-    log_ns: Ints
-
-    @classmethod
-    def of(cls, pieces: Sequence[bytes], channel: Any, log_ns: Any) -> Messages:
-        """Concatenate messages."""
-        size = np.fromiter(map(len, pieces), np.int64, len(pieces))
-        data = np.frombuffer(b''.join(pieces), np.uint8)
-        numbers, times = np.asarray(channel, np.uint16), np.asarray(log_ns, np.int64)
-        return cls(data, np.cumsum(size) - size, size, numbers, times)
-
-    def __len__(self) -> int:
-        """Return the number of messages."""
-        return len(self.start)
-
-    def __iter__(self) -> Iterator[bytes]:
-        """Yield the bytes of each message."""
-        data = self.data.tobytes()
-        for at, size in zip(self.start.tolist(), self.size.tolist(), strict=True):
-            yield data[at : at + size]
-
-    def take(self, which: Ints | Bools | slice) -> Messages:
-        """Select messages; the bytes are shared."""
-        return Messages(
-            self.data, self.start[which], self.size[which], self.channel[which], self.log_ns[which]
-        )
-
-    def places_of(self, numbers: Collection[int]) -> Ints:
-        """Return the indices of the messages of some channels."""
-        is_own = np.zeros(len(self), np.bool_)
-        for number in numbers:
-            is_own |= self.channel == number
-        return np.flatnonzero(is_own)
-
-    def of_channels(self, numbers: Collection[int]) -> Messages:
-        """Select the messages of some channels."""
-        places = self.places_of(numbers)
-        return self if len(places) == len(self) else self.take(places)
-
-    def in_order(self) -> Messages:
-        """Sort by log time and, for equal times, by position."""
-        if (self.log_ns[1:] >= self.log_ns[:-1]).all():
-            return self
-        return self.take(np.argsort(self.log_ns, kind='stable'))
-
-    def packed(self, room: int = 0) -> Messages:
-        """Copy the bytes, with `room` before each message, so that the original can be freed."""
-        ends = np.cumsum(self.size + room)
-        data = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
-        for each in np.unique(self.size[self.size > 0]).tolist():
-            own = np.flatnonzero(self.size == each)
-            scatter(data, ends[own] - each, gather(self.data, self.start[own], each))
-        return Messages(data, ends - self.size, self.size, self.channel, self.log_ns)
-
-
-def join_messages(pieces: Sequence[Messages]) -> Messages:
-    """Concatenate pieces of messages, at least one piece."""
-    if len(pieces) == 1:
-        return pieces[0]
-    begins = np.cumsum([0, *(len(one.data) for one in pieces)])
-    return Messages(
-        np.concatenate([one.data for one in pieces]),
-        np.concatenate([one.start + at for one, at in zip(pieces, begins, strict=False)]),
-        *(np.concatenate([getattr(one, n) for one in pieces]) for n in Messages.__slots__[2:]),
-    )
 
 
 class BagFile:

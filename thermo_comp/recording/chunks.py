@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from ..errors import RecordingError
 from ..files import open_regular
 from ..typing import Bytes, Ints
-from .blocks import Messages, gather, number_at
+from .serialized import Messages, gather, number_at
 
 PREFIX = struct.Struct('<BQ')  # opcode and length in front of each record
 HEAD_BYTES = 160  # bytes of a chunk's record that contain its head

@@ -21,7 +21,8 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..typing import Floats, Ints
-from .blocks import NO_STAMP_NS, Messages, gather, number_at
+from .blocks import NO_STAMP_NS
+from .serialized import Messages, gather, number_at
 
 _STEP = re.compile(r'([A-Za-z]\w*)(?:\[([0-9]{1,6})\])?')
 _KINDS = {

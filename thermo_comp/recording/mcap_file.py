@@ -30,8 +30,9 @@ from mcap.stream_reader import StreamReader
 
 from ..errors import RecordingError
 from ..files import open_regular
-from .blocks import BagFile, Messages, Topic, join_messages
+from .blocks import BagFile, Topic
 from .chunks import HEAD_BYTES, PREFIX, DamagedError, Span, load, parse_chunk_head, translated
+from .serialized import Messages, join_messages
 
 MAGIC = b'\x89MCAP0\r\n'
 _BEGIN = MAGIC + bytes([Opcode.HEADER])

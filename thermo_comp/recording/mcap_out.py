@@ -28,10 +28,10 @@ from mcap.opcode import Opcode
 from .. import __version__
 from ..errors import RecordingError
 from ..topics import OUTPUTS
-from .blocks import Messages, join_messages, scatter
 from .chunks import MESSAGE, MESSAGE_HEAD_BYTES, PREFIX
 from .fields import typestore
 from .mcap_file import MAGIC, METADATA_NAME
+from .serialized import Messages, join_messages, scatter
 
 Compression = Literal['none', 'lz4', 'zstd']
 

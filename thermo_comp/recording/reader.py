@@ -27,7 +27,6 @@ from .blocks import (
     ROLES,
     BagFile,
     Block,
-    Messages,
     Recording,
     RecordingInfo,
     Role,
@@ -41,6 +40,7 @@ from .blocks import (
 from .chunks import MAX_CHUNK_BYTES, expand, inflate, inflate_ros1_chunk, translated
 from .fields import Field, definitions_of
 from .mcap_file import McapFile
+from .serialized import Messages
 from .topics import WHOLE, Selected, Topics, select_topics, shown
 from .wire import Feed, decode_blocks
 

@@ -265,7 +265,7 @@ def still_intervals(
     quiet = believable & (cells.variance <= limit).all(axis=1)
     roughest = roughest_at_rest(cells, quiet, wider > 1.0, ratio)
     quiet &= (cells.roughness <= roughest).all(axis=1)
-    # A single change of so many sd is one as rough as a whole cell.
+    # A single change of this many sd has the roughness of a whole cell.
     is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
     broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
     # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.

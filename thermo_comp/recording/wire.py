@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from ..errors import RecordingError
 from ..topics import IMU, N_NUMBERS, TEMPERATURE, VECTOR3_STAMPED
 from ..typing import Bytes, Floats, Ints
-from .blocks import ROLES, Block, ImuColumns, Messages, Readings, Role, Topic, gather, number_at
+from .blocks import ROLES, Block, ImuColumns, Readings, Role, Topic
 from .fields import Field, typestore
+from .serialized import Messages, gather, number_at
 from .topics import shown
 
 #: The columns of sensor_msgs/Imu among its numbers, as `ImuColumns` has them.

@@ -25,8 +25,9 @@ from ..errors import OutputError, RecordingError
 from ..files import CSV, PARQUET, Draft, Kind, bag_kind, drafted
 from ..topics import BOOL, IMU, N_NUMBERS, TEMPERATURE, VECTOR3_STAMPED
 from ..typing import Ints
-from .blocks import ImuColumns, Messages
+from .blocks import ImuColumns
 from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
+from .serialized import Messages
 from .wire import encode_stamped
 
 STAMP_END_NS = 2**31 * 10**9  # ROS stamps are from 0 to below this [ns]

@@ -29,12 +29,12 @@ class Contribution(NamedTuple):
 
     name: str
     evaluation: str
-    standard: float | None  # None where nobody has said it
+    standard: float | None  # None if not stated
     basis: str
 
 
 class Result(NamedTuple):
-    """One line of the results, with its expanded uncertainty (k = 2), rounded as such are."""
+    """One line of the results, with its expanded uncertainty (k = 2), as rounded texts."""
 
     quantity: str
     value: str
@@ -46,8 +46,8 @@ class StateResult(NamedTuple):
     """
     One axis in a soak or a ramp at one temperature of the board.
 
-    Each deviation is that of the value before it from a straight line over temperature, which
-    meets a soak at the reference temperature and has the slope of the soak.
+    Each deviation is that of the preceding value from a straight line over temperature. The line
+    passes through the value in a soak at the reference temperature and has the slope of the soak.
     """
 
     program: str
@@ -70,7 +70,7 @@ class AxisOverTemperature(NamedTuple):
 
 
 def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...]:
-    """Split the uncertainty of ``|f|`` at rest into what it comes from; empty unjudged."""
+    """Split the uncertainty of ``|f|`` at rest into its contributions; empty without bags."""
     judgement, calibration = evidence.judgement, evidence.calibration
     if judgement is None or calibration is None or not judgement.sections['all'].n:
         return ()
@@ -91,14 +91,14 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         drift = drift_k * _slope(calibration)
         slope = f'{drift_k:g} K times the slope of the correction'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
-    beyond = 'what the residual exceeds noise, attitude and model by'
-    # What the fit was told of gravity's uncertainty is part of the claim already.
+    beyond = 'residual in excess of noise, attitude and model'
+    # The gravity uncertainty that was given to the fit is a part of the claimed sd already.
     gravity = unclaimed_gravity_sd(evidence, info)
-    told = 'stated to the fit, a part of the model' if evidence.gravity_sd else ''
+    in_fit = 'given to the fit, included in the model' if evidence.gravity_sd else ''
     return (
         Contribution('noise', 'A', noise, seconds),
-        Contribution('gravity', 'B', gravity, info.gravity.source or told),
-        Contribution('attitude', 'A', attitude, 'axes not at right angles; |f| needs no fixture'),
+        Contribution('gravity', 'B', gravity, info.gravity.source or in_fit),
+        Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
         Contribution('thermometers', 'B', drift, slope),
         Contribution('model', 'A', model, 'posterior of all parameters at the judged windows'),
         Contribution('repeatability', 'A', rest, beyond),
@@ -107,9 +107,9 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
     """
-    Give the standard uncertainty of gravity that the calibration's covariance lacks [m/s^2].
+    Return the standard uncertainty of gravity beyond the part in the covariance [m/s^2].
 
-    None: nobody has stated how well gravity is known.
+    None if the uncertainty of gravity is not stated.
     """
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
@@ -118,20 +118,20 @@ def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | N
 
 
 def combined(contributions: tuple[Contribution, ...]) -> float:
-    """Add up a budget: the combined standard uncertainty of what was said [m/s^2]."""
+    """Return the combined standard uncertainty of the stated contributions [m/s^2]."""
     return float(np.sqrt(sum((one.standard or 0.0) ** 2 for one in contributions)))
 
 
 def results(
     evidence: Evidence, info: CertificateInfo, contributions: tuple[Contribution, ...]
 ) -> list[Result]:
-    """List the constants at the reference temperature, and the error that is left of |f|."""
+    """List the constants at the reference temperature, and the mean residual of |f|."""
     calibration = evidence.calibration
     if calibration is None:
         return []
     unit = 'counts' if calibration.unit.input == 'counts' else 'm/s²'
     bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
-    # Without a claim there is no uncertainty to expand.
+    # Without a covariance there is no uncertainty to expand.
     known = COVERAGE if calibration.has_uncertainty else np.nan
     scale_sd = np.hypot(scale_sd, _gravity_part(evidence, info)) * np.abs(scale)
     below = ((1, 0), (2, 0), (2, 1))
@@ -197,7 +197,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
-    """Give the relative uncertainty of scale that gravity adds; NaN where nobody has stated it."""
+    """Return the relative uncertainty of scale due to gravity; NaN if it is not stated."""
     sd = unclaimed_gravity_sd(evidence, info)
     if sd is None or evidence.calibration is None:
         return np.nan
@@ -205,7 +205,7 @@ def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
 
 
 def withheld_because(evidence: Evidence, info: CertificateInfo) -> str:
-    """Say why an expanded uncertainty is a dash, if one is."""
+    """Return the reason for withheld expanded uncertainties; empty if none is withheld."""
     calibration = evidence.calibration
     if calibration is not None and not calibration.has_uncertainty:
         return 'U is withheld: the calibration states no uncertainty.'

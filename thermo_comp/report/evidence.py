@@ -23,9 +23,10 @@ from ..judging.windows import WINDOW_S, Windows, corrected_windows, means_by, us
 from ..replay import check_unit
 from ..text import counted
 from ..typing import Floats
-from ..unit.calibration import Calibration, Source
+from ..unit.calibration import Calibration
 from ..unit.gravity import spoken
 from ..unit.metrics import norm_residual
+from ..unit.provenance import Source
 from .trace import ShownBag, shown_bag, widest
 
 _T = TypeVar('_T')
@@ -195,7 +196,7 @@ class Evidence:
 def given(value: _T | None) -> _T:
     """Return a value that is not None: a figure is drawn only if its data exist."""
     if value is None:
-        raise ValueError('`evidence` lacks what is to be drawn')
+        raise ValueError('`evidence` lacks the data of this figure')
     return value
 
 

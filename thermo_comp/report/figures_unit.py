@@ -1,36 +1,29 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the figures of a calibration, its curves to its history, and the figures of a fleet."""
+"""Owns the figures of a calibration over temperature, and those of a fleet."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..judging.windows import means_by
-from ..thermal.state import Layout as StateLayout
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
-from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
-from ..unit.prediction import bias_and_scale, ramp_states, step_states
 from ..unit.rate_bias import MILLIDEGREE
 from ..unit.rate_triad import rate_triad
 from . import style
 from .evidence import CHOSEN, Evidence, given
-from .html import label_text, minus, number
+from .html import minus, number
 from .states import Curve, curves, slopes
 
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
-_N_CURVE = 61
 _BOARD = 'T board, °C'
-#: Time axis of the step response [min]: from a few readings to the end of the longest lag.
-_STEP_MINUTES = (0.2, 500.0)
 # Line, hatch and marker of a soak and of ramps.
 _LOOKS: dict[str, tuple[style.Line, str, str]] = {
     'soak': (style.STATIC_LINE, '////', 'o'),
@@ -64,26 +57,17 @@ def draw_functions(evidence: Evidence) -> Figure:
 def draw_rates(evidence: Evidence) -> Figure:
     """Draw the bias of the angular rate over temperature, less a line, with bands."""
     triad = rate_triad(given(evidence.calibration))
-    names = ('bias less the line, mdeg/s', '', '')
-    figure, panels = _panels(2.5, names, _BOARD, sharex=True)
+    figure = style.new_figure(2.5)
+    panels = figure.subplots(1, 3, sharex=True)
+    panels[0].set_ylabel('bias less the line, mdeg/s')
     # In the triad of a gyroscope m/s^2 stands for rad/s.
     factor = MICRO_G / MILLIDEGREE
     drawn = [one._replace(value=factor * one.value, sd=factor * one.sd) for one in curves(triad)]
     for i, axes in enumerate(panels):
+        axes.set_xlabel(_BOARD)
         _draw_less_line(axes, triad, drawn, i, 'mdeg/s')
     style.shared_legend(figure, panels[0], 3)
     return figure
-
-
-def _panels(
-    height: float, names: Sequence[str], xlabel: str = '', **shared: Any
-) -> tuple[Figure, Any]:
-    """Make a figure with a row of panels, one for each label of a y axis."""
-    figure = style.new_figure(height)
-    panels = figure.subplots(1, len(names), **shared)
-    for axes, name in zip(panels, names, strict=True):
-        axes.set(xlabel=xlabel, ylabel=name)
-    return figure, panels
 
 
 def _draw_less_line(
@@ -112,8 +96,8 @@ def _draw_less_line(
 
 def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     """
-    Average what is left in each soak of each position: temperatures (n,), bias [micro-g] and scale
-    [ppm] (n, 6), as if all were one of them; NaN of an axis with less than half of gravity.
+    Average the residual in each soak of each position: temperatures (n,), bias [micro-g] and scale
+    [ppm] (n, 6), attributed to bias or to scale alone; scale is NaN below half of gravity.
     """
     windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
     if windows is None or residual is None:
@@ -126,79 +110,6 @@ def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     known = np.abs(force) >= 0.5 * windows.gravity
     scale = np.divide(error, force, out=np.full(error.shape, np.nan), where=known)
     return mean[:, 0], np.hstack((error / MICRO_G, scale * 1e6))
-
-
-def draw_step(evidence: Evidence) -> Figure:
-    """Draw the response of each axis to a temperature step over time."""
-    minutes, *values = step_answer(given(evidence.calibration))
-    names = ('still to come, µg/K', 'still to come, ppm/K')
-    figure, panels = _panels(2.5, names, 'time since the step, min')
-    for axes, name, value in zip(panels, ('bias', 'scale'), values, strict=True):
-        axes.set_prop_cycle(style.AXIS_CYCLE)
-        axes.plot(minutes, value, label=AXES)
-        style.log_axis(axes, float(minutes[0]), float(minutes[-1]))
-        axes.axhline(0.0, color='black', linewidth=0.5)
-        style.legend_above(axes, name, share=0.5)
-    return figure
-
-
-def step_answer(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
-    """Return minutes since a step of 1 K, and the remaining change of bias [ug], scale [ppm]."""
-    minutes = np.geomspace(*_STEP_MINUTES, _N_CURVE)
-    since_s = np.append(minutes * 60.0, np.inf)
-    states = step_states(calibration, calibration.reference_temperature_c, since_s)
-    bias, scale = bias_and_scale(calibration, states)
-    return minutes, (bias[:-1] - bias[-1]) / MICRO_G, (scale[:-1] / scale[-1] - 1.0) * 1e6
-
-
-def draw_hysteresis(evidence: Evidence) -> Figure:
-    """Draw the hysteresis loop of each axis' bias in a slow run through the range and back."""
-    temperature, heating, cooling = hysteresis_loop(given(evidence.calibration))
-    figure, panels = _panels(2.5, ('loop, µg', '', ''), _BOARD, sharex=True, sharey=True)
-    for i, axes in enumerate(panels):
-        middle = (heating[:, i] + cooling[:, i]) / 2.0
-        for name, bias in (('heating', heating), ('cooling', cooling)):
-            line, _, marker = _LOOKS[name]
-            look: style.Line = {'marker': marker, 'markevery': 12, 'markersize': 3.5}
-            axes.plot(temperature, bias[:, i] - middle, label=name, **look, **line)
-        axes.set_title(f'bias {AXES[i]}')
-        axes.axhline(0.0, color='black', linewidth=0.5)
-    style.shared_legend(figure, panels[0], 2)
-    return figure
-
-
-def hysteresis_loop(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
-    """Return temperatures, and the bias [ug] in a slow run up and down, shapes (n, 3)."""
-    lower, upper = calibration.static.temperature_range_c
-    temperature = np.linspace(lower, upper, _N_CURVE)
-    plays = StateLayout(Correction(calibration).memory).plays
-    ways = []
-    for sign, travelled in ((1.0, temperature - lower), (-1.0, upper - temperature)):
-        states = ramp_states(calibration, temperature)
-        for (_, width), place in plays.items():
-            states[:, place] = sign * np.maximum(width - travelled, -width)
-        ways.append(bias_and_scale(calibration, states)[0] / MICRO_G)
-    return temperature, ways[0], ways[1]
-
-
-def draw_history(evidence: Evidence) -> Figure:
-    """Draw bias and scale of each calibration of the unit against the first one, by date."""
-    history = evidence.history
-    figure, panels = _panels(2.6, ('change, µg', 'change, ppm'))
-    places = np.arange(len(history))
-    change = np.array([one.value - history[0].value for one in history])
-    half = BAND_SDS * np.nan_to_num([one.sd for one in history])
-    for axes, name, first in zip(panels, ('bias', 'scale'), (0, 3), strict=True):
-        for i, (axis, marker) in enumerate(zip(AXES, 'os^', strict=True)):
-            look: style.Line = {'marker': marker, 'markersize': 3.5, **style.AXIS_LINES[i]}
-            at = places + 0.08 * (i - 1)
-            axes.errorbar(
-                at, change[:, first + i], half[:, first + i], label=axis, capsize=2.0, **look
-            )
-        axes.axhline(0.0, color='black', linewidth=0.5)
-        axes.set_xticks(places, [label_text(one.created[:10]) for one in history])
-        style.legend_above(axes, name, share=0.5)
-    return figure
 
 
 def draw_shares(curves: Mapping[str, Floats]) -> Figure:

@@ -142,7 +142,7 @@ def remarks_of(bag: ReducedBag) -> list[str]:
 
 
 def _seen(evidence: Evidence) -> list[str]:
-    """Describe the bags of the verdict, and whether the regime was never known."""
+    """Describe the bags of the verdict, and state if their regime was never known."""
     said = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board
@@ -230,7 +230,7 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         'Does |f| stay constant over the whole program?',
         of_bags.draw_gravity,
         f'|f| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
-        'a unit at rest must show zero whatever the temperature does. Above: before and after '
+        'for a unit at rest it is zero at any temperature. Above: before and after '
         'the correction; below: after it, in a larger scale. '
         f'{read} 7 of the paper.',
     )
@@ -243,7 +243,7 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         return
     has_band = calibration.posterior is not None
     yield (
-        'What is corrected, and how well is it known?',
+        'Which bias and scale are corrected, and how uncertain are they?',
         of_unit.draw_functions,
         'Bias and scale factor over temperature, in a soak and in ramps through the whole range '
         'that begin in a soak at its end, less the value at '
@@ -261,36 +261,13 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     if calibration.gyroscope is not None:
         judged = None if evidence.judgement is None else evidence.judgement.rate
         yield (
-            'What is corrected of the angular rate?',
+            'Which bias of the angular rate is corrected?',
             of_unit.draw_rates,
             'Bias of the gyroscope over temperature, in a soak and in ramps as above, less the '
             'value at the reference temperature and less a straight line, whose slope stands '
             'above each panel. Hatched: 95 % band, of the constant as well, which the Earth’s '
             'rate and the turn-on blur.',
             '' if judged is None else f'Judged on these bags, {judged}.',
-        )
-    moved = (one for one in calibration.response if any((*one.bias, *one.scale)))
-    if any(one.lag and not one.is_of_sensor for one in moved):
-        yield (
-            'For how long does the unit remember a change of temperature?',
-            of_unit.draw_step,
-            'After a step of board and case by 1 K: distance of bias and scale from their final '
-            'values. Where a line reaches zero, the unit has settled.',
-        )
-    if any(term.kind == 'play' for term in calibration.response):
-        yield (
-            'Does the bias differ between warming and cooling?',
-            of_unit.draw_hysteresis,
-            'A run through the whole range and back, too slow for any lag: bias of each axis less '
-            'the mean of both directions. No curve over temperature corrects the width of the '
-            'loop.',
-        )
-    if len(evidence.history) > 1:
-        yield (
-            'What has drifted between the calibrations of this unit?',
-            of_unit.draw_history,
-            'Bias and scale in a soak at the reference temperature, by the date of each '
-            'calibration, less those of the first; bars: 95 % interval of each.',
         )
 
 

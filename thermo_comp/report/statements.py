@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what a laboratory states on a certificate, and the reading of its file."""
+"""Owns the statements of a laboratory on a certificate, and the reading of their file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Party:
 
 @dataclass(frozen=True)
 class Item:
-    """What was calibrated, and in which condition it came."""
+    """The calibrated unit, and its condition at receipt."""
 
     maker: Text = ''
     model: Text = ''
@@ -38,7 +38,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Instrument:
-    """What it was calibrated with: the chamber, a thermometer."""
+    """An instrument of the calibration: the chamber, a thermometer."""
 
     name: Text
     model: Text = ''
@@ -83,7 +83,7 @@ class Dates:
 
 @dataclass(frozen=True)
 class CertificateInfo:
-    """What a laboratory says of a calibration, key by key as in its file; all may be left out."""
+    """Statements of a laboratory about a calibration; all keys of its file are optional."""
 
     number: Text = ''
     laboratory: Party = Party()

@@ -90,6 +90,6 @@ def table_temperatures(lowest: float, highest: float) -> Floats:
     span = highest - lowest
     step = next((one for one in _STEPS_K if span <= one * (_MOST_TEMPERATURES - 2)), _STEPS_K[-1])
     within = step * np.arange(math.ceil(lowest / step), math.floor(highest / step) + 1)
-    # A round temperature nearer to an end than a quarter of the step says what the end says.
+    # A round temperature within a quarter of the step from an end would repeat the end's row.
     kept = within[(within - lowest > 0.25 * step) & (highest - within > 0.25 * step)]
     return np.array([lowest, *kept, highest])

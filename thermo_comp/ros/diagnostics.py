@@ -102,7 +102,7 @@ class Reporter:
                 # Of data time.
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
-        findings = [*self._inputs(), *_findings(loaded, status, new, rate, silence_s)]
+        findings = [*self._inputs(), *findings_of(loaded, status, new, rate, silence_s)]
         findings.sort(key=lambda finding: -finding[0])
         values = self._values(loaded, status, counts, rate)
         message = DiagnosticStatus(
@@ -239,7 +239,7 @@ def _mismatch(node: Node, subscription: Subscription) -> str:
     return ''
 
 
-def _findings(
+def findings_of(
     loaded: LoadedCalibration,
     status: CompensatorStatus,
     new: dict[str, int],

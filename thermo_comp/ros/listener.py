@@ -20,8 +20,9 @@ import numpy as np
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from ..errors import ThermoCompError
-from ..recording.blocks import NO_STAMP_NS, Messages, Role, Topic, with_stamps
+from ..recording.blocks import NO_STAMP_NS, Role, Topic, with_stamps
 from ..recording.growing import News
+from ..recording.serialized import Messages
 from ..recording.topics import Topics, is_thermometer, split_field
 from ..recording.wire import Feed, decode_blocks
 from ..recording.writer import BagWriter

@@ -6,26 +6,17 @@ Owns the way of the samples through the node, in order of arrival and independen
 Messages do not identify their publisher. While a topic has more than one publisher it is ignored,
 and so is the first batch afterwards, which may still be from the publisher that left
 (`waitloop.Sources`).
-
-Samples are read, and an Imu is written, at fixed offsets of their plain form, little-endian CDR:
-4 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with
-its final NUL, the string, and, at the next multiple of 8 from the end of the encapsulation,
-float64 values. A message in any other form is first converted to this form by rclpy.
 """
 
 from __future__ import annotations
 
-import struct
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
-from typing import Any
 
 from rclpy.executors import ExternalShutdownException
-from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 
 from ..errors import ThermoCompError
@@ -34,6 +25,7 @@ from ..online.segments import Model
 from ..recording.blocks import NO_STAMP_NS
 from ..recording.topics import TWINS, split_field
 from ..topics import BOARD, FLAGS, IMU_OUT, SAMPLES, thermometer
+from .conversion import SampleConverter, Traffic, read_temperature
 from .fields import LiveField, live_field
 from .messages import message_class, qos_of
 from .parameters import NodeConfig, named_topics
@@ -44,107 +36,8 @@ from .waitloop import RawSubscription, RCLError, WaitLoop
 #: that Fast DDS has to repeat can be 3 s late.
 IDLE_NS = 1_000_000_000
 
-#: Compensates a sample: stamp and three components in, force and covariance out; None = dropped.
-Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
-#: Corrects the angular rate of that sample: rate and variances out.
-CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
-
-#: Longest message read [bytes]; an Imu with the longest frame name is shorter.
-_LONGEST_MESSAGE = 1024
-
-_ENCAPSULATION = b'\0\1\0\0'
-_HEADER = struct.Struct('<4siI4x')
-# Bytes of an Imu that are passed on: orientation 4 + 9 and angular velocity 3 + 9 float64 values;
-# linear acceleration 3 + 9 follow.
-_PASSED = 8 * 25
-_NO_GYRO = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
-#: Offset of the angular rate in these bytes; its format with the first covariance element.
-_RATE_AT = 8 * 13
-_RATE_IN, _RATE_OUT = struct.Struct('<4d'), struct.Struct('<12d')
-_CELSIUS = struct.Struct('<d')
-
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
 _Reading = tuple[int, tuple[str, int, float]]
-
-
-@dataclass(slots=True)
-class Traffic:
-    """The node's counters, in addition to the compensator's."""
-
-    n_lost: int = 0  # samples that the driver sent and the node did not receive
-    n_unpublished: int = 0  # output messages that the middleware did not accept
-    n_malformed: int = 0  # messages that could not be read
-    n_flags: int = 0  # regime flags published, one for each deciding reading
-    n_fallback: int = 0  # samples that rclpy had to convert to the plain form
-    n_contested: int = 0  # messages dropped because more than one publisher may have sent them
-
-
-class SampleConverter:
-    """Turns samples into Imu, both serialized; an empty `frame_id` keeps the input's."""
-
-    def __init__(self, kind: Any, frame_id: str = '', traffic: Traffic | None = None) -> None:
-        self._kind, self._frame_id = kind, frame_id
-        self.traffic = traffic or Traffic()
-        # Last layout of input message: frame, struct to unpack it, offset of the bytes passed on.
-        # Imu: frame and struct to pack it.
-        self._name, self._passed, self._frame = b'', 0, b''
-        self._unpack: Callable[[bytes], tuple[Any, ...]] = struct.Struct('').unpack
-        self._pack: Callable[..., bytes] = struct.Struct('').pack
-        #: Last result of `process`, for reports.
-        self.last_result: tuple[float, ...] | None = None
-
-    def convert(
-        self, data: bytes, process: Process, correct_rate: CorrectRate | None = None
-    ) -> bytes | None:
-        """Compensate a sample; None if it is unreadable or `process` dropped it."""
-        try:
-            encapsulation, sec, nanosec, name, x, y, z = self._unpack(data)
-            is_known = name == self._name and encapsulation == _ENCAPSULATION
-        except (struct.error, ValueError):
-            is_known = False
-        if not is_known:
-            data = self._learn(data)
-            if not data:
-                self.traffic.n_malformed += 1
-                return None
-            _, sec, nanosec, _, x, y, z = self._unpack(data)
-        result = process(sec * 1_000_000_000 + nanosec, x, y, z)
-        if result is None:
-            return None
-        self.last_result = result
-        block = _NO_GYRO
-        if self._passed:
-            block = data[self._passed : self._passed + _PASSED]
-            if correct_rate is not None:
-                x, y, z, claimed = _RATE_IN.unpack_from(block, _RATE_AT)
-                if claimed != -1.0:
-                    x, y, z, xx, yy, zz = correct_rate(sec * 1_000_000_000 + nanosec, x, y, z)
-                    rate = x, y, z, xx, 0.0, 0.0, 0.0, yy, 0.0, 0.0, 0.0, zz
-                    block = block[:_RATE_AT] + _RATE_OUT.pack(*rate)
-        fx, fy, fz, c00, c01, c02, c11, c12, c22 = result
-        return self._pack(
-            _ENCAPSULATION, sec, nanosec, self._frame, block,
-            fx, fy, fz, c00, c01, c02, c01, c11, c12, c02, c12, c22,
-        )  # fmt: skip
-
-    def _learn(self, data: bytes) -> bytes:
-        """Note the offsets of a message of new layout; return its plain form, or empty bytes."""
-        is_imu = self._kind is Imu
-        skip, rest = (_PASSED, 72) if is_imu else (0, 0)
-        size = skip + 24 + rest
-        given, (data, start) = data, _plain(data, size, self._kind)
-        if not start:
-            return b''
-        self.traffic.n_fallback += data is not given
-        self._passed = start if is_imu else 0
-        end = 16 + int.from_bytes(data[12:16], 'little')
-        # The padding after the name may hold any bytes.
-        self._name, gap = data[12:end], start - end + skip
-        self._unpack = struct.Struct(f'<4siI{len(self._name)}s{gap}x3d{rest}x').unpack
-        frame = self._frame_id.encode() + b'\0' if self._frame_id else self._name[4:]
-        self._frame = len(frame).to_bytes(4, 'little') + frame + bytes(-(12 + len(frame)) % 8)
-        self._pack = struct.Struct(f'<4siI{len(self._frame)}s{_PASSED}s12d').pack
-        return data
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,40 +258,3 @@ class Relay:
         if not self._loop.node.context.ok():
             raise ExternalShutdownException
         self.traffic.n_unpublished += 1
-
-
-def read_temperature(data: bytes) -> tuple[int, float] | None:
-    """Read stamp [ns] and temperature of a serialized Temperature; None if it is malformed."""
-    # rclpy's deserialization would cost as much as several samples: its code is not in the cache
-    # of a node that sleeps between samples.
-    data, start = _plain(data, 16, Temperature)
-    if not start:
-        return None
-    _, sec, nanosec = _HEADER.unpack_from(data)
-    return sec * 1_000_000_000 + nanosec, _CELSIUS.unpack_from(data, start)[0]
-
-
-def _values_at(data: bytes, size: int) -> int:
-    """Return the offset of the `size` bytes of values of a message; 0 if not in plain form."""
-    if not 16 < len(data) <= _LONGEST_MESSAGE or data[:4] != _ENCAPSULATION:
-        return 0
-    length = int.from_bytes(data[12:16], 'little')
-    start = 16 + length + -(12 + length) % 8
-    name = data[16 : 16 + length]
-    if not length or len(data) != start + size or name.find(0) != length - 1:
-        return 0
-    with suppress(UnicodeDecodeError):
-        name.decode()
-        return start
-    return 0
-
-
-def _plain(data: bytes, size: int, message_type: Any) -> tuple[bytes, int]:
-    """Return a message in plain form, by rclpy if needed, and the offset of its values or 0."""
-    start = _values_at(data, size)
-    if not start and len(data) <= _LONGEST_MESSAGE:
-        # RuntimeError: rclpy cannot read it. ValueError: a name is not UTF-8.
-        with suppress(RuntimeError, ValueError):
-            data = serialize_message(deserialize_message(data, message_type))
-            start = _values_at(data, size)
-    return data, start

@@ -115,17 +115,6 @@ class FlowEffect(Effect):
 
 
 @dataclass(frozen=True)
-class LeakageEffect(Effect):
-    """Leakage of a junction: ``exp(d / growth) - 1`` with the part's deviation `d`."""
-
-    part: str
-    growth: float
-
-    def _signals(self, history: PartHistory) -> tuple[Floats, float]:
-        return np.expm1(history.of(self.part) / self.growth), 0.0
-
-
-@dataclass(frozen=True)
 class CreepEffect(Effect):
     """Slow relaxation in a part: follows a fast change of temperature [K], then decays."""
 
@@ -139,33 +128,6 @@ class CreepEffect(Effect):
         new = 1.0 - self.time_constant / history.step * (1.0 - kept)
         lagged = lfilter([new, 1.0 - kept - new], [1.0, -kept], d - d[0]) + d[0]
         return d - lagged, 0.0
-
-
-@dataclass(frozen=True)
-class SlipEffect(Effect):
-    """
-    A joint that is strained by a part's temperature and slips; its stress [K of free strain]
-    depends on the path, not the time. It slips abruptly at `width` (Jenkins) or gradually towards
-    it (Dahl, Bouc-Wen); it starts relaxed.
-    """
-
-    part: str
-    width: float
-    is_gradual: bool = False
-
-    def _signals(self, history: PartHistory) -> tuple[Floats, float]:
-        strain = np.diff(history.of(self.part), prepend=history.of(self.part)[:1])
-        width, now = self.width, 0.0
-        kept = np.exp(-np.abs(strain) / width).tolist()
-        stress = np.empty(len(strain))
-        for k, step in enumerate(strain.tolist()):
-            if self.is_gradual and step:
-                limit = width if step > 0.0 else -width
-                now = limit + (now - limit) * kept[k]
-            else:
-                now = min(max(now + step, -width), width)
-            stress[k] = now
-        return stress, 0.0
 
 
 def drift_of(effects: Iterable[Effect], history: PartHistory) -> tuple[Floats, Floats]:

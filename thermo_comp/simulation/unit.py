@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..typing import Floats, Ints
 from ..unit.gravity import EARTH_RATE, MICRO_G
 from ..unit.rate_bias import MILLIDEGREE
-from .drift import ZERO, Effect, PartHistory, Triple, drift_of, triple
+from .drift import ZERO, Effect, PartHistory, Triple, drift_of
 from .network import ThermalNetwork, ThermalResponse
 
 _NS = 1_000_000_000
@@ -199,36 +199,3 @@ class UnitModel:
         """Return the unit with other thermometers, the same changes on board and case."""
         board, case = (replace(one, **changes) for one in (self.board, self.case))
         return replace(self, board=board, case=case)
-
-    def sibling(self, seed: int, spread: float = 0.15) -> UnitModel:
-        """
-        Return another unit of the same type, with other constants and misalignment; each
-        coefficient, width and heat capacity differs by a share of up to `spread`.
-        """
-        rng = generator(seed, Stream.SIBLING)
-
-        def near(value: float) -> float:
-            return float(value * (1.0 + spread * rng.uniform(-1.0, 1.0)))
-
-        def changed(effect: Effect) -> Effect:
-            values: dict[str, float | Triple] = {}
-            for name, value in vars(effect).items():
-                if isinstance(value, tuple):
-                    values[name] = near(value[0]), near(value[1]), near(value[2])
-                elif isinstance(value, float) and name != 'exponent':
-                    values[name] = near(value)
-            return replace(effect, **values)  # type: ignore[arg-type]
-
-        capacity = {name: near(value) for name, value in self.network.capacity.items()}
-        K = np.array(self.scale_factor) * (1.0 + 0.005 * rng.standard_normal(3))
-        bias = np.array(self.bias_at_reference) + 200.0 * MICRO_G * K * rng.standard_normal(3)
-        M = self.M + 1e-3 * np.tril(rng.standard_normal((3, 3)), -1)
-        return replace(
-            self,
-            serial=f'{self.serial}-{seed:02d}',
-            network=replace(self.network, capacity=capacity),
-            drift=tuple(changed(effect) for effect in self.drift),
-            scale_factor=triple(K),
-            bias_at_reference=triple(bias),
-            misalignment=(triple(M[0]), triple(M[1]), triple(M[2])),
-        )

@@ -39,7 +39,7 @@ _FADED: Final = 1e-18
 @dataclass(frozen=True)
 class MemorySpec:
     """
-    What a tracker remembers. `sensors`: thermometers by name, the first leads the detector.
+    Contents of a tracker's memory. `sensors`: thermometers by name, the first leads the detector.
     `lags`: (input, time constant [s]), the input being ``'board'`` or the sensor of a gradient, in
     the order of `inputs`. `plays`: (time constant of the board lag that the play follows, 0 for
     the board itself; half-width [K]).

@@ -52,7 +52,7 @@ _CALM_NS: Final = 120 * 10**9
 
 
 class Fault(Enum):
-    """What is wrong with a sensor; values are the words of the diagnostics."""
+    """The faults of a sensor; values are the words of the diagnostics."""
 
     NONE = 'none'
     #: The readings have been equal for too long: they are used, with a growing variance.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the settings of thermometers, detector and tracker: what is known before any reading.
+Owns the settings of thermometers, detector and tracker.
 
 Calibrations hold them, and a fleet's workers receive them.
 """
@@ -82,7 +82,7 @@ Closes = Literal['board', 'case']
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
     """
-    What the detector must see and what it must ignore; keys of the file's `detector` section.
+    Smallest ramp, ripple and false alarms of the detector; keys of the file's `detector` section.
     """
 
     smallest_ramp_k_min: Annotated[
@@ -111,7 +111,7 @@ class DetectorSettings:
     ] = 60.0
     closes: Annotated[
         Closes,
-        'What must be calm for the dynamic state to end: the leading sensor alone (`case`, the '
+        'Sensors that must settle before the dynamic state ends: the leading one (`case`, the '
         'end of the change as in the paper), or the board, too (`board`).',
     ] = 'board'
     case: Annotated[ThermometerSettings, 'The two sensors.'] = field(

@@ -67,7 +67,7 @@ class Thermometer:
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
         self._noise_scale = 1.0  # actual noise variance / declared
-        self._n_turns = 8.0  # number of innovations in it, the prior counting as 8
+        self._n_turns = 8.0  # number of innovations in `_noise_scale`; its prior counts as 8
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s

@@ -18,7 +18,6 @@ Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -32,6 +31,7 @@ from ..thermal.settings import DetectorSettings, ThermometerSettings
 from .columns import Column
 from .functions import TemperatureFunction, check_reference
 from .posterior import ParameterLayout, Posterior, lay_out
+from .provenance import GroupEvidence, Provenance
 from .rate_bias import LARGEST_RATE, Gyroscope
 from .reach import FULL_SCALES, LARGEST_RELATIVE_SCALE, Reach, Term, check_posterior
 from .schema import Vector, check_ranges
@@ -53,8 +53,6 @@ _Density = Annotated[float, QUANTITIES['noise density']]
 _Slow = Annotated[float, QUANTITIES['slow noise']]
 _Tilt = Annotated[float, QUANTITIES['misalignment deviation']]
 _Error = Annotated[float, QUANTITIES['error']]
-_Number = Annotated[int, QUANTITIES['number']]
-_WeightSd = Annotated[float, QUANTITIES['deviation of a weight']]
 Serial = Annotated[str, Bounds(shortest=1, longest=LONGEST_SERIAL)]
 Input = Literal['counts', 'm/s^2']
 
@@ -175,65 +173,6 @@ class ResponseTerm(Column):
 
 
 @dataclass(frozen=True)
-class GroupEvidence:
-    """Contribution of one group of columns to the fit."""
-
-    group: Annotated[str, 'The group, as in `response`.']
-    part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
-    explains_m_s2: Annotated[_Error, "RMS of the group's correction."]
-    effective_parameters: Annotated[
-        float, QUANTITIES['number'], 'Effective number of weights determined by the data.'
-    ]
-    log_evidence_change: Annotated[
-        float, QUANTITIES['log evidence'], 'Loss of log evidence without the group.'
-    ]
-    prior_sd: Annotated[tuple[_WeightSd, ...], "Prior sd of the group's weights."]
-
-
-@dataclass(frozen=True)
-class Source:
-    """One bag that the calibration was fitted on."""
-
-    name: str
-    sha256: str = ''
-    n_samples: _Number = 0
-
-
-@dataclass(frozen=True)
-class ResidualSummary:
-    """|g| error over one section of the fitted data, before and after correction."""
-
-    section: str
-    n_windows: _Number
-    raw_rms_m_s2: _Error
-    rms_m_s2: _Error
-    max_m_s2: _Error
-    left_out_rms_m_s2: Annotated[
-        _Error | None, 'On each position by a fit to the others (leave one out); null if unknown.'
-    ] = None
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """Where the numbers come from."""
-
-    created: str = ''
-    tool_version: str = ''
-    model: str = ''
-    sources: tuple[Source, ...] = ()
-    residuals: tuple[ResidualSummary, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    @property
-    def left_out_rms(self) -> float:
-        """RMS of ``|f| - g`` on positions left out of the fit [m/s^2]; NaN where unknown."""
-        values = [
-            summary.left_out_rms_m_s2 for summary in self.residuals if summary.section == 'all'
-        ]
-        return math.nan if not values or values[0] is None else values[0]
-
-
-@dataclass(frozen=True)
 class Calibration:
     """One unit's calibration; ValueError if parts contradict each other."""
 
@@ -273,7 +212,7 @@ class Calibration:
     detector: Annotated[DetectorSettings, 'The thermometers and the regime detector.'] = field(
         default_factory=DetectorSettings
     )
-    provenance: Provenance = Provenance()
+    provenance: Provenance = field(default_factory=Provenance)
     evidence: Annotated[tuple[GroupEvidence, ...], 'Contribution of each group of columns.'] = ()
     posterior: Annotated[
         Posterior | None, 'Covariance of all parameters; null where it is unknown.'
@@ -417,7 +356,7 @@ class Calibration:
         """Whether it was fitted with a case thermometer, or has columns computed from it."""
         columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
         return self.detector.case != ThermometerSettings() or any(
-            column.kind in {'now', 'neighbour', 'size', 'even'}
+            column.kind in {'gradient', 'gradient_lag', 'size', 'gradient_even'}
             or (column.kind == 'square' and not column.tau_s)
             for column in columns
         )

@@ -24,6 +24,15 @@ from .schema import SchemaError, build, fields_of, plain
 #: with one thermometer beside the board, nearly all of it the posterior; with two it fits, too.
 SIZE_LIMIT = 1 << 23
 
+#: Former names of groups and kinds of columns, as files of version 0.2.0 may have them.
+_FORMER = {
+    'now': 'gradient',
+    'neighbour': 'gradient_lag',
+    'mixed': 'gradient_x_temperature',
+    'even': 'gradient_even',
+    'change': 'gradient_even_about_rest',
+}
+
 
 def load_calibration(path: str | Path) -> Calibration:
     """
@@ -60,10 +69,24 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
             advice = 'fit the bags again'
         message = f'`format_version` must be {FORMAT_VERSION}, got {version}: {advice}'
         raise CalibrationError(message, path, 'format_version', rule)
+    _rename(data)
     try:
         return build(Calibration, data)
     except SchemaError as error:
         raise CalibrationError(error.message, path, error.key or None, rule) from error
+
+
+def _rename(data: dict[str, Any]) -> None:
+    """Replace former names of columns in the plain values of a file."""
+    gyroscope = data.get('gyroscope')
+    lists = [data.get('response'), data.get('evidence')]
+    lists += [gyroscope.get('response')] if isinstance(gyroscope, dict) else []
+    for entries in lists:
+        for entry in entries if isinstance(entries, list) else ():
+            for key in ('group', 'kind') if isinstance(entry, dict) else ():
+                name = entry.get(key)
+                if isinstance(name, str) and name in _FORMER:
+                    entry[key] = _FORMER[name]
 
 
 def dump_calibration(calibration: Calibration) -> str:

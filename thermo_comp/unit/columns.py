@@ -6,9 +6,7 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 With ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s, ``L_tau(u)`` the first-order
 lag of u, ``P_r(v)`` the play of half-width r on v, and w the weight of the dynamic regime:
 
-=========  ==========================  ====================================================
-kind       value u                     carries
-=========  ==========================  ====================================================
+=============  ====================================================
 now        g_s                         heat that flows now
 rate       dT_board/dt [K/s]           the same, as seen by one thermometer
 board      T_board - L_tau(T_board)    parts that lag the board
@@ -22,18 +20,37 @@ play       P_r(v) - v, v = t or        rate-independent hysteresis
            v = L_tau(t)
 bend       max(v - knee, 0)            a slope that changes at one temperature of a part
 =========  ==========================  ====================================================
+=======
+=============  ==========================  ================================================
+kind           value u                     effect
+=============  ==========================  ================================================
+gradient       g_s                         heat flow
+rate           dT_board/dt [K/s]           the same, from one thermometer
+board          T_board - L_tau(T_board)    parts that lag the board
+gradient_lag   L_tau(g_s)                  parts between the thermometers
+square         (T_board - L_tau)^2, or     curves of parts that lag the board; losses of a
+               q_s^2 where tau is 0        flow
+cube           (T_board - L_tau)^3         the same, and a flow that is not linear
+gradient_even  tanh((q_s / width)^2)       heat load, equal for both directions of the flow
+size           abs(q_s)                    the same, as of a heat pump
+play           P_r(v) - v, v = t or        rate-independent hysteresis
+               v = L_tau(t)
+bend           max(v - knee, 0)            a slope that changes at one temperature of a part
+=============  ==========================  ================================================
 
-Kinds *even* and *size* have the same value for heating and cooling. They are computed from ``q_s =
-g_s - rest``: rest is 0 in the group *even*, and in the group *change* the gradient at rest, where
-the board's own heat makes it warmer than the case.
+Kinds *gradient_even* and *size* have the same value for heating and cooling. They are computed
+from ``q_s = g_s - rest``: rest is 0 in the group *gradient_even*, and in the group
+*gradient_even_about_rest* the gradient at rest, where self-heating makes the board warmer than
+the case.
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u held at the edges of the column's range
 and t at those of the calibrated temperatures. Curves go on along their tangent beyond them, the
 powers of t do not: with power p the tangent of a product would be u p t^(p - 1), and no recording
 tells how a coefficient that changes with temperature goes on.
 
-The groups of the bank are its kinds; *product* and *mixed* are board, and now and neighbour, of a
-power: coefficients that change with temperature.
+The groups of the bank are its kinds. *product* contains board, and *gradient_x_temperature*
+contains gradient and gradient_lag, times a power of temperature: coefficients that change with
+temperature.
 
 Tracker, fit, correction, covariance and file use this table. A new regressor is an entry of `bank`
 and, if its kind is new, of `_FORMS`.
@@ -83,15 +100,15 @@ class Column:
 
     group: Annotated[
         Literal[
-            'now',
+            'gradient',
             'rate',
             'board',
-            'neighbour',
+            'gradient_lag',
             'product',
-            'mixed',
+            'gradient_x_temperature',
             'square',
-            'even',
-            'change',
+            'gradient_even',
+            'gradient_even_about_rest',
             'play',
             'bend',
         ],
@@ -99,7 +116,16 @@ class Column:
     ]
     kind: Annotated[
         Literal[
-            'now', 'rate', 'board', 'neighbour', 'square', 'cube', 'size', 'even', 'play', 'bend'
+            'gradient',
+            'rate',
+            'board',
+            'gradient_lag',
+            'square',
+            'cube',
+            'size',
+            'gradient_even',
+            'play',
+            'bend',
         ],
         'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or q_s^2 without '
         'lag; (T - lagged T)^3; abs(q_s); tanh((q_s / width)^2); play of t minus t; max(t - '
@@ -109,11 +135,15 @@ class Column:
     tau_s: Annotated[
         float,
         QUANTITIES['lag'],
-        'Time constant of the lag (board, neighbour, square, cube; play, bend: 0 = none).',
+        'Time constant of the lag (board, gradient_lag, square, cube; play, bend: 0 = none).',
     ] = 0.0
-    width_k: Annotated[float, QUANTITIES['width'], 'Width of even, half-width of play.'] = 0.0
+    width_k: Annotated[
+        float, QUANTITIES['width'], 'Width of gradient_even, half-width of play.'
+    ] = 0.0
     rest_k: Annotated[
-        float, QUANTITIES['gradient'], 'g_s at rest, for even, size and square without lag.'
+        float,
+        QUANTITIES['gradient'],
+        'g_s at rest, for gradient_even, size and square without lag.',
     ] = 0.0
     knee_k: Annotated[
         float, QUANTITIES['gradient'], 'Where the slope of bend changes, from the reference.'
@@ -130,7 +160,10 @@ class Column:
 
     def __post_init__(self) -> None:
         check_ranges(self, range=QUANTITIES['span of a column'])
-        for key, kinds in (('tau_s', ('board', 'neighbour')), ('width_k', ('even', 'play'))):
+        for key, kinds in (
+            ('tau_s', ('board', 'gradient_lag')),
+            ('width_k', ('gradient_even', 'play')),
+        ):
             if self.kind in kinds and not getattr(self, key) > 0.0:
                 raise ValueError(
                     f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
@@ -140,14 +173,14 @@ class Column:
     def is_of_sensor(self) -> bool:
         """Whether the value is computed from readings of `sensor`."""
         is_loss = self.kind == 'square' and not self.tau_s
-        return is_loss or self.kind in ('now', 'neighbour', 'even', 'size')
+        return is_loss or self.kind in ('gradient', 'gradient_lag', 'gradient_even', 'size')
 
     @property
     def lag(self) -> tuple[str, float] | None:
         """The lag that the value is computed from: input and time constant [s]; None if none."""
-        if self.kind == 'neighbour':
+        if self.kind == 'gradient_lag':
             return self.sensor, self.tau_s
-        return (BOARD_INPUT, self.tau_s) if self.tau_s and self.kind != 'even' else None
+        return (BOARD_INPUT, self.tau_s) if self.tau_s and self.kind != 'gradient_even' else None
 
     @property
     def order(self) -> int:
@@ -159,7 +192,7 @@ class Column:
         Return the largest slope [1/K] of values `raw` (without t^power) with respect to their
         temperature difference; for a dimensionless value by the RMS of the gradient, `flow_k` [K].
         """
-        if self.kind == 'even':
+        if self.kind == 'gradient_even':
             return 1.0 / flow_k
         if self.kind == 'rate':
             return 1.0 / USUAL_BOARD_LAG_S
@@ -176,32 +209,34 @@ def bank(
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
     of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K].
     """
-    now = [Column('now', 'now', sensor, range=UNBOUNDED) for sensor in sensors]
+    gradient = [Column('gradient', 'gradient', sensor, range=UNBOUNDED) for sensor in sensors]
     board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in FINE_TAUS]
-    neighbour = [
-        replace(column, group='neighbour', kind='neighbour', sensor=sensor)
+    lagged_gradient = [
+        replace(column, group='gradient_lag', kind='gradient_lag', sensor=sensor)
         for sensor in sensors
         for column in board
     ]
     coarse = [column for column in board if column.tau_s in BANK_TAUS]
-    flow = [*now, *(column for column in neighbour if column.tau_s in BANK_TAUS)]
+    flow = [*gradient, *(column for column in lagged_gradient if column.tau_s in BANK_TAUS)]
     product = [
         replace(column, group='product', power=power) for power in (1, 2) for column in coarse
     ]
-    mixed = [replace(column, group='mixed', power=1) for column in flow]
+    mixed = [replace(column, group='gradient_x_temperature', power=1) for column in flow]
     # The bias of a part that lags the board by m is a polynomial in its temperature t - m:
     # (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
     square = [replace(column, group='square', kind='square') for column in coarse]
     square += [replace(column, power=1) for column in square]
     square += [replace(column, group='square', kind='cube') for column in coarse]
     even = [
-        Column('even', 'even', sensor, width_k=width, power=power, range=(0.0, 1.0))
+        Column(
+            'gradient_even', 'gradient_even', sensor, width_k=width, power=power, range=(0.0, 1.0)
+        )
         for sensor in sensors
         for power in (0, 1, 2)
         for width in EVEN_WIDTHS
     ]
     even += [
-        Column('even', kind, sensor, power=power, range=UNBOUNDED)
+        Column('gradient_even', kind, sensor, power=power, range=UNBOUNDED)
         for sensor in sensors
         for kind in ('size', 'square')
         for power in (0, 1, 2)
@@ -209,7 +244,7 @@ def bank(
     # A heat pump's load is even in the heat flow; the effect of a change is even about rest.
     rest = at_rest or {}
     even += [
-        replace(column, group='change', rest_k=rest[column.sensor])
+        replace(column, group='gradient_even_about_rest', rest_k=rest[column.sensor])
         for column in even
         if rest.get(column.sensor)
     ]
@@ -224,7 +259,7 @@ def bank(
         for tau in BEND_TAUS
         for knee in np.linspace(*span_k, n_knees + 2)[1:-1].round(3).tolist()
     ]
-    return (*now, *board, *neighbour, *product, *mixed, *square, *even, *play, *bend)
+    return (*gradient, *board, *lagged_gradient, *product, *mixed, *square, *even, *play, *bend)
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
@@ -253,7 +288,7 @@ _FORMS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Flo
     'cube': (lambda x: x * x * x, lambda x: 3.0 * x * x),
     'size': (np.abs, np.sign),
     'bend': (lambda x: np.maximum(x, 0.0), lambda x: (x > 0.0).astype(np.float64)),
-    'even': (
+    'gradient_even': (
         lambda x: by_element(math.tanh, x * x),
         lambda x: 2.0 * x * (1.0 - by_element(math.tanh, x * x) ** 2),
     ),
@@ -375,6 +410,6 @@ def _source(column: Column, layout: Layout) -> tuple[int, str, float, float]:
         place = BOARD
     else:
         place = layout.gradients[column.sensor]
-    width = column.width_k if form == 'even' else 1.0
+    width = column.width_k if form == 'gradient_even' else 1.0
     rest = column.knee_k if form == 'bend' else column.rest_k
     return place, form, width, rest if form != 'line' else 0.0

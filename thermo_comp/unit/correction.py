@@ -159,7 +159,7 @@ class Correction:
         raw = self.table.raw(states)
         beyond = (raw - self.table.held(raw))[:, 0].tolist()
         columns = zip(beyond, self.table.columns, strict=True)
-        gradients = [0.0, *(one for one, column in columns if column.kind == 'now')]
+        gradients = [0.0, *(one for one, column in columns if column.kind == 'gradient')]
         of_columns = float(self.table.excess(raw).max(initial=0.0))
         return Excess(
             over[is_dynamic], too_fast[is_dynamic], max(gradients, key=abs), curves + of_columns

@@ -107,7 +107,7 @@ class Curves:
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """Evaluate what each axis' set leaves unexplained, a variance [m^2/s^4], (2, 3, n)."""
+        """Evaluate the unexplained variance of each set and axis [m^2/s^4], shape (2, 3, n)."""
         if not self._has_lacks:
             return self._residuals
         result = np.repeat(self._residuals, len(board), axis=2)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns predictions for a thermal state: the slow part of the error variance (parameters, and lags
-whose start was not seen), and hypothetical states: a soak, a ramp, a step.
+whose start was not seen), and hypothetical states: a soak and a ramp.
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
 of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
@@ -143,13 +143,4 @@ def ramp_states(
         states[:, place] = end * (1.0 - np.exp(-np.asarray(lasted_s) / tau))
     for (_, width), place in layout.plays.items():
         states[:, place] = -np.sign(rate) * width
-    return states
-
-
-def step_states(calibration: Calibration, temperature: float, since_s: Floats) -> Floats:
-    """Build the states at times [s] after board and case jumped by 1 K out of a soak."""
-    states = ramp_states(calibration, np.full(len(since_s), temperature))
-    for (name, tau), place in Layout(Correction(calibration).memory).lags.items():
-        if name == BOARD_INPUT:
-            states[:, place] = np.exp(-since_s / tau)
     return states

@@ -12,6 +12,7 @@ from . import calibration as unit
 from .calibration import Calibration, RegimeSet, parameter_layout
 from .functions import Polynomial
 from .posterior import Posterior
+from .provenance import Provenance
 from .rate_bias import LARGEST_RATE, NIL, Gyroscope, RateCurve, RateSet, RateTerm
 
 
@@ -41,7 +42,7 @@ def rate_triad(calibration: Calibration) -> Calibration:
         misalignment=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         misalignment_sd=NIL,
         response=tuple(unit.ResponseTerm(**vars(term), scale=NIL) for term in gyroscope.response),
-        provenance=unit.Provenance(),
+        provenance=Provenance(),
         evidence=(),
         posterior=None,
         gyroscope=None,

@@ -47,7 +47,7 @@ class Term:
     def largest(self, farthest_k: float) -> float:
         """Return the largest value of the column within `farthest_k` [K] of the reference."""
         column = self.column
-        physical = {'even': 1.0, 'rate': _RATE_K_S}.get(
+        physical = {'gradient_even': 1.0, 'rate': _RATE_K_S}.get(
             column.kind, (_DIFFERENCE_K + abs(column.rest_k)) ** column.order
         )
         return min(max(map(abs, column.range)), physical) * float(farthest_k) ** column.power

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns ``fleet fit``: the calibrations of many units, with their table and statistics."""
+
+from pathlib import Path
+from typing import Any
+
+from ..text import counted, one_line
+from . import shared_options as options
+from .output import Output, micro, picked
+from .shared_options import argument, option
+
+
+def fleet_fit(
+    folder: str = argument('DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR'),
+    output: Path = option(
+        'Folder of the results; an earlier run is continued.', ..., '--output', '-o'
+    ),
+    settings: dict[str, Any] = options.fitting,
+    scheduler: str | None = option(
+        'Address of a running Dask scheduler, as tcp://host:8786; default: this machine alone.',
+        metavar='URL',
+    ),
+    workers: int | None = option('Processes on this machine; default: all processors.', min=1),
+    no_certificates: bool = option(
+        'Write no certificates, which halves the work.', False, '--no-certificates'
+    ),
+    with_prior: bool = option(
+        'Fit units with incomplete data again, with the prior of the others.',
+        False,
+        '--with-prior',
+    ),
+    earlier: list[Path] | None = option(
+        'fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'
+    ),
+    topics: Any = options.reading,
+    out: Output = options.out,
+) -> None:
+    """
+    Fit every unit below a folder.
+
+    Each folder of bags is a thermal test of a unit; bags directly in DIR are
+    sorted by the serial in them. Results go to OUT/units, the table to
+    OUT/fleet.parquet and .csv, its statistics to OUT/fleet.html, the prior of
+    the valid units (as by `thermo_comp prior`) to OUT/prior.yaml. A second
+    run only does what is missing or has changed. Exit code 1 if a unit has no
+    valid calibration from all of its bags.
+
+    Example:
+      thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates
+    """
+    from ..fitting import FitOptions
+    from ..fleet.run import fit_fleet
+    from ..fleet.table import read_parquet
+    from ..fleet.work import FleetOptions
+
+    with options.usage_of():
+        wanted = FleetOptions(
+            fit=FitOptions(**settings), topics=topics, certificates=not no_certificates
+        )
+    before = [row for path in earlier or () for row in read_parquet(path)]
+    state = 'no test has begun'
+    with out.progress('fitting') as show:
+
+        def tell(n: int, total: int, _row: object) -> None:
+            nonlocal state
+            state = f'{n} of {counted(total, "test")} done'
+            show(n / total)
+
+        try:
+            result = fit_fleet(
+                folder,
+                output,
+                wanted,
+                with_prior=with_prior,
+                scheduler=scheduler,
+                n_workers=workers,
+                earlier=before,
+                tell=tell,
+            )
+        except KeyboardInterrupt:
+            out.note(f'interrupted: {state}, kept in {output}; the same command does the others')
+            raise
+    summary = result.summary
+    out.table(
+        ('test', 'serial', 'verdict', 'static ug', 'dynamic ug', 'bags'),
+        [
+            (
+                *(_short(row['name']), _short(row['serial']), row['verdict']),
+                *(_micro(row[name]) for name in ('static_ug', 'dynamic_ug')),
+                f'{row["n_bags"]}-{row["n_left_out"]}' if row['n_left_out'] else row['n_bags'],
+            )
+            for row in result.rows
+        ],
+        title='|f| - g at rest, RMS',
+    )
+    out.told((row['name'], str(row['chosen']), None) for row in result.rows)
+    for row in result.rows:
+        # Of a test with a calibration the reservations name the bags left out, too.
+        said = (row['problem'], row['reservations'] or row['left_out'])
+        out.points(f'{row["name"]}: {one}' for one in said if one)
+    out.points(
+        f'{one.name}: {one.label} {one.value:.4g} {one.unit}, median {one.middle:.4g}: '
+        f'{one.z:+.1f} sd'
+        for one in summary.outliers
+    )
+    out.points(
+        f'{one.serial}: {one.worst.constant} changed by {one.worst.change:+.4g} {one.worst.unit} '
+        f'(sd {one.worst.sd:.2g}) from {one.earlier} to {one.later}'
+        for one in summary.drifts
+        if one.is_significant
+    )
+    if result.prior is not None:
+        out.line(f'{result.prior}: prior of the type, from the valid units')
+    elif with_prior:
+        out.line(f'- fitted without a prior: {result.no_prior}')
+    out.line(
+        f'{result.page}: {result.n_fitted} of {counted(len(result.rows), "test")} calibrated; '
+        f'{counted(result.n_done, "test")} done in this run, '
+        f'{len(result.rows) - result.n_done} in an earlier one'
+    )
+    out.end(
+        int(not result.is_whole),
+        **picked(result, 'rows n_fitted n_done parquet csv page prior'),
+        **picked(summary, 'verdicts outliers drifts'),
+    )
+
+
+def _micro(value: object) -> str | None:
+    return micro(value) if isinstance(value, float) else None
+
+
+def _short(name: object) -> str:
+    """Keep the end of a long name, which differs most, so that the table fits 80 columns."""
+    clean = one_line(str(name))
+    return clean if len(clean) <= 22 else f'~{clean[-21:]}'

@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns the origin of a calibration: its bags, residuals and the evidence for its columns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from ..quantities import QUANTITIES
+
+_Error = Annotated[float, QUANTITIES['error']]
+_Number = Annotated[int, QUANTITIES['number']]
+_WeightSd = Annotated[float, QUANTITIES['deviation of a weight']]
+
+
+@dataclass(frozen=True)
+class GroupEvidence:
+    """Contribution of one group of columns to the fit."""
+
+    group: Annotated[str, 'The group, as in `response`.']
+    part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
+    explains_m_s2: Annotated[_Error, "RMS of the group's correction."]
+    effective_parameters: Annotated[
+        float, QUANTITIES['number'], 'Effective number of weights determined by the data.'
+    ]
+    log_evidence_change: Annotated[
+        float, QUANTITIES['log evidence'], 'Loss of log evidence without the group.'
+    ]
+    prior_sd: Annotated[tuple[_WeightSd, ...], "Prior sd of the group's weights."]
+
+
+@dataclass(frozen=True)
+class Source:
+    """One bag that the calibration was fitted on."""
+
+    name: str
+    sha256: str = ''
+    n_samples: _Number = 0
+
+
+@dataclass(frozen=True)
+class ResidualSummary:
+    """|g| error over one section of the fitted data, before and after correction."""
+
+    section: str
+    n_windows: _Number
+    raw_rms_m_s2: _Error
+    rms_m_s2: _Error
+    max_m_s2: _Error
+    left_out_rms_m_s2: Annotated[
+        _Error | None, 'On each position by a fit to the others (leave one out); null if unknown.'
+    ] = None
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where the numbers come from."""
+
+    created: str = ''
+    tool_version: str = ''
+    model: str = ''
+    sources: tuple[Source, ...] = ()
+    residuals: tuple[ResidualSummary, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def left_out_rms(self) -> float:
+        """RMS of ``|f| - g`` on positions left out of the fit [m/s^2]; NaN where unknown."""
+        values = [
+            summary.left_out_rms_m_s2 for summary in self.residuals if summary.section == 'all'
+        ]
+        return math.nan if not values or values[0] is None else values[0]
