@@ -189,7 +189,7 @@ def draw_year(axes: Axes) -> None:
             at = new.day == one
             for name, values in (('old', old.miss), ('new', new.miss), ('claim', new.claim)):
                 error[name].append(float(np.sqrt(np.mean(values[at] ** 2))) / units.UG)
-        found = update(new, calibrated, source_of(chosen, ''), ahead=7.0)
+        found = update(new, calibrated, source_of(chosen, '', 7.0), ahead=7.0)
         if found.judged.is_better:
             calibrated = found.calibration
     days = np.arange(len(error['old']))

@@ -257,6 +257,7 @@ def test_the_watch_names_the_day_and_the_class_of_temperature() -> None:
     year = watch(series_of(rests(unit, upright, no_error, days=61), unit), unit)
     assert [row.n_rests for row in year.periods] == [9] * 20 + [3]
     assert healthy.forecast[0] < healthy.forecast[1] <= healthy.forecast[2]
+    assert watch(series_of(rests(unit, upright, no_error), unit), unit, 1.0).forecast[0] == np.inf
     aged = watch(series_of(rests(unit, upright, jump_of(400.0, 10.0)), unit), unit)
     assert (aged.exit_code, aged.left, aged.forecast) == (1, '2030-01-11', ())
 
@@ -278,7 +279,7 @@ def test_update_by_the_command_line(tmp_path: Path, unit_file: Path, cli: Cli) -
     assert 'the rests cannot tell x, y' in said.stdout
     assert 'a shock, no ageing' in said.stdout
     written = load_calibration(new)
-    assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40.000000000'
+    assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
     # The new file removes what the old one leaves, and the history shows both.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']

@@ -44,7 +44,7 @@ def update(
 
     check_output(output, CALIBRATION, overwrite=force, others=[calibration, *rests])
     old = load_calibration(calibration)
-    logged, source, notes = read_rests(rests, old)
+    logged, source, notes = read_rests(rests, old, ahead=ahead)
     created = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
     result = run(series_of(logged, old, gravity), old, source, created, ahead)
     out.points(notes)
@@ -85,17 +85,23 @@ def update(
 
 
 def evaluate_rests(
-    rests: list[Path], calibration: Path, gravity: float | None, out: Output
+    rests: list[Path],
+    calibration: Path,
+    gravity: float | None,
+    tolerance: float | None,
+    out: Output,
 ) -> None:
     """Watch the drift of a unit over a rest log; exit code 1 once it has left its claim."""
     from ..field.series import read_rests, series_of
     from ..field.watch import LIMIT, watch
     from ..unit.calibration_file import load_calibration
+    from ..unit.gravity import spoken
 
     known = load_calibration(calibration)
     logged, _, notes = read_rests(rests, known, is_for_update=False)
-    result = watch(series_of(logged, known, gravity), known)
+    result = watch(series_of(logged, known, gravity), known, tolerance)
     out.points(notes)
+    limit = f'{LIMIT:g} times the claim' if tolerance is None else spoken(tolerance)
     for rows, name in ((result.periods, 'from'), (result.temperatures, 'board')):
         out.table(
             (name, 'rests', 'degC', 'mean ug', 'RMS ug', 'claimed ug', 'within'),
@@ -106,7 +112,7 @@ def evaluate_rests(
                 )
                 for row in rows
             ],
-            title=f'|f| - g at rest; within: RMS of at most {LIMIT:g} times the claim',
+            title=f'|f| - g at rest; within: RMS of at most {limit}',
         )
     out.line(str(result))
     out.end(

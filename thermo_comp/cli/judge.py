@@ -52,7 +52,7 @@ def evaluate(
             raise options.usage(
                 'rest logs are evaluated alone, with one calibration, without --csv'
             )
-        evaluate_rests(logs, calibration[0], judging['gravity'], out)
+        evaluate_rests(logs, calibration[0], judging['gravity'], judging['tolerance'], out)
         return
     if csv is not None:
         kind = TABLES.get(csv.suffix, CSV)

@@ -144,7 +144,7 @@ class Model:
         self.rows, self.changes, self.since = rows, tuple(changes), since
         self.prior = np.zeros((n, n)) if posterior is None else posterior.covariance()
         bias, scale = rows.by_level[:, :3], rows.by_level[:, 3:]
-        age = rows.time - since
+        age = np.maximum(rows.time - since, 0.0)
         elapsed = np.minimum.outer(age, age)
         along = bias @ bias.T
         is_same = rows.start[:, np.newaxis] == rows.start
@@ -317,7 +317,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     by a slope of each axis, (n_parameters, 3); `ahead`: time of use after the last rest [days].
     """
     rows = model.rows
-    age = (rows.time - model.since)[:, np.newaxis]
+    age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]
     walk = np.repeat([ageing.bias**2, ageing.scale**2], 3)
     crossed = rows.by_parameter @ model.prior + (age * rows.by_level * walk) @ to_file.T
     prior = model.prior + (to_file * walk * float(age[-1, 0])) @ to_file.T

@@ -32,8 +32,9 @@ from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
 
 _DAY_NS = 86_400e9
-#: Name of the source of an update, followed by the time of its last rest.
-_UNTIL = 'rests until '
+#: Name of the source of an update: time of its last rest, days by which its claim was aged.
+_UNTIL, _AGED = 'rests until ', ', claim aged '
+_LONGEST_DAYS = 36525.0  # a century
 #: Largest file of a log that is read [bytes]: a day of the node has at most 320 kB.
 _LARGEST = 1 << 26
 #: Windows of one start are averaged while the direction of f [rad] and the temperature [K] differ
@@ -95,10 +96,15 @@ def is_rest_log(path: Path) -> bool:
 
 
 def read_rests(
-    paths: Sequence[Path], calibration: Calibration, *, is_for_update: bool = True
+    paths: Sequence[Path],
+    calibration: Calibration,
+    *,
+    ahead: float = 0.0,
+    is_for_update: bool = True,
 ) -> tuple[list[tuple[Start, Rest]], Source, list[str]]:
     """
-    Read rest logs of a calibration's unit: its rests, the logs as a source, and notes.
+    Read rest logs of a calibration's unit: its rests, the logs as a source of an update that is
+    aged `ahead` days, and notes.
 
     Rests before the calibration are left out, unless all are; for an update those of an earlier
     one always are. Raises RecordingError if no rest of the unit is left.
@@ -131,8 +137,10 @@ def read_rests(
         )
     if not rests:
         raise RecordingError(f'no rest of unit {unit.serial}', ', '.join(map(str, paths)))
-    begin, is_update = valid_since(calibration)
-    later = [(start, rest) for start, rest in rests if rest.stamp_ns > begin * _DAY_NS]
+    begin, _, is_update = valid_since(calibration)
+    # The end is stated to the second.
+    first_ns = begin * _DAY_NS + 1e9 * is_update
+    later = [(start, rest) for start, rest in rests if rest.stamp_ns > first_ns]
     if is_update and not is_for_update:
         notes.append(f'{counted(len(rests) - len(later), "window")} took part in its last update')
     elif is_update and not later:
@@ -142,28 +150,34 @@ def read_rests(
         notes.append(f'{counted(len(rests) - len(later), "window")} before {day}: left out')
         rests = later
     digest = hashlib.sha256(b''.join(contents)).hexdigest()
-    return rests, source_of(rests, digest), notes
+    return rests, source_of(rests, digest, ahead), notes
 
 
-def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str) -> Source:
-    """Describe rests for the provenance of an update: their last is in the name."""
-    end = np.datetime64(rests[-1][1].stamp_ns, 'ns')
-    return Source(f'{_UNTIL}{end}', sha256, sum(rest.n for _, rest in rests))
+def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
+    """Describe rests for the provenance of an update: its name says their end and `ahead`."""
+    end = np.datetime64(rests[-1][1].stamp_ns, 'ns').astype('datetime64[s]')
+    n_samples = sum(rest.n for _, rest in rests)
+    return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
 
 
-def valid_since(calibration: Calibration) -> tuple[float, bool]:
+def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     """
-    Return from when a calibration holds [days since 1970], and whether that is its last update's
-    last rest; else it is the date of the file, or minus infinity without a date.
+    Return from when a calibration holds [days since 1970], until when its claim has been aged, and
+    whether this is by an update, from its last rest on; else it is the date of the file, or minus
+    infinity without a date.
     """
     names = [one.name for one in calibration.provenance.sources if one.name.startswith(_UNTIL)]
     text = names[-1].removeprefix(_UNTIL) if names else calibration.provenance.created
+    date, _, aged = text.partition(_AGED)
     try:
-        moment = np.datetime64(text.removesuffix('Z'), 'ns')
+        moment = np.datetime64(date.removesuffix('Z'), 'ns')
+        ahead = float(aged.removesuffix(' d') or 0.0)
     except ValueError:
-        return -np.inf, False
-    known = not np.isnat(moment)
-    return (int(moment.astype(np.int64)) / _DAY_NS if known else -np.inf), bool(names) and known
+        return -np.inf, -np.inf, False
+    if np.isnat(moment) or not 0.0 <= ahead < _LONGEST_DAYS:
+        return -np.inf, -np.inf, False
+    begin = int(moment.astype(np.int64)) / _DAY_NS
+    return begin, begin + ahead, bool(names)
 
 
 def series_of(

@@ -119,9 +119,10 @@ def update(
             f'rests of {counted(n_starts, "start")}, need 3 at least: each start has a bias of '
             'its own, and the update is judged on starts left out'
         )
-    begin, first = valid_since(calibration)[0], float(series.time[0])
-    # The walk begins at the calibration, if its date is known and before the rests.
-    since = begin if -np.inf < begin < first else first
+    _, aged, is_update = valid_since(calibration)
+    first, last = float(series.time[0]), float(series.time[-1])
+    # The walk begins where the claim's ageing ends, or at the first rest if no date is before it.
+    since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since)
     to_file, bend = _levels(calibration), _slopes(calibration)
     solution = solve(model, ageing, to_file, bend, ahead)

@@ -41,11 +41,12 @@ class Row:
     mean: float
     rms: float
     claim: float
+    limit: float
 
     @property
     def is_within(self) -> bool:
-        """Whether the RMS is within the bound of the claim."""
-        return self.rms <= LIMIT * self.claim
+        """Whether the RMS is within the limit: the tolerance, or a multiple of the claim."""
+        return self.rms <= self.limit
 
 
 @dataclass(frozen=True)
@@ -92,11 +93,14 @@ class Watch:
         return str(np.datetime64(self.last, 'D') + np.timedelta64(int(days), 'D'))
 
 
-def watch(series: Series, calibration: Calibration) -> Watch:
-    """Compare the rests with the claim of a calibration, and forecast its end."""
+def watch(series: Series, calibration: Calibration, tolerance: float | None = None) -> Watch:
+    """
+    Compare the rests with the claim of a calibration, or with a tolerance of ``|f| - g`` [m/s^2],
+    and forecast when the unit leaves it.
+    """
     names = np.array([str(np.datetime64(int(day), 'D')) for day in series.day])
     ordered = np.unique(names)
-    days = _rows(series, names, ordered.tolist())
+    days = _rows(series, names, ordered.tolist(), tolerance)
     together = -(-len(ordered) // _PERIODS)
     firsts = ordered[np.searchsorted(ordered, names) // together * together]
     lower = np.floor(series.temperature / _CLASS_K) * _CLASS_K
@@ -121,22 +125,25 @@ def watch(series: Series, calibration: Calibration) -> Watch:
         walk = np.repeat([ageing.bias**2, ageing.scale**2], 3)
         rate = float(of_levels**2 @ walk)
         sd = float(np.sqrt(variance))
-        bound = LIMIT * float(np.sqrt(np.mean(series.claim**2)))
+        bound = tolerance or LIMIT * float(np.sqrt(np.mean(series.claim**2)))
         interval = passage(0.0, sd, rate, bound)
         forecast = passage(error, sd, rate, bound) if left is None else ()
-    periods = _rows(series, firsts, ordered[::together].tolist())
-    temperatures = _rows(series, np.array(classes), warmer)
+    periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
+    temperatures = _rows(series, np.array(classes), warmer, tolerance)
     return Watch(days, periods, temperatures, last, left, forecast, interval, ageing)
 
 
-def _rows(series: Series, labels: Floats, ordered: Sequence[str]) -> tuple[Row, ...]:
+def _rows(
+    series: Series, labels: Floats, ordered: Sequence[str], tolerance: float | None
+) -> tuple[Row, ...]:
     rows = []
     for name in ordered:
         at = labels == name
         weight = series.n_windows[at] / series.n_windows[at].sum()
-        means = [float(weight @ one[at]) for one in (series.temperature, series.miss)]
-        squares = [float(np.sqrt(weight @ one[at] ** 2)) for one in (series.miss, series.claim)]
-        rows.append(Row(name, int(at.sum()), *means, *squares))
+        temperature, mean = (float(weight @ one[at]) for one in (series.temperature, series.miss))
+        rms, claim = (float(np.sqrt(weight @ one[at] ** 2)) for one in (series.miss, series.claim))
+        limit = tolerance or LIMIT * claim
+        rows.append(Row(name, int(at.sum()), temperature, mean, rms, claim, limit))
     return tuple(rows)
 
 
