@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the drawings of the pages: the chamber test with its cyclogram, an afternoon at home, and the
-viewer's layout.
+Owns the drawings of the pages: the chamber test with its cyclogram, an afternoon at home, a unit
+in the year after its calibration, and the viewer's layout.
 
     python docs/make_pictures.py
 """
@@ -10,6 +10,7 @@ viewer's layout.
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyBboxPatch, Polygon, Rectangle
 
 import thermo_comp as tc
+from thermo_comp.field.series import series_of, source_of
+from thermo_comp.field.update import update
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import simulate
@@ -28,6 +31,7 @@ ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / 'docs' / 'images'
 LAYOUT = ROOT / 'config' / 'thermo_comp.foxglove.json'
 BLUE, RED, GREY = '#0072B2', '#D55E00', '#5A5A5A'
+sys.path.insert(0, str(ROOT / 'benchmarks'))
 
 
 def draw_chamber(axes: Axes) -> None:
@@ -170,6 +174,36 @@ def draw_layout(figure: Figure) -> None:
     place(saved['layout'], 0.0, 0.0, 1.0, 1.0)
 
 
+def draw_year(axes: Axes) -> None:
+    """Draw |f| - g of a vehicle's unit over a year: as calibrated, and updated every week."""
+    import field_units as units
+
+    laboratory = units.calibration()
+    history = units.live('level', 5, 364, units.Process(shock_day=140.0))
+    day, calibrated = np.array(history.day), laboratory
+    error: dict[str, list[float]] = {'old': [], 'new': [], 'claim': []}
+    for week in range(52):
+        chosen = [history.rests[k] for k in np.flatnonzero(day // 7 == week)]
+        old, new = (series_of(chosen, one) for one in (laboratory, calibrated))
+        for one in np.unique(new.day):
+            at = new.day == one
+            for name, values in (('old', old.miss), ('new', new.miss), ('claim', new.claim)):
+                error[name].append(float(np.sqrt(np.mean(values[at] ** 2))) / units.UG)
+        found = update(new, calibrated, source_of(chosen, '', 7.0), ahead=7.0)
+        if found.judged.is_better:
+            calibrated = found.calibration
+    days = np.arange(len(error['old']))
+    axes.plot(days, error['old'], color=RED, lw=0.8, label="the chamber's calibration")
+    axes.plot(days, error['new'], color=BLUE, lw=0.8, label='updated every week')
+    claim = 2.0 * np.array(error['claim'])
+    axes.fill_between(days, 0.0, claim, color=BLUE, alpha=0.15, label='2 sd of its claim')
+    axes.axvline(140.0, color=GREY, lw=0.8, ls=':')
+    axes.text(142.0, 0.9 * max(error['old']), 'a shock', color=GREY)
+    axes.set(xlabel='days after the chamber', ylabel='|f| - g at rest, RMS of a day [ug]')
+    axes.set(xlim=(0, 364), ylim=(0, None))
+    axes.legend(loc='upper right', frameon=False)
+
+
 def main() -> None:
     """Write the drawings."""
     plt.rcParams.update({'svg.hashsalt': 'thermo_comp', 'font.size': 8, 'svg.fonttype': 'none'})
@@ -181,6 +215,9 @@ def main() -> None:
     figure = plt.figure(figsize=(9, 3.0), layout='constrained')
     draw_afternoon(figure.subplots())
     figure.savefig(IMAGES / 'afternoon.png', dpi=110, metadata={'Software': None})
+    figure = plt.figure(figsize=(9, 3.2), layout='constrained')
+    draw_year(figure.subplots())
+    figure.savefig(IMAGES / 'year.png', dpi=110, metadata={'Software': None})
     figure = plt.figure(figsize=(9, 5))
     draw_layout(figure)
     figure.savefig(IMAGES / 'viewer.png', dpi=110, metadata={'Software': None})

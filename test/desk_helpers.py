@@ -23,7 +23,7 @@ MADE = (
     *('unit.yaml', 'unit42.yaml', 'unit01.yaml', 'unit02.yaml', 'unit03.yaml', 'map.yaml'),
     *('autopilot.params', 'xsens_acc.calib', 'accel_calib.yaml', 'chamber.mcap', 'unit42_p01'),
     *('freezer.mcap', 'log.csv', 'tumble.txt', 'flight.ulg', 'flight.bin', 'bags/fleet'),
-    'bags/unit42',
+    *('bags/unit42', 'rests'),
 )
 _EXPORTS = {
     'autopilot.params': 'px4',
@@ -110,6 +110,15 @@ class Desk:
             from fleet_helpers import write_unit
 
             write_unit(path / 'unit42', 42, 1)
+        elif name == 'rests':
+            from field_helpers import rests, upright, write_log
+
+            from thermo_comp.unit.calibration_file import load_calibration
+            from thermo_comp.unit.gravity import MICRO_G
+
+            off = np.array([0.0, 0.0, 25.0 * MICRO_G])
+            unit = load_calibration(self._make('unit42.yaml'))
+            write_log(path, rests(unit, upright, lambda _: off, turn_on=5.0 * MICRO_G))
         elif name == 'log.csv':
             rng = np.random.default_rng(3)
             rows = [

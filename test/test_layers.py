@@ -33,6 +33,7 @@ LAYERS = {
     'fitting': 3,
     'replay': 3,
     'api': 4,
+    'field': 4,
     'judging': 4,
     'convert': 4,
     'report': 5,
@@ -65,7 +66,7 @@ HOMES = {
 }
 
 # The mathematics reads no clock.
-PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting'}
+PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
 CLOCK_EXCEPTIONS = {
     'fitting/assembly.py'  # the date of a fit is part of its provenance

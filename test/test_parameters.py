@@ -56,7 +56,9 @@ def test_every_parameter_is_described() -> None:
         for entry in fields(NodeConfig):
             found = node.describe_parameter(entry.name)
             assert found.description == entry.metadata['description']
-            assert found.read_only == (entry.name in {'calibration_directory', 'topics'})
+            assert found.read_only == (
+                entry.name in {'calibration_directory', 'topics', 'rest_log'}
+            )
             assert found.type == Parameter.Type.from_parameter_value(entry.default).value
             assert bool(found.floating_point_range) == isinstance(entry.default, float)
             assert bool(found.integer_range) == isinstance(entry.default, int)

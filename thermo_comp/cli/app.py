@@ -3,8 +3,9 @@
 """
 Owns the entry point of the command line: its commands and exit codes.
 
-0: done. 1: the data or the result is bad. 2: the command line is wrong. 70: a bug of this program,
-whose traceback goes into a file. Every error is one line on stderr.
+0: done. 1: the data or the result is bad. 2: the command line is wrong. 3: an update gains
+nothing. 70: a bug of this program, whose traceback goes into a file. Every error is one line on
+stderr.
 
 Heavy libraries are imported by the commands when they run, so that ``--help`` is fast.
 """
@@ -21,7 +22,7 @@ from typer import rich_utils
 from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
-from . import bags, convert, demo, fit, fleet, judge, output, record, simulate
+from . import bags, convert, demo, field, fit, fleet, judge, output, record, simulate
 from .shared_options import expanded, option
 
 # Base class of all errors in a command line, which typer does not export.
@@ -60,7 +61,7 @@ def _top(
 
 for _command in (
     *(record.record, fit.fit, fit.prior, judge.evaluate, bags.replay, bags.play, bags.info),
-    *(judge.report, convert.convert, convert.export, convert.import_),
+    *(field.update, judge.report, convert.convert, convert.export, convert.import_),
     *(simulate.simulate, demo.demo),
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))

@@ -9,12 +9,15 @@ from typing import Any
 
 from ..files import CSV, PAGE, check_output, shown_name
 from . import shared_options as options
+from .field import evaluate_rests
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
 from .shared_options import argument, option
 
 
 def evaluate(
-    bags: list[Path] = argument('Bags of one unit, any positions.', metavar='BAG...'),
+    bags: list[Path] = argument(
+        'Bags of one unit, any positions, or its rest logs.', metavar='BAG...'
+    ),
     calibration: list[Path] = option(
         'Calibration; the first is judged, more are compared.', ..., '--calibration', '-c'
     ),
@@ -30,17 +33,27 @@ def evaluate(
     The verdict compares the RMS residual with your --tolerance or, without
     one, with the uncertainty that the calibration claims for the same
     windows; six positions or more show which axis has moved. Exit code 0
-    only if the calibration is shown to be valid.
+    only if the calibration is shown to be valid. Rest logs of the node
+    instead of bags show the drift over the days and when the claim ends.
 
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
     """
+    from ..field.series import is_rest_log
     from ..judging.evaluation import drifts_of, history_of
     from ..judging.evaluation import evaluate as run
     from ..judging.windows import columns_of
     from ..recording.writer import TABLES, table_writer
     from ..unit.calibration_file import load_calibration
 
+    logs = [path for path in bags if is_rest_log(path)]
+    if logs:
+        if len(logs) < len(bags) or len(calibration) > 1 or csv is not None:
+            raise options.usage(
+                'rest logs are evaluated alone, with one calibration, without --csv'
+            )
+        evaluate_rests(logs, calibration[0], judging['gravity'], judging['tolerance'], out)
+        return
     if csv is not None:
         kind = TABLES.get(csv.suffix, CSV)
         check_output(csv, kind, overwrite=force, others=[*bags, *calibration])

@@ -21,7 +21,7 @@ from rclpy.subscription import Subscription
 
 from ..online.checks import RATE_TOLERANCE
 from ..online.compensator import CONTINUED, HELD, SWAPPED, Compensator, CompensatorStatus
-from ..text import one_line
+from ..text import counted, one_line
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT
@@ -102,7 +102,8 @@ class Reporter:
                 # Of data time.
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
-        findings = [*self._inputs(), *findings_of(loaded, status, new, rate, silence_s)]
+        found = findings_of(loaded, status, new, rate, silence_s)
+        findings = [*self._inputs(), *self._lost_rests(), *found]
         findings.sort(key=lambda finding: -finding[0])
         values = self._values(loaded, status, counts, rate)
         message = DiagnosticStatus(
@@ -152,6 +153,13 @@ class Reporter:
                 level = _ERROR if k < 2 else _WARN
                 yield level, f'no messages of a publisher on {topic}: {mismatch}'
 
+    def _lost_rests(self) -> Iterator[Finding]:
+        """Name the reason if rests could not be kept."""
+        rests = self._relay.rests
+        if rests is not None and rests.log.reason:
+            lost = counted(rests.log.n_lost, 'rest')
+            yield _WARN, f'{lost} not kept in the rest log: {rests.log.reason}'
+
     def _values(
         self,
         loaded: LoadedCalibration,
@@ -186,6 +194,12 @@ class Reporter:
                 'gravity residual sd [m/s^2]': f'{gravity.residual_sd:.3e}',
                 'gravity windows': str(gravity.n_windows),
                 'standing': str(gravity.is_still),
+            }
+        if (rests := self._relay.rests) is not None:
+            values |= {
+                'rests gathered': str(rests.log.n_rests),
+                'days with rests': str(rests.log.n_days),
+                'rests not kept': str(rests.log.n_lost),
             }
         densities, gyroscope = calibration.noise_density_m_s2_sqrt_hz, calibration.gyroscope
         values |= _of_axes('noise density {} [m/s^2/sqrt(Hz)]', densities)

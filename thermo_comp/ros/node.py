@@ -108,6 +108,8 @@ class CompensationNode:
         """Destroy the node."""
         self._reader.close()
         self._requests.close()
+        if self._relay.rests is not None:
+            self._relay.rests.log.close()
         self.node.destroy_node()
 
     def _report_every(self, period_s: float) -> None:
@@ -115,6 +117,7 @@ class CompensationNode:
 
     def _report(self) -> None:
         self._relay.look()
+        self._relay.gather()
         self._reporter.report()
 
     @property

@@ -49,7 +49,7 @@ def _parameter(
 
 @dataclass(frozen=True, slots=True)
 class NodeConfig:
-    """The parameters; all but two can be changed while the node runs. Descriptions have units."""
+    """The parameters; three are fixed at start, all others can be set while the node runs."""
 
     calibration_file: str = _parameter(
         '',
@@ -70,6 +70,13 @@ class NodeConfig:
         '',
         'Topics of inputs with other names: INPUT=TOPIC[:FIELD], separated by commas, or a file '
         'of such lines, as in config/drivers. Only at start.',
+        longest=4096,
+        is_fixed=True,
+    )
+    rest_log: str = _parameter(
+        '',
+        'Folder for windows of 10 s at rest, which `thermo_comp update` and `evaluate` read, at '
+        'most 10 MB a month; empty keeps none. Only at start.',
         longest=4096,
         is_fixed=True,
     )

@@ -30,6 +30,7 @@ from .fields import LiveField, live_field
 from .messages import message_class, qos_of
 from .parameters import NodeConfig, named_topics
 from .reader import LoadedCalibration
+from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
 #: Without samples, readings take effect once they are older than the newest by this [ns]: a sample
@@ -82,6 +83,9 @@ class Relay:
             (loop.publisher(message_class(one.type), one.name, qos_of(one)).publish, pack)
             for one, pack in FLAGS.items()
         ]
+        self.rests = RestKeeper(config.rest_log) if config.rest_log else None
+        #: Samples that the rest log has not summed yet; None without one.
+        self.waiting: list[bytes] | None = [] if self.rests else None
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
 
@@ -175,9 +179,20 @@ class Relay:
         self.traffic.n_contested += n_others
         if not messages:
             return
+        waiting = self.waiting
+        if waiting is not None:
+            waiting += messages
         if self._readings:
             messages = self._relay_with_readings(messages, received_ns)
         self._relay(messages)
+        if waiting is not None and len(waiting) >= BLOCK:
+            self.gather()
+
+    def gather(self) -> None:
+        """Sum the samples that wait for the rest log."""
+        if self.rests is not None and self.waiting:
+            messages, self.waiting = self.waiting, []
+            self.rests.gather(messages, self.running.loaded, self.running.compensator)
 
     def advance_without_samples(self, silence_ns: int) -> None:
         """Apply readings without samples, so that the regime flag is still published."""

@@ -1,0 +1,220 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Measures updates in the field against the best filter, on units that age (`field_units.py`).
+
+    python benchmarks/field.py [--units 10] [--days 60] [--recordings ../shared/data]
+
+For each kind of platform, a vehicle level within 10 deg and a drone that is carried, units age for
+60 days: bias walk 15 ug and scale walk 10 ppm per root day, turn-on 20 ug, one shock of 300 ug a
+unit. On several days the calibration is updated with all rests so far, as `thermo_comp update`
+does, and judged on the rests of the day after; at the end its errors are compared with those of a
+Kalman filter that knows the process and the shock's start. With --recordings, the real recordings
+that are there are cut in parts, and updates are judged on the part after.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from field_recorded import judge_recordings
+from field_units import (
+    DAY_ZERO,
+    KINDS,
+    NOISE,
+    REFERENCE_C,
+    UG,
+    WINDOW_S,
+    BestFilter,
+    Floats,
+    G,
+    History,
+    K,
+    Process,
+    attitude,
+    calibration,
+    corrected,
+    live,
+    measured,
+)
+
+from thermo_comp.field.rest import Rest, encode
+from thermo_comp.field.series import Series, series_of
+from thermo_comp.field.update import update
+from thermo_comp.unit.calibration import Calibration
+
+#: Attitudes and temperatures at which the errors are taken.
+N_PROBES = 200
+LABORATORY = calibration()
+
+
+def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, Floats]:
+    """Build noiseless rests of use: rests, counts [K], warmth [K], true forces."""
+    rng = np.random.default_rng(seed)
+    force = G * np.array([attitude(kind, rng) for _ in range(N_PROBES)])
+    warmth = rng.normal(0.0, 5.0, N_PROBES)
+    counts = measured(force, warmth, state)
+    start = live(kind, 0, 1, Process()).rests[0][0]
+    rests = []
+    for number, (one, warm) in enumerate(zip(counts, warmth, strict=True)):
+        thermal = (REFERENCE_C + warm, 1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6)
+        stamp = start.start_ns + number * 10**13
+        rests.append((start, Rest(stamp, 1000, tuple(K * one), (K * NOISE * 10,) * 3, thermal)))
+    return rests, counts, warmth, force
+
+
+def errors_of(series: Series, calibrated: Calibration, force: Floats) -> Floats:
+    """Return the errors of |f| and of the axes x, y, z, shape (n, 4)."""
+    f = series.force @ np.array(calibrated.misalignment).T
+    return np.column_stack((series.miss, f - force))
+
+
+def root_mean(values: Floats) -> float:
+    """Return the RMS."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
+    """
+    Say whether the update, and the best filter, are worse than the old file on a day: whether the
+    RMS over its n starts is larger by more than its standard error, the claim over sqrt(2 n).
+    """
+    old, one = (series_of(after, given) for given in (LABORATORY, new))
+    counts = np.array([rest.mean for _, rest in after]) / K
+    warmth = np.array([rest.state[0] for _, rest in after]) - REFERENCE_C
+    of_best = np.linalg.norm(corrected(counts, warmth, kalman), axis=1) - G
+    # Windows of one attitude are averaged, as those of a series are.
+    group = np.repeat(np.arange(len(old)), old.n_windows)
+    of_best = np.bincount(group, of_best) / old.n_windows
+
+    weights = old.n_windows / np.bincount(old.start, old.n_windows)[old.start]
+    n_starts = int(old.start[-1]) + 1
+    before, *later = (
+        np.sqrt(weights @ miss**2 / n_starts) for miss in (old.miss, one.miss, of_best)
+    )
+    error = root_mean(one.claim) / np.sqrt(2.0 * n_starts)
+    found = [bool(rms > before + error) for rms in later]
+    return found[0], found[1]
+
+
+def filtered(history: History, process: Process, days: int) -> Floats:
+    """Return the state of the best filter by the first days, without the last turn-on."""
+    state = best(history, process, days).state.copy()
+    state[21:] = 0.0
+    return state
+
+
+def best(history: History, process: Process, days: int) -> BestFilter:
+    """Run the best filter over the rests of the first days, each averaged as one measurement."""
+    found = BestFilter(process)
+    rests: dict[tuple, list[Rest]] = defaultdict(list)
+    for (_, rest), day, start in zip(history.rests, history.day, history.start, strict=True):
+        if day < days:
+            rests[start, rest.state[0]].append(rest)
+    for (start, celsius), windows in rests.items():
+        mean = np.mean([one.mean for one in windows], axis=0) / K
+        variance = NOISE**2 / (WINDOW_S * len(windows))
+        now = windows[0].stamp_ns / 86400e9 - DAY_ZERO
+        found.take(now, start, mean, celsius - REFERENCE_C, variance)
+    return found
+
+
+def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, float]:
+    """Age and update one unit: squared errors at the end, comparisons by day, time of the last."""
+    shock_day = np.random.default_rng([seed, 7]).uniform(0.2, 0.8) * days
+    process = Process(shock_day=float(shock_day))
+    history = live(kind, seed, days, process)
+    day = np.array(history.day)
+    compared = []
+    for until in np.linspace(days / 6.0, days, 6).round().astype(int):
+        chosen = [history.rests[k] for k in np.flatnonzero(day < until)]
+        begin = time.perf_counter()
+        found = update(series_of(chosen, LABORATORY), LABORATORY)
+        took = time.perf_counter() - begin
+        new = found.calibration if found.judged.is_better else LABORATORY
+        after = [history.rests[k] for k in np.flatnonzero(day == until)]
+        if after:
+            kalman = filtered(history, process, until)
+            compared.append(worse(after, new, kalman))
+    state = history.states[-1]
+    rests, counts, warmth, force = probes(kind, state, seed)
+    series, before = series_of(rests, new), series_of(rests, LABORATORY)
+    kalman = filtered(history, process, days)
+    f = corrected(counts, warmth, kalman)
+    of_best = np.column_stack((np.linalg.norm(f, axis=1) - G, f - force))
+    # A claim is of one window of another start a day later: turn-on, noise, a day's walk.
+    rng = np.random.default_rng([seed, 9])
+    of_bias = np.hypot(process.turn_on, process.bias)
+    more = (series.direction * rng.normal(0.0, of_bias, (N_PROBES, 3))).sum(axis=1)
+    of_scale = rng.normal(0.0, process.scale, (N_PROBES, 3))
+    more += (series.direction * series.force * of_scale).sum(axis=1)
+    more += rng.normal(0.0, NOISE / np.sqrt(WINDOW_S), N_PROBES)
+    return (
+        {
+            'before': errors_of(before, LABORATORY, force),
+            'after': errors_of(series, new, force),
+            'best': of_best,
+            'claimed': series.claim[:, None],
+            'missed': (series.miss + more)[:, None],
+        },
+        compared,
+        took,
+    )
+
+
+def simulated(kind: str, n_units: int, days: int) -> None:
+    """Print the figures of one kind of platform."""
+    results = [unit(kind, seed, days) for seed in range(n_units)]
+    joined = {name: np.array([one[0][name] for one in results]) for name in results[0][0]}
+    print(f'\n{kind}: {n_units} units, {days} days, one shock each')
+    for column, name in enumerate(('|f|', 'x', 'y', 'z')):
+        a, b, c = (root_mean(joined[key][..., column]) / UG for key in ('before', 'after', 'best'))
+        n_worse, n_best = (
+            sum(
+                root_mean(one[0][key][:, column]) > root_mean(one[0]['before'][:, column])
+                for one in results
+            )
+            for key in ('after', 'best')
+        )
+        print(
+            f'  {name:4} before {a:6.1f} ug  after {b:6.1f}  best {c:6.1f}  ratio {b / c:.2f}  '
+            f'units worse than before {n_worse} (the best filter: {n_best})'
+        )
+    ratio = root_mean(joined['missed']) / root_mean(joined['claimed'])
+    print(f'  error / claimed sd of |f| {ratio:.2f} (0.7 .. 1.4)')
+    days_after = np.array([pair for one in results for pair in one[1]])
+    print(
+        f'  day after an update: {len(days_after)} days, worse than the old file beyond the '
+        f'standard error {days_after[:, 0].sum()} (the best filter: {days_after[:, 1].sum()})'
+    )
+    print(f'  update of {days} days: {max(one[2] for one in results):.1f} s at most')
+
+
+def log_size() -> None:
+    """Print the size of a month's log of these units."""
+    history = live('carried', 0, 30, Process())
+    size = sum(len(encode(rest)) for _, rest in history.rests)
+    size += sum(len(encode(start)) for start in {start for start, _ in history.rests})
+    print(f'log of 30 days: {size / 1e6:.2f} MB, {len(history.rests)} windows')
+
+
+def main() -> None:
+    """Print all figures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
+    parser.add_argument('--units', type=int, default=10)
+    parser.add_argument('--days', type=int, default=60)
+    parser.add_argument('--recordings', type=Path, help='folder with the real recordings')
+    arguments = parser.parse_args()
+    for kind in KINDS[: int(__import__('os').environ.get('NK', '2'))]:
+        simulated(kind, arguments.units, arguments.days)
+    log_size()
+    if arguments.recordings is not None:
+        judge_recordings(arguments.recordings)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns updates on real recordings, for the benchmark `field.py`.
+
+None of the recordings spans days, so each is cut: a fit of its first part takes the place of the
+laboratory's calibration, each further part that of a start of the node. An update by the parts so
+far is judged on the next part, against the fit of the first.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from recorded.data import GRAVITY, freezer_bag, handheld_bag
+
+import thermo_comp as tc
+from thermo_comp.api import Columns
+from thermo_comp.field import gather
+from thermo_comp.field.rest import Rest, Start
+from thermo_comp.field.series import series_of
+from thermo_comp.field.update import update
+from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.sources import fit_sources
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.recording.topics import Part, Topics
+from thermo_comp.unit.calibration import Calibration
+
+
+def part(of: Columns, begin: float, end: float) -> Columns:
+    """Cut seconds out of a recording."""
+
+    def cut(time_s: np.ndarray, *values: np.ndarray) -> tuple[np.ndarray, ...]:
+        is_in = (time_s >= begin) & (time_s < end)
+        return tuple(one[is_in] for one in (time_s, *values))
+
+    time_s, counts = cut(of.time_s, of.counts)
+    temperatures = {name: cut(*both) for name, both in of.temperatures.items()}
+    return Columns(time_s, counts, temperatures, of.start_ns, of.serial, of.name)
+
+
+def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple[Start, Rest]]:
+    """Return what a node that starts with a part would have logged of it."""
+    compensator = Compensator(calibration)
+    correction = compensator.thermal.correction
+    start = Start(
+        start_ns,
+        calibration.unit.serial,
+        calibration.unit.input,
+        calibration.gravity_m_s2,
+        'part',
+        correction.memory,
+    )
+
+    def state_now() -> tuple[tuple[float, ...], list[float]]:
+        thermal, now_ns = compensator.thermal, compensator.now_ns or 0
+        if thermal.is_unmeasured:
+            return (*thermal.sample(now_ns), 0.0, 0.0)[:7], []
+        return thermal.sample(now_ns), thermal.tracker.memory.start_shares(now_ns)
+
+    finder = gather.RestFinder(
+        correction.K[:, 0], np.array(correction.noise), calibration.unit.full_scale, state_now
+    )
+    readings = sorted(
+        (int(t * 1e9), name, float(value))
+        for name, both in of.temperatures.items()
+        for t, value in zip(*both, strict=True)
+        if name in ('board', *calibration.sensors)
+    )
+    found: list[tuple[Start, Rest]] = []
+    for t, sample in zip(of.time_s, of.counts, strict=True):
+        stamp = int(t * 1e9)
+        while readings and readings[0][0] <= stamp:
+            at, name, value = readings.pop(0)
+            compensator.push(name, at, value)
+        compensator.process(stamp, *sample.tolist())
+        found += [(start, one) for one in finder.add(np.array([stamp]), sample[np.newaxis])]
+    return found
+
+
+def cases(folder: Path, work: Path) -> Iterator[tuple[str, Path, list[float], float]]:
+    """Yield name, bag, the begins of all parts with the end [s], and the length of a window."""
+    # After the sensor's last jump (docs/real_data.md), until it is taken out.
+    yield 'freezer', freezer_bag(folder, work), [518.5, *np.arange(900.0, 1941.0, 104.0)], 10.0
+    for unit in range(3):
+        yield f'handheld {unit}', handheld_bag(folder, work, unit), [0.0, *range(80, 157, 11)], 2.0
+
+
+def judge_recordings(folder: Path) -> None:
+    """Print for each recording how its updates do on the part after."""
+    print('\nreal recordings, an update by the parts so far judged on the part after')
+    with tempfile.TemporaryDirectory() as work:
+        for name, bag, edges, window in cases(folder, Path(work)):
+            gather.SECONDS = int(window)
+            first = Topics(part=Part(edges[0], edges[1]))
+            options = FitOptions(gravity=GRAVITY, input='m/s^2')
+            calibration = fit(fit_sources([bag], first)[0], options).calibration
+            whole = tc.read(bag)
+            parts = [
+                rests_of(part(whole, *both), calibration, int(both[0] * 1e9))
+                for both in pairwise(edges[1:])
+            ]
+            parts = [one for one in parts if one]
+            old, new, n_written = [], [], 0
+            for k in range(3, len(parts)):
+                known = [one for some in parts[:k] for one in some]
+                found = update(series_of(known, calibration), calibration)
+                n_written += found.judged.is_better
+                best = found.calibration if found.judged.is_better else calibration
+                for rms, one in ((old, calibration), (new, best)):
+                    rms.append(float(np.sqrt(np.mean(series_of(parts[k], one).miss ** 2))))
+            mg = [1e3 * np.sqrt(np.mean(np.square(one))) / GRAVITY for one in (old, new)]
+            n_worse = sum(b > 1.001 * a for a, b in zip(old, new, strict=True))
+            print(
+                f'  {name:11} {len(old)} updates, {n_written} written: |f| - g of the part after '
+                f'{mg[0]:.2f} mg RMS before, {mg[1]:.2f} after; worse on {n_worse} parts'
+            )

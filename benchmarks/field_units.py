@@ -1,0 +1,221 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the ageing units of the benchmark `field.py`: their physics, their rests, and the best filter.
+
+A unit leaves the laboratory with a calibration whose error is drawn from the covariance that the
+calibration states. From then on bias and scale walk at random, each start has a bias of its own,
+and one shock moves the biases. The forward model and the Kalman filter are written here in numpy
+and share no code with the update; the filter is given the true variances and the shock's start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from thermo_comp.field.rest import Rest, Start
+from thermo_comp.thermal.memory import MemorySpec
+from thermo_comp.unit.calibration import (
+    Axes,
+    AxisReference,
+    AxisSet,
+    Calibration,
+    RegimeSet,
+    Unit,
+    parameter_layout,
+)
+from thermo_comp.unit.functions import Polynomial
+from thermo_comp.unit.posterior import posterior_of
+from thermo_comp.unit.provenance import Provenance
+
+Floats = npt.NDArray[np.float64]
+
+G = 9.80665
+UG = 1e-6 * G
+K = 300.0  # counts per m/s^2
+REFERENCE_C = 20.0
+CREATED = '2026-01-01T00:00:00Z'
+DAY_ZERO = 20454  # 2026-01-01 in days since 1970
+#: Slope of the bias [m/s^2 per K] and of the scale [1/K] that the calibration corrects.
+SLOPE, SCALE_SLOPE = 30 * UG, 1e-5
+#: Sd of the calibration's error: bias, its slope per K, scale, its slope per K, misalignment.
+PRIOR = np.repeat([10 * UG, 0.3 * UG, 10e-6, 0.3e-6, 5e-6], 3)
+#: Window: white noise 60 ug/sqrt(Hz) over 10 s.
+WINDOW_S, NOISE = 10.0, 60 * UG
+KINDS = ('level', 'carried')
+
+
+@dataclass(frozen=True)
+class Process:
+    """What the field does: walks per root day, turn-on, sd of the shock."""
+
+    bias: float = 15 * UG
+    scale: float = 10e-6
+    turn_on: float = 20 * UG
+    shock: float = 300 * UG
+    shock_day: float = np.inf
+
+
+@dataclass
+class History:
+    """Rests of a unit, and its true deviations from the calibration after each day."""
+
+    rests: list[tuple[Start, Rest]] = field(default_factory=list)
+    #: For each window: day, number of the start, direction of f.
+    day: list[int] = field(default_factory=list)
+    start: list[int] = field(default_factory=list)
+    states: list[Floats] = field(default_factory=list)
+
+
+def calibration() -> Calibration:
+    """Build the laboratory's calibration, with the covariance of its error."""
+    axis = AxisSet(
+        Polynomial((0.0, K * SLOPE)), Polynomial((1.0, SCALE_SLOPE)), residual_sd_m_s2=20 * UG
+    )
+    part = RegimeSet((-10.0, 50.0), (-1.0, 1.0), axis, axis, axis)
+    blank = Calibration(
+        format_version=2,
+        unit=Unit('FIELD-1', 'counts', 32767.0, 0.01),
+        reference_temperature_c=REFERENCE_C,
+        gravity_m_s2=G,
+        axes=Axes(*[AxisReference(K, 0.0)] * 3),
+        static=part,
+        dynamic=part,
+        noise_density_m_s2_sqrt_hz=(NOISE,) * 3,
+        provenance=Provenance(created=CREATED),
+    )
+    layout = parameter_layout(blank)
+    to_file = np.zeros((layout.n_parameters, 15))
+    for axis_number, (bias, scale) in enumerate(zip(layout.bias, layout.scale, strict=True)):
+        for place, number, size in (
+            (bias, 0, K), (scale, 2, 1.0),
+        ):  # fmt: skip
+            to_file[[place.static, place.dynamic], 3 * number + axis_number] = size
+            to_file[[place.static + 1, place.dynamic + 1], 3 * number + 3 + axis_number] = size
+        to_file[layout.misalignment + axis_number, 12 + axis_number] = 1.0
+    return replace(blank, posterior=posterior_of((to_file * PRIOR**2) @ to_file.T))
+
+
+def _parts(state: Floats, warmth: Floats) -> tuple[Floats, Floats, Floats]:
+    """Evaluate bias [m/s^2], relative scale and M of deviations (15,) or (15 + 9,)."""
+    bias, slope, scale, scale_slope, tilt = state[:15].reshape(5, 3)
+    if len(state) > 15:
+        walk_bias, walk_scale, turn_on = state[15:].reshape(3, 3)
+        bias, scale = bias + walk_bias + turn_on, scale + walk_scale
+    warm = np.atleast_1d(warmth)[:, None]
+    M = np.eye(3)
+    M[[1, 2, 2], [0, 0, 1]] = tilt
+    return (
+        bias + (SLOPE + slope) * warm,
+        (1.0 + scale) * (1.0 + (SCALE_SLOPE + scale_slope) * warm),
+        M,
+    )
+
+
+def measured(force: Floats, warmth: Floats, state: Floats) -> Floats:
+    """Return the counts [K] of a unit with deviations `state` under forces (n, 3)."""
+    bias, scale, M = _parts(state, warmth)
+    return np.asarray(np.linalg.solve(M, force.T).T * scale + bias)
+
+
+def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
+    """Return the force that counts [K] mean to a file with deviations `state`."""
+    bias, scale, M = _parts(state, warmth)
+    return np.asarray((counts - bias) / scale @ M.T)
+
+
+def attitude(kind: str, rng: np.random.Generator) -> Floats:
+    """Draw the direction of f: within 10 deg of the vertical, or any."""
+    if kind == 'carried':
+        u = rng.standard_normal(3)
+        return np.asarray(u / np.linalg.norm(u))
+    tilt, azimuth = np.radians(rng.uniform(0.0, 10.0)), rng.uniform(0.0, 2.0 * np.pi)
+    return np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
+
+
+def temperature(day: float, rng: np.random.Generator) -> float:
+    """Draw a temperature: a season about the reference, and the weather [degC]."""
+    return float(REFERENCE_C + 10.0 * np.sin(2.0 * np.pi * day / 60.0) + rng.normal(0.0, 2.0))
+
+
+def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[float]:
+    """Split the rests of a start: one attitude of a vehicle, 20 to 90 s each of a drone."""
+    while seconds >= WINDOW_S:
+        one = seconds if kind == 'level' else min(seconds, rng.uniform(20.0, 90.0))
+        yield one
+        seconds -= one
+
+
+def live(kind: str, seed: int, days: int, process: Process) -> History:
+    """Let a unit age: three starts a day, two to ten minutes of rest each."""
+    rng = np.random.default_rng([seed, KINDS.index(kind)])
+    state = np.concatenate((PRIOR * rng.standard_normal(15), np.zeros(9)))
+    found, before, is_shocked, n_starts = History(), 0.0, False, 0
+    for day in range(days):
+        for number in range(3):
+            now = day + (8.0 + 5.0 * number + rng.uniform(0.0, 2.0)) / 24.0
+            root = np.sqrt(now - before)
+            before = now
+            state = state.copy()
+            state[15:18] += process.bias * root * rng.standard_normal(3)
+            state[18:21] += process.scale * root * rng.standard_normal(3)
+            if now >= process.shock_day and not is_shocked:
+                is_shocked = True
+                state[15:18] += process.shock * rng.standard_normal(3)
+            state[21:] = process.turn_on * rng.standard_normal(3)
+            stamp = int((DAY_ZERO + now) * 86400e9)
+            start = Start(stamp, 'FIELD-1', 'counts', G, 'laboratory', MemorySpec())
+            for seconds in lasting(kind, rng.uniform(120.0, 600.0), rng):
+                force, celsius = G * attitude(kind, rng), temperature(day, rng)
+                clean = measured(force[None], np.array([celsius - REFERENCE_C]), state)[0]
+                for _ in range(int(seconds // WINDOW_S)):
+                    noise = NOISE / np.sqrt(WINDOW_S) * rng.standard_normal(3)
+                    mean = tuple((K * (clean + noise)).tolist())
+                    thermal = (celsius, 1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6)
+                    rest = Rest(stamp, 1000, mean, (K * NOISE * 10.0,) * 3, thermal)
+                    found.rests.append((start, rest))
+                    found.day.append(day)
+                    found.start.append(n_starts)
+                    stamp += int(WINDOW_S * 1e9)
+            n_starts += 1
+        found.states.append(np.concatenate((state[:21], np.zeros(3))))
+    return found
+
+
+class BestFilter:
+    """The best linear estimator: a Kalman filter that knows the process and the shock's time."""
+
+    def __init__(self, process: Process) -> None:
+        self.process = process
+        self.state = np.zeros(24)
+        self.P = np.diag(np.concatenate((PRIOR**2, np.zeros(9))))
+        self._now, self._is_shocked, self._start = 0.0, False, -1
+
+    def take(self, now: float, start: int, counts: Floats, warmth: float, variance: float) -> None:
+        """Take the mean of a rest [K], `now` in days, the variance of its norm."""
+        one = self.process
+        if start != self._start:
+            elapsed, self._now, self._start = now - self._now, now, start
+            walk = np.repeat([one.bias**2, one.scale**2], 3) * elapsed
+            self.P[range(15, 21), range(15, 21)] += walk
+            if now >= one.shock_day and not self._is_shocked:
+                self._is_shocked = True
+                self.P[range(15, 18), range(15, 18)] += one.shock**2
+            self.state[21:], self.P[21:], self.P[:, 21:] = 0.0, 0.0, 0.0
+            self.P[range(21, 24), range(21, 24)] = one.turn_on**2
+        warm = np.array([warmth])
+
+        def norm(state: Floats) -> float:
+            return float(np.linalg.norm(corrected(counts[None], warm, state)))
+
+        step = 1e-6
+        here = norm(self.state)
+        H = np.array([(norm(self.state + step * e) - here) / step for e in np.eye(24)])
+        S = H @ self.P @ H + variance
+        gain = self.P @ H / S
+        self.state = self.state + gain * (G - here)
+        self.P = self.P - np.outer(gain, gain) * S

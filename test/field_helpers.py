@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns rests of a unit with any calibration, for tests: what its node would have logged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from thermo_comp.field.rest import Rest, Start, encode
+from thermo_comp.unit.calibration import Calibration
+from thermo_comp.unit.correction import Correction
+from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.prediction import ramp_states
+
+DAY_NS = 86_400 * 10**9
+#: 2030-01-01, after any calibration that a test makes, in days since 1970.
+FIRST_DAY = 21_915
+
+
+def rests(
+    calibration: Calibration,
+    attitudes: Callable[[np.random.Generator], np.ndarray],
+    error: Callable[[float], np.ndarray],
+    days: int = 20,
+    seed: int = 1,
+    turn_on: float = 20.0 * MICRO_G,
+    rate: float = 0.0,
+) -> list[tuple[Start, Rest]]:
+    """
+    Log three starts a day with four windows each, in soaks (or ramps of `rate` [K/s]) at 15 to 25
+    degC; `error` gives the bias [m/s^2] that the calibration lacks after some days.
+    """
+    rng = np.random.default_rng(seed)
+    correction = Correction(calibration)
+    M, found = np.array(calibration.misalignment), []
+    noise = np.array(calibration.noise_density_m_s2_sqrt_hz) / np.sqrt(10.0)
+    shares = (0.0,) * len(correction.memory.lags)
+    for k in range(3 * days):
+        since = k / 3.0
+        begin = int((FIRST_DAY + 0.3 + since) * DAY_NS)
+        start = Start(
+            begin,
+            calibration.unit.serial,
+            calibration.unit.input,
+            calibration.gravity_m_s2,
+            'laboratory',
+            correction.memory,
+        )
+        offset = error(since) + turn_on * rng.standard_normal(3)
+        state = ramp_states(calibration, rng.uniform(15.0, 25.0, 1), rate, 3600.0)
+        state[:, 1] = 1e-8
+        bias, scale = correction.bias_scale(state.T)[:, :, 0]
+        force = calibration.gravity_m_s2 * np.linalg.solve(M, attitudes(rng))
+        for window in range(4):
+            x = force + offset + noise * rng.standard_normal(3)
+            sd = noise * np.sqrt(1000.0) * np.abs(correction.K[:, 0])
+            mean = tuple((bias + scale * x).tolist())
+            stamp = begin + (window + 1) * 10 * 10**9
+            found.append((start, Rest(stamp, 1000, mean, tuple(sd), tuple(state[0]), shares)))
+    return found
+
+
+def write_log(folder: Path, found: list[tuple[Start, Rest]]) -> Path:
+    """Write rests as the node does, a file for each day."""
+    folder.mkdir(parents=True)
+    for start, rest in found:
+        day = np.datetime64(rest.stamp_ns, 'ns').astype('datetime64[D]')
+        with (folder / f'{day}.rests').open('ab') as file:
+            file.write(encode(start) + encode(rest))
+    return folder
+
+
+def upright(_rng: np.random.Generator) -> np.ndarray:
+    """Give the attitude of a vehicle on level ground."""
+    return np.array([0.0, 0.0, 1.0])
+
+
+def any_way(rng: np.random.Generator) -> np.ndarray:
+    """Give the attitude of something that is carried."""
+    u = rng.standard_normal(3)
+    return np.asarray(u / np.linalg.norm(u))

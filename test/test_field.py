@@ -1,0 +1,333 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Updates in the field against the truth, the best filter and closed forms; the drift watch."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import calibration, rich_calibration
+from conftest import ROOT, Cli, parsed
+from field_helpers import any_way, rests, upright, write_log
+from scipy.stats import norm
+
+sys.path.insert(0, str(ROOT / 'benchmarks'))
+
+import field_units
+
+from thermo_comp.errors import FitError
+from thermo_comp.field.ageing import Ageing, Model, rows_of, solve
+from thermo_comp.field.series import series_of
+from thermo_comp.field.update import update
+from thermo_comp.field.watch import passage, watch
+from thermo_comp.fitting.assembly import parameters_of, with_parameters
+from thermo_comp.unit.calibration import parameter_layout
+from thermo_comp.unit.calibration_file import load_calibration, save_calibration
+from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.posterior import posterior_of
+from thermo_comp.unit.provenance import Provenance
+
+ZERO = np.zeros(3)
+
+
+def known(**keys):
+    """Make a calibration that knows its biases to 10 ug and its scales to 10 ppm."""
+    value = calibration(noise_density_m_s2_sqrt_hz=(60 * MICRO_G,) * 3, **keys)
+    layout = parameter_layout(value)
+    sd = np.zeros(layout.n_parameters)
+    to_file = np.zeros((layout.n_parameters, 6))
+    for axis in range(3):
+        bias, scale = layout.bias[axis], layout.scale[axis]
+        to_file[[bias.static, bias.dynamic], axis] = 300.0 * 10 * MICRO_G
+        to_file[[scale.static, scale.dynamic], axis + 3] = 10e-6
+    sd[layout.misalignment :] = 1e-6
+    return replace(value, posterior=posterior_of(to_file @ to_file.T + np.diag(sd**2)))
+
+
+def no_error(_days: float) -> np.ndarray:
+    return ZERO
+
+
+def jump_of(size: float, day: float):
+    return lambda days: size * MICRO_G * np.array([0.0, 0.0, float(days >= day)])
+
+
+def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit() -> None:
+    # Every column and both sets, on a ramp; the second route is a difference of two evaluations.
+    unit = rich_calibration()
+    found = rests(unit, any_way, no_error, days=1, rate=0.5 / 60.0)
+    series = series_of(found, unit)
+    values, scale = parameters_of(unit), np.array([axis.scale_factor for axis in unit.axes])
+    covariance = unit.posterior.covariance()
+    layout = parameter_layout(unit)
+    levels = {block.static: axis for axis, block in enumerate(layout.scale)}
+    levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
+    # Blocks have odd lengths, so that every kind of parameter comes on one axis at least.
+    for k in range(0, layout.n_parameters, 2):
+        step = 1e-7
+        moved = values.copy()
+        if k in levels:
+            continue  # below: both levels of a scale move together, as K does
+        if k in {block.static for block in layout.bias}:
+            continue
+        moved[k] += step
+        miss = series_of(found, with_parameters(unit, scale, moved, covariance)).miss
+        slope = (series.miss - miss) / step
+        assert np.allclose(slope, series.by_parameter[:, k], atol=2e-4 * abs(slope).max() + 1e-9)
+    for axis, block in enumerate(layout.scale):
+        factor = np.where(np.arange(3) == axis, 1.0 + 1e-6, 1.0)
+        miss = series_of(found, with_parameters(unit, scale * factor, values, covariance)).miss
+        slope = (series.miss - miss) / 1e-6
+        by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
+        assert np.allclose(slope, by_level, atol=1e-4)
+        both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
+        # A level is relative to K, and the rest of the scale, within a percent of it.
+        assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
+
+
+def test_an_update_with_the_true_variances_is_the_kalman_filter() -> None:
+    process = field_units.Process()
+    history = field_units.live('carried', 3, 6, process)
+    unit = field_units.calibration()
+    series = series_of(history.rests, unit)
+    best = field_units.BestFilter(process)
+    for k in range(len(series)):
+        # The filter takes the rests of the series, one by one.
+        first = int(series.n_windows[:k].sum())
+        windows = [r for _, r in history.rests[first : first + int(series.n_windows[k])]]
+        mean = np.mean([one.mean for one in windows], axis=0) / field_units.K
+        warmth = series.temperature[k] - field_units.REFERENCE_C
+        variance = field_units.NOISE**2 / (10.0 * len(windows))
+        now = history.rests[first][0].start_ns / 86400e9 - field_units.DAY_ZERO
+        best.take(now, int(series.start[k]), mean, warmth, variance)
+    ageing = Ageing(process.bias, process.scale * field_units.G, process.turn_on, 1e-9)
+    rows = rows_of(series, 1e-9)
+    to_file = np.zeros((parameter_layout(unit).n_parameters, 6))
+    layout = parameter_layout(unit)
+    for axis in range(3):
+        to_file[[layout.bias[axis].static, layout.bias[axis].dynamic], axis] = field_units.K
+        places = [layout.scale[axis].static, layout.scale[axis].dynamic]
+        to_file[places, axis + 3] = 1.0 / field_units.G
+    model = Model(rows, unit, float(field_units.DAY_ZERO))
+    found = solve(model, ageing, to_file, np.zeros((len(to_file), 3)), 0.0)
+    for axis in range(3):
+        bias, scale = layout.bias[axis].static, layout.scale[axis].static
+        sd = np.sqrt(found.posterior[bias, bias]) / field_units.K
+        expected = best.state[axis] + best.state[15 + axis]
+        # Six sums of each start instead of all its rests, its mean time: a fifth of the sd.
+        assert abs(found.shift[bias] / field_units.K - expected) < 0.2 * sd
+        P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
+        assert sd == pytest.approx(np.sqrt(P), rel=0.1)
+        expected = best.state[6 + axis] + best.state[18 + axis]
+        assert abs(found.shift[scale] - expected) < 0.2 * np.sqrt(found.posterior[scale, scale])
+
+
+def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave() -> None:
+    # Walks, turn-on and one shock over 30 days, level and carried.
+    squares, ratios = [], []
+    for kind, seed in (('level', 1), ('level', 2), ('level', 4), ('carried', 1)):
+        process = field_units.Process(shock_day=11.5)
+        history = field_units.live(kind, seed, 30, process)
+        unit = field_units.calibration()
+        found = update(series_of(history.rests, unit), unit)
+        assert found.judged.is_better
+        before, truth = history.states[10], history.states[-1]
+        jumps = [one.time for one in found.changes if one.time is not None]
+        shock = history.states[11][15:18] - before[15:18]
+        if np.abs(shock[2:] if kind == 'level' else shock).max() > 200 * MICRO_G:
+            (jump,) = jumps
+            assert jump - field_units.DAY_ZERO == pytest.approx(11.5, abs=0.7)
+        force = field_units.G * np.array([[0.0, 0.0, 1.0]])
+        counts = field_units.measured(force, np.zeros(1), truth)[0] * field_units.K
+        start, rest = history.rests[-1]
+        thermal = (field_units.REFERENCE_C, *rest.state[1:])
+        after = series_of([(start, replace(rest, mean=tuple(counts), state=thermal))], unit)
+        new = series_of(
+            [(start, replace(rest, mean=tuple(counts), state=thermal))], found.calibration
+        )
+        squares.append((float(after.miss[0]), float(new.miss[0])))
+        ratios.append(float(new.miss[0] / new.claim[0]))
+        if kind == 'level':
+            assert abs(found.ageing.turn_on / (20 * MICRO_G) - 1.0) < 0.5
+    before, left = np.sqrt(np.mean(np.square(squares), axis=0)) / MICRO_G
+    # A filter that knows the process leaves 12 ug (benchmarks/field.py).
+    assert before > 100.0
+    assert left < 30.0
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+def test_axes_that_no_rest_shows_keep_their_bits() -> None:
+    unit = known()
+    found = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
+    new = found.calibration
+    assert [one.is_told for one in found.moved] == [False, False, True]
+    assert new.axes.x == unit.axes.x
+    assert new.axes.y == unit.axes.y
+    assert new.axes.z != unit.axes.z
+    # Upright, bias and scale of z are one number: 300 ug, a third of the turn-on's 20 ug.
+    assert found.moved[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
+    layout = parameter_layout(unit)
+    old_sd, new_sd = (
+        np.sqrt(np.diag(one.posterior.covariance()))[layout.bias[0].static] for one in (unit, new)
+    )
+    assert new_sd > old_sd
+
+
+def test_a_jump_is_told_from_ageing(rng: np.random.Generator) -> None:
+    unit = known()
+    jumped = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
+    (change,) = jumped.changes
+    assert change.time == pytest.approx(series_of(
+        rests(unit, upright, no_error), unit).time[0] + 10.0, abs=0.4)  # fmt: skip
+    assert jumped.ageing.bias < 10.0 * MICRO_G
+    steps = 60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3))
+    walked = np.cumsum(steps, axis=0)
+    aged = update(series_of(rests(unit, upright, lambda d: walked[round(3 * d)], 30), unit), unit)
+    assert aged.changes == ()
+    along = np.hypot(aged.ageing.bias, aged.ageing.scale)
+    assert along == pytest.approx(60.0 * MICRO_G, rel=0.4)
+
+
+def test_a_curve_that_has_changed_is_found_and_mended() -> None:
+    # 5 ug/K of the z bias, and temperatures of 15 to 25 degC in the log.
+    unit = known(
+        static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
+    )
+    found = rests(unit, upright, no_error, days=30)
+    bent = [
+        (s, replace(r, mean=(*r.mean[:2], r.mean[2] + 300.0 * 5 * MICRO_G * (r.state[0] - 20.0))))
+        for s, r in found
+    ]
+    result = update(series_of(bent, unit), unit)
+    assert [one.time for one in result.changes] == [None]
+    curves = [
+        one.static.z.bias_function.coefficients[1] / 300.0 for one in (unit, result.calibration)
+    ]
+    assert curves[1] - curves[0] == pytest.approx(5.0 * MICRO_G, abs=1.5 * MICRO_G)
+
+
+def test_a_start_that_contradicts_all_others_is_left_out() -> None:
+    unit = known()
+    found = rests(unit, upright, jump_of(100.0, 8.0), days=15)
+    wrong = found[80][0]
+    bad = [
+        (s, replace(r, mean=(*r.mean[:2], r.mean[2] + 300.0 * 0.02)) if s == wrong else r)
+        for s, r in found
+    ]
+    result = update(series_of(bad, unit), unit)
+    assert result.n_outliers == 1
+    assert result.moved[2].reading == pytest.approx(100.0 * MICRO_G, abs=20.0 * MICRO_G)
+
+
+def test_too_few_starts_are_refused() -> None:
+    unit = known()
+    found = rests(unit, upright, no_error, days=1)[:8]
+    with pytest.raises(FitError, match='rests of 2 starts, need 3 at least'):
+        update(series_of(found, unit), unit)
+
+
+def test_the_first_passage_is_that_of_the_reflection_principle() -> None:
+    # Inside (-c, c): sum (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)] with s^2 = rate t.
+    rate, bound = 4.0, 50.0
+    for probability, days in zip((0.1, 0.5, 0.9), passage(0.0, 0.0, rate, bound), strict=True):
+        s, k = np.sqrt(rate * days), np.arange(-40, 41)
+        inside = norm.cdf((2 * k + 1) * bound / s) - norm.cdf((2 * k - 1) * bound / s)
+        assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.005)
+    # From nearer to a bound it is earlier, and a unit that does not age never arrives.
+    assert passage(30.0, 0.0, rate, bound)[1] < passage(0.0, 0.0, rate, bound)[1]
+    assert passage(0.0, 0.0, 1e-12, bound) == (np.inf,) * 3
+
+
+def test_the_watch_names_the_day_and_the_class_of_temperature() -> None:
+    unit = known(
+        static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
+    )
+    healthy = watch(series_of(rests(unit, upright, no_error), unit), unit)
+    assert (healthy.exit_code, healthy.left) == (0, None)
+    assert 'within its claim up to 2030-01-20' in str(healthy)
+    assert sum(row.n_rests for row in healthy.days) == sum(
+        row.n_rests for row in healthy.temperatures
+    )
+    assert [row.name for row in healthy.temperatures] == ['10 .. 20 degC', '20 .. 30 degC']
+    assert [row.name for row in healthy.periods] == [row.name for row in healthy.days]
+    year = watch(series_of(rests(unit, upright, no_error, days=61), unit), unit)
+    assert [row.n_rests for row in year.periods] == [9] * 20 + [3]
+    assert healthy.forecast[0] < healthy.forecast[1] <= healthy.forecast[2]
+    assert watch(series_of(rests(unit, upright, no_error), unit), unit, 1.0).forecast[0] == np.inf
+    aged = watch(series_of(rests(unit, upright, jump_of(400.0, 10.0)), unit), unit)
+    assert (aged.exit_code, aged.left, aged.forecast) == (1, '2030-01-11', ())
+
+
+@pytest.fixture
+def unit_file(tmp_path: Path) -> Path:
+    path = tmp_path / 'unit.yaml'
+    created = Provenance(created='2029-12-31T00:00:00Z')
+    save_calibration(known(provenance=created), path)
+    return path
+
+
+@pytest.mark.usefixtures('no_figures')
+def test_update_by_the_command_line(tmp_path: Path, unit_file: Path, cli: Cli) -> None:
+    unit = load_calibration(unit_file)
+    found = rests(unit, upright, jump_of(300.0, 10.0))
+    log, new = write_log(tmp_path / 'rests', found), tmp_path / 'new.yaml'
+    said = cli('update', unit_file, log, '-o', new)
+    assert 'the rests cannot tell x, y' in said.stdout
+    assert 'a shock, no ageing' in said.stdout
+    written = load_calibration(new)
+    assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
+    assert 'before: 2029-12-31' in written.provenance.notes[-1]
+    # The new file removes what the old one leaves, and the history shows both.
+    assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
+    history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
+    assert [one['constant'] for one in parsed(history.stdout)['history']][2] == 'bias z'
+    again = cli('evaluate', log, '-c', new)
+    assert '240 windows took part in its last update' in again.stdout
+    again = cli('update', new, log, '-o', tmp_path / 'newer.yaml', code=1)
+    assert 'has been updated with all of these rests' in again.stderr
+
+
+def test_nothing_gained_writes_nothing(tmp_path: Path, unit_file: Path, cli: Cli) -> None:
+    unit = load_calibration(unit_file)
+    log = write_log(tmp_path / 'rests', rests(unit, upright, no_error))
+    said = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', '--json', code=3)
+    data = parsed(said.stdout)
+    assert data['output'] is None
+    assert data['is_better'] is False
+    assert not (tmp_path / 'new.yaml').exists()
+    text = cli('evaluate', log, '-c', unit_file).stdout
+    assert 'recalibration interval' in text
+
+
+def test_mistakes_end_in_one_sentence(tmp_path: Path, unit_file: Path, cli: Cli) -> None:
+    unit = load_calibration(unit_file)
+    other = replace(unit, unit=replace(unit.unit, serial='T-2'))
+    log = write_log(tmp_path / 'rests', rests(other, upright, no_error, days=2))
+    new = ('-o', tmp_path / 'new.yaml')
+    (tmp_path / 'empty').mkdir()
+    for arguments, text in (
+        (('update', unit_file, log, *new), 'rests: no rest of unit T-1'),
+        (('update', unit_file, tmp_path / 'empty', *new), 'empty: no rest log: expected a folder'),
+        (('update', unit_file, tmp_path / 'none', *new), 'none: no rest log: expected a folder'),
+    ):
+        assert text in cli(*arguments, code=1).stderr
+    bag = ROOT / 'bags' / 'held_out.mcap'
+    assert 'evaluated alone' in cli('evaluate', log, bag, '-c', unit_file, code=2).stderr
+    rich = tmp_path / 'rich.yaml'
+    save_calibration(rich_calibration(), rich)
+    log = write_log(tmp_path / 'own', rests(unit, upright, no_error, days=2))
+    said = cli('update', rich, log, *new, code=1).stderr
+    assert 'logged with a calibration of other columns' in said
+
+
+def test_the_newest_of_many_starts_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    unit = known()
+    series = series_of(rests(unit, upright, no_error), unit)
+    everything = rows_of(series, MICRO_G)
+    monkeypatch.setattr('thermo_comp.field.ageing._MOST_ROWS', 25)
+    newest = rows_of(series, MICRO_G)
+    assert set(newest.start) == set(everything.start[-24:])

@@ -1,0 +1,280 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The rest log: what the node gathers on real DDS, and its files when killed or on a full disk."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+
+from builders import calibration
+from diagnostic_msgs.msg import DiagnosticArray
+from node_process import NodeProcess
+from ros_helpers import SECOND_NS, START_NS, Driver, Peer, drive, node_arguments, node_in_thread
+
+from thermo_comp.errors import OutputError
+from thermo_comp.field.gather import RestFinder
+from thermo_comp.field.rest import Rest, Start, decode, encode, thinned
+from thermo_comp.ros import rest_log
+from thermo_comp.ros.rest_log import RestLog
+from thermo_comp.thermal.memory import MemorySpec
+from thermo_comp.unit.calibration_file import save_calibration
+
+RATE_HZ, CYCLE_NS = 50, 20_000_000
+NOISE = 0.01  # of a sample [m/s^2]: 3 counts of the unit of 300 per m/s^2
+START = Start(START_NS, 'T-1', 'counts', 9.80665, 'abc', MemorySpec(('case',), (('board', 60.0),)))
+
+
+def rest(number: int) -> Rest:
+    stamp, state = START_NS + number * 10 * SECOND_NS, (20.0, 1e-6, 0.0, 0.0, 0.0, 0.5, 1e-6)
+    return Rest(stamp, 1000, (1.0, -2.0, 2941.25), (3.0,) * 3, (*state, 0.25, 0.0), (0.5,))
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    path = tmp_path / 'unit.yaml'
+    density = float(NOISE / np.sqrt(RATE_HZ))
+    save_calibration(calibration(noise_density_m_s2_sqrt_hz=(density,) * 3), path)
+    return path
+
+
+def standing(n: int, seed: int = 1) -> np.ndarray:
+    """Make the counts of a unit that stands."""
+    rng = np.random.default_rng(seed)
+    return np.round((30.0, -20.0, 2941.0) + 300.0 * NOISE * rng.standard_normal((n, 3)))
+
+
+def send(driver: Driver, samples: np.ndarray, begin: int = 0) -> None:
+    for k, sample in enumerate(samples.tolist(), begin):
+        if k % RATE_HZ == 0:
+            driver.temperatures(START_NS + k * CYCLE_NS, 21.0, 21.5)
+        driver.counts(START_NS + k * CYCLE_NS, *sample)
+
+
+def logged(folder: Path) -> list[tuple[Start, Rest]]:
+    return [one for file in sorted(folder.glob('*.rests')) for one in decode(file.read_bytes())[0]]
+
+
+def finder() -> RestFinder:
+    state = (20.0,) * 7
+    return RestFinder(np.full(3, 300.0), np.full(3, NOISE**2), 32767.0, lambda: (state, ()))
+
+
+def test_windows_are_means_of_ten_seconds_at_rest() -> None:
+    # 25 s at rest, 1 s of handling, 21 s at rest in another attitude: two windows, then two.
+    first, second = standing(25 * RATE_HZ), standing(21 * RATE_HZ, 2)[:, [2, 1, 0]]
+    handled = first[:RATE_HZ] + np.linspace(0.0, 900.0, RATE_HZ)[:, None]
+    samples = np.concatenate((first, handled, second))
+    stamps = START_NS + np.arange(len(samples)) * CYCLE_NS
+    whole = finder().add(stamps, samples)
+    assert [(one.stamp_ns - START_NS) / SECOND_NS for one in whole] == [5.0, 15.0, 31.0, 41.0]
+    parts = [part[k : k + 500] for part in (first, second) for k in (0, 500)]
+    for one, part in zip(whole, parts, strict=True):
+        assert np.allclose(one.mean, part.mean(axis=0), atol=1e-9)
+        assert np.allclose(one.sd, part.std(axis=0), rtol=0.05)
+    # However the samples arrive.
+    pieces, found = finder(), []
+    for cut in np.split(np.arange(len(samples)), [7, 333, 334, 1201]):
+        found += pieces.add(stamps[cut], samples[cut])
+    assert [one.stamp_ns for one in found] == [one.stamp_ns for one in whole]
+    assert np.allclose([one.mean for one in found], [one.mean for one in whole], atol=1e-9)
+
+
+@pytest.mark.parametrize('fault', ['moves', 'shakes', 'stuck', 'tilts', 'saturated', 'gap'])
+def test_what_is_no_rest_is_not_kept(fault: str) -> None:
+    samples = standing(12 * RATE_HZ)
+    stamps = START_NS + np.arange(len(samples)) * CYCLE_NS
+    if fault == 'moves':
+        samples[300:] += 30.0  # 0.1 m/s^2
+    elif fault == 'shakes':
+        samples += 60.0 * np.sin(np.arange(len(samples)))[:, None]
+    elif fault == 'stuck':
+        samples[:] = samples[0]
+    elif fault == 'tilts':
+        samples[:, 0] += np.linspace(0.0, 100.0, len(samples))  # 3 mrad/s
+    elif fault == 'saturated':
+        samples[:, 0] = 32767.0
+    else:
+        stamps[300:] += 5 * SECOND_NS
+    assert finder().add(stamps, samples) == []
+
+
+def test_a_rest_that_lasts_a_day_is_kept_ever_more_rarely() -> None:
+    # Ten minutes all 60 windows, then one a minute to the hour, then one in five minutes.
+    found, one = 0, finder()
+    samples = standing(6 * 60)
+    for minute in range(71):
+        stamps = START_NS + (np.arange(len(samples)) + minute * len(samples)) * SECOND_NS // 6
+        found += len(one.add(stamps, samples))
+    assert found == 60 + 50 + 3
+
+
+@given(st.integers(0, 2000), st.integers(0, 255))
+def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place: int, value: int) -> None:
+    content = encode(START) + b''.join(encode(rest(k)) for k in range(9))
+    whole, n_damaged = decode(content)
+    assert n_damaged == 0
+    assert [one for _, one in whole] == [rest(k) for k in range(9)]
+    assert {one for one, _ in whole} == {START}
+    cut = decode(content[:place])[0]
+    assert cut == whole[: len(cut)]
+    changed = bytearray(content)
+    changed[place % len(content)] = value
+    left = [one for _, one in decode(bytes(changed))[0]]
+    # Without its start no rest counts; of others at most two lines are joined by a lost newline.
+    assert all(one in [rest(k) for k in range(9)] for one in left)
+    assert len(left) >= 7 or place % len(content) < len(encode(START))
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+        lambda inner: st.lists(inner, max_size=6) | st.dictionaries(st.text(max_size=5), inner),
+        max_leaves=12,
+    ),
+    st.integers(0, 6),
+)
+def test_a_line_with_a_checksum_may_hold_anything(value: object, place: int) -> None:
+    good = json.loads(encode(rest(0))[9:])
+    for data in (value, [*good[:place], value, *good[place + 1 :]]):
+        text = json.dumps(data).encode()
+        found, n_damaged = decode(encode(START) + b'%08x %s\n' % (zlib.crc32(text), text))
+        assert len(found) + n_damaged == 1
+        for _, one in found:
+            assert np.isfinite([*one.mean, *one.sd, *one.state, *one.shares]).all()
+            assert (len(one.mean), len(one.sd), len(one.state)) == (3, 3, 9)
+
+
+def test_thinning_halves_the_rests_and_keeps_each_start() -> None:
+    starts = [replace(START, start_ns=START_NS + k) for k in range(3)]
+    lines = [encode(one) + b''.join(map(encode, map(rest, range(5)))) for one in starts]
+    content = thinned(b''.join(lines))
+    found = decode(content)[0]
+    assert [one.stamp_ns for _, one in found] == 3 * [rest(k).stamp_ns for k in (0, 2, 4)]
+    while len(content) > len(thinned(content)):
+        content = thinned(content)
+    assert [start for start, _ in decode(content)[0]] == starts
+
+
+def test_a_log_is_bounded_by_day_and_in_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rest_log, 'DAY_BYTES', 2000)
+    monkeypatch.setattr(rest_log, 'FOLDER_BYTES', 5000)
+    monkeypatch.setattr(rest_log, '_FLOOR', 500)
+    log = RestLog(str(tmp_path))
+    for day in range(6):
+        for k in range(40):
+            stamp = rest(day * 8640 + k).stamp_ns
+            log.put(stamp, encode(START), encode(rest(day * 8640 + k)))
+    log.close(10.0)
+    sizes = [file.stat().st_size for file in sorted(tmp_path.glob('*.rests'))]
+    assert len(sizes) == 6
+    assert max(sizes) <= 2000
+    assert sum(sizes) <= 5000 + 2000
+    # The oldest days are the thinnest, and none is gone.
+    assert sizes[0] < sizes[-1] / 2
+    assert log.n_rests == len(logged(tmp_path))
+    assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')
+
+
+def test_a_full_disk_loses_nothing_silently(small_disk: Path) -> None:
+    log = RestLog(str(small_disk))
+    for k in range(100):
+        log.put(rest(k).stamp_ns, encode(START), encode(rest(k)))
+    log.close(10.0)
+    kept = logged(small_disk)
+    assert 0 < len(kept) < 100
+    assert (log.n_rests, log.n_lost) == (len(kept), 100 - len(kept))
+    assert log.reason == 'No space left on device'
+
+
+def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(
+    tmp_path: Path, unit: Path, peer: Peer
+) -> None:
+    folder = tmp_path / 'rests'
+    samples = standing(200 * RATE_HZ)
+    words = node_arguments(unit, f'rest_log:={folder}')
+    sent = 0
+
+    def until(condition: Callable[[], bool], what: str) -> None:
+        """Send second after second: the first may come before both ends know each other."""
+        nonlocal sent
+        pause = threading.Event()
+        for _ in range(len(samples) // RATE_HZ):
+            send(driver, samples[sent : sent + RATE_HZ], sent)
+            sent += RATE_HZ
+            if condition():
+                return
+            pause.wait(0.02)
+        raise AssertionError(f'{what} did not come true')
+
+    with NodeProcess(*words) as process:
+        driver = Driver(peer)
+        until(lambda: bool(logged(folder)), 'a rest on the disk')
+        assert process.stop(signal.SIGKILL) == -signal.SIGKILL
+    (file,) = folder.iterdir()
+    assert file.name == '2026-01-01.rests'
+    with file.open('ab') as torn:
+        torn.write(encode(rest(9))[:40])
+    before = logged(folder)
+    # Started again in the same folder, the node goes on after the torn line.
+    with node_in_thread(*words) as node:
+        heard = peer.listen(DiagnosticArray, '/diagnostics')
+        peer.join(node)
+        until(lambda: len(logged(folder)) > len(before), 'a rest of the second start')
+
+        def told() -> bool:
+            values = {one.key: one.value for a in heard[-1:] for one in a.status[0].values}
+            return values.get('rests gathered') == str(len(logged(folder)))
+
+        peer.wait_for(told, 'the number of rests in the diagnostics')
+    found = logged(folder)
+    assert decode(file.read_bytes())[1] == 1
+    last = found[len(before)][1]
+    begin = round((last.stamp_ns - START_NS) / SECOND_NS - 5.0) * RATE_HZ
+    assert np.allclose(last.mean, samples[begin : begin + 10 * RATE_HZ].mean(axis=0), atol=1e-5)
+    assert last.n == 10 * RATE_HZ
+    assert last.state[0] == pytest.approx(21.0, abs=1e-6)
+    assert len({start.start_ns for start, _ in found}) == 2
+    assert {start.serial for start, _ in found} == {'T-1'}
+
+
+def test_the_diagnostics_warn_of_a_full_disk(small_disk: Path, unit: Path, peer: Peer) -> None:
+    (small_disk / 'other').write_bytes(bytes(1 << 13)[: 1 << 12])
+    with node_in_thread(*node_arguments(unit, f'rest_log:={small_disk}')) as node:
+        heard = peer.listen(DiagnosticArray, '/diagnostics')
+        driver = drive(peer, node)
+        send(driver, standing(12 * RATE_HZ))
+
+        def warned() -> bool:
+            return any(
+                'not kept in the rest log: No space left on device' in one.status[0].message
+                for one in heard
+            )
+
+        peer.wait_for(warned, 'the warning')
+
+
+def test_a_folder_that_cannot_be_made_is_refused(unit: Path) -> None:
+    with pytest.raises(OutputError, match='rests: parameter `rest_log`: Not a directory'):
+        RestLog(f'{unit}/rests')

@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns ``update``, and ``evaluate`` on a rest log: a calibration in use."""
+
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from ..files import CALIBRATION, check_output
+from . import shared_options as options
+from .output import Output, micro, micro_g
+from .shared_options import argument, option
+
+#: Exit code of an update that gains nothing.
+NOTHING_GAINED = 3
+
+
+def update(
+    calibration: Path = argument('Calibration of the unit (YAML).', metavar='YAML'),
+    rests: list[Path] = argument('Rest logs: folders of the node, or files.', metavar='RESTS...'),
+    output: Path = options.NEW_CALIBRATION,
+    gravity: float | None = options.place,
+    ahead: float = option(
+        'Days until the next update: the claim is aged by them.', 1.0, min=0.0, max=3650.0
+    ),
+    force: bool = options.FORCE,
+    out: Output = options.out,
+) -> None:
+    """
+    Update a calibration in the field, by rests that the node has logged.
+
+    The calibration is the prior, aged as far as the rests show; rests may
+    be in any attitude. Days left out judge the new file against the old.
+    It is written only if it is better beyond one standard error; otherwise
+    the exit code is 3.
+
+    Example:
+      thermo_comp update unit42.yaml rests -o unit42_new.yaml
+    """
+    from ..field.series import read_rests, series_of
+    from ..field.update import update as run
+    from ..field.update import what_moved
+    from ..unit.calibration_file import load_calibration, save_calibration
+
+    check_output(output, CALIBRATION, overwrite=force, others=[calibration, *rests])
+    old = load_calibration(calibration)
+    logged, source, notes = read_rests(rests, old, ahead=ahead)
+    created = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
+    result = run(series_of(logged, old, gravity), old, source, created, ahead)
+    out.points(notes)
+    out.table(
+        ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),
+        [
+            (
+                one.axis,
+                *(micro_g(one.bias), micro_g(one.bias_sd)),
+                *(micro(1e6 * one.scale), micro(1e6 * one.scale_sd)),
+                *(micro_g(one.curve), micro_g(one.curve_sd)),
+                *(micro_g(one.reading), micro_g(one.reading_sd)),
+                f'{one.reading / one.reading_sd:+.1f}' if one.is_told else 'not told',
+            )
+            for one in result.moved
+        ],
+        title=f'what moved by {len(result.series)} rests of {result.series.start[-1] + 1} starts '
+        '(at rest: of the axis as it lay)',
+    )
+    out.points(what_moved(result))
+    out.line(str(result.judged))
+    is_better = result.judged.is_better and any(one.is_told for one in result.moved)
+    if is_better:
+        save_calibration(result.calibration, output, overwrite=force)
+        out.line(f'{output}: written')
+    else:
+        out.line(f'nothing gained: {output} is not written, keep {calibration}')
+    facts: dict[str, Any] = {
+        'output': output if is_better else None,
+        'moved': result.moved,
+        'ageing_m_s2': result.ageing,
+        'changes': result.changes,
+        'judged': result.judged,
+        'is_better': is_better,
+        'notes': [*notes, *what_moved(result)],
+    }
+    out.end(0 if is_better else NOTHING_GAINED, **facts)
+
+
+def evaluate_rests(
+    rests: list[Path],
+    calibration: Path,
+    gravity: float | None,
+    tolerance: float | None,
+    out: Output,
+) -> None:
+    """Watch the drift of a unit over a rest log; exit code 1 once it has left its claim."""
+    from ..field.series import read_rests, series_of
+    from ..field.watch import LIMIT, watch
+    from ..unit.calibration_file import load_calibration
+    from ..unit.gravity import spoken
+
+    known = load_calibration(calibration)
+    logged, _, notes = read_rests(rests, known, is_for_update=False)
+    result = watch(series_of(logged, known, gravity), known, tolerance)
+    out.points(notes)
+    limit = f'{LIMIT:g} times the claim' if tolerance is None else spoken(tolerance)
+    for rows, name in ((result.periods, 'from'), (result.temperatures, 'board')):
+        out.table(
+            (name, 'rests', 'degC', 'mean ug', 'RMS ug', 'claimed ug', 'within'),
+            [
+                (
+                    *(row.name, row.n_rests, row.temperature, micro_g(row.mean)),
+                    *(micro_g(row.rms), micro_g(row.claim), 'yes' if row.is_within else 'no'),
+                )
+                for row in rows
+            ],
+            title=f'|f| - g at rest; within: RMS of at most {limit}',
+        )
+    out.line(str(result))
+    out.end(
+        result.exit_code,
+        days=result.days,
+        temperatures=result.temperatures,
+        left=result.left,
+        forecast_days=result.forecast,
+        interval_days=result.interval,
+        ageing_m_s2=result.ageing,
+        notes=notes,
+    )

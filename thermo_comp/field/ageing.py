@@ -1,0 +1,338 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns how a unit ages between its rests: the Gaussian model, and its variances by evidence.
+
+``|f| - g`` of rest i at time t_i, of start k, is ``H_i delta + B_i b(t_i) + S_i s(t_i) + B_i o_k
++ lack + e_i``: delta is the error of the calibration (its posterior), b and s are random walks of
+bias and scale since the calibration, o is a bias that each start has anew, e is independent.
+Jumps of the levels, and a change of the curve, are added one by one while the evidence asks for
+them. The variances maximise the marginal likelihood, with wide priors about their usual size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.optimize import minimize
+
+from ..typing import Bools, Floats, Ints
+from ..unit.calibration import Calibration
+from ..unit.gravity import MICRO_G
+from .series import Series
+
+#: Centres of the priors in parts of the turn-on: walk of the bias, and of the scale times g, per
+#: root day, and scatter of a rest; sd of their logarithms: a factor of 5 either way.
+_WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
+#: Smallest centre of the prior of the turn-on [m/s^2].
+_LEAST_TURN_ON = 5.0 * MICRO_G
+#: Prior sd of a jump [m/s^2], and of a change of a curve's slope [m/s^2 per K], looked at.
+_JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
+#: A shock moves proof mass and electrodes: the scale times g by a tenth of what the bias moves.
+_JUMP_SHARES = np.repeat([1.0, 0.1], 3)
+_BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
+#: Log Bayes factor from which a jump or a change of the curve is believed, and largest number.
+_BELIEVED, _MOST_CHANGES = 5.0, 4
+#: Distance of temperatures over which a lack of fit is the same [K].
+_LACK_K = 10.0
+#: Rows of a start that the solution, and the search of the variances, use; rows of the search.
+_ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
+#: A rest is left out if it misses what the others predict by more than this number of sd.
+_OUTLIER = 5.0
+
+
+@dataclass(frozen=True)
+class Ageing:
+    """
+    Standard deviations [m/s^2]: random walk of the bias and of the scale times g per root day,
+    bias of a start, scatter of a rest.
+    """
+
+    bias: float
+    scale: float
+    turn_on: float
+    rest: float
+
+
+@dataclass(frozen=True)
+class Change:
+    """A jump of the levels before a start, at `time` [days since 1970]; a bent curve has none."""
+
+    time: float | None
+    sd: float
+    log_bayes_factor: float
+
+    def columns(self, rows: Rows) -> Floats:
+        """Return the derivatives of the rows by the change, (n, 6) or (n, 3)."""
+        if self.time is None:
+            return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
+        is_after = (rows.time >= self.time)[:, np.newaxis]
+        return np.asarray(rows.by_level * _JUMP_SHARES * is_after)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """
+    Equations of the rests, in order of time, at most `_ROWS` of a start: orthogonal sums that hold
+    what its rests say of the six levels. `noise`, `scatter`: variance of the noise, and share of
+    the rests' scatter; `rank`: number of the row in its start; `warmth`: temperature less the
+    reference [K].
+    """
+
+    time: Floats
+    start: Ints
+    y: Floats
+    by_parameter: Floats
+    by_level: Floats
+    lack: Floats
+    warmth: Floats
+    noise: Floats
+    scatter: Floats
+    rank: Ints
+
+    def at(self, chosen: Bools) -> Rows:
+        """Return some of the rows."""
+        return Rows(**{name: value[chosen] for name, value in vars(self).items()})
+
+
+def rows_of(series: Series, scatter: float) -> Rows:
+    """Sum the rests of each start, weighted by their noise and a first guess of their scatter."""
+    parts: list[tuple[Floats, ...]] = []
+    variance = series.noise + scatter**2
+    for start in np.unique(series.start):
+        at = np.flatnonzero(series.start == start)
+        weight = np.sqrt(variance[at].mean() / variance[at])
+        Q = np.eye(len(at))
+        if len(at) > _ROWS:
+            Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
+        # A sum of n equal rests would be sqrt(n) times one.
+        Q = Q * weight[:, np.newaxis]
+        mean = np.full(Q.shape[1], series.temperature[at].mean() - series.reference_temperature)
+        parts.append(
+            (
+                np.full(Q.shape[1], series.time[at].mean()),
+                np.full(Q.shape[1], start),
+                Q.T @ series.miss[at],
+                Q.T @ series.by_parameter[at],
+                Q.T @ series.by_level[at],
+                Q.T @ series.lack[at],
+                mean,
+                (Q**2).T @ series.noise[at],
+                (Q**2).sum(axis=0),
+                np.arange(Q.shape[1]),
+            )
+        )
+    rows = Rows(*[np.concatenate(part) for part in zip(*parts, strict=True)])
+    searched = rows.start[rows.rank < _SEARCH_ROWS]
+    if len(searched) <= _MOST_ROWS:
+        return rows
+    # Older starts say little of today; the time of the search grows with the cube of the rows.
+    return rows.at(rows.start > searched[-_MOST_ROWS])
+
+
+class Model:
+    """The covariance of the rows, by the variances and the changes."""
+
+    def __init__(
+        self, rows: Rows, calibration: Calibration, since: float, changes: Sequence[Change] = ()
+    ) -> None:
+        posterior = calibration.posterior
+        n = rows.by_parameter.shape[1]
+        self.rows, self.changes, self.since = rows, tuple(changes), since
+        self.prior = np.zeros((n, n)) if posterior is None else posterior.covariance()
+        bias, scale = rows.by_level[:, :3], rows.by_level[:, 3:]
+        age = np.maximum(rows.time - since, 0.0)
+        elapsed = np.minimum.outer(age, age)
+        along = bias @ bias.T
+        is_same = rows.start[:, np.newaxis] == rows.start
+        self.parts = [
+            elapsed * along,
+            elapsed * (scale @ scale.T),
+            np.where(is_same, along, 0.0),
+            np.diag(rows.scatter),
+        ]
+        near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / _LACK_K) ** 2)
+        self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
+        self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
+        for change in changes:
+            columns = change.columns(rows)
+            self.base += change.sd**2 * columns @ columns.T
+
+    def covariance(self, ageing: Ageing) -> Floats:
+        """Return the covariance of the rows."""
+        result: Floats = self.base.copy()
+        for sd, part in zip(vars(ageing).values(), self.parts, strict=True):
+            result += sd**2 * part
+        return result
+
+    def fitted(self, centre: Ageing) -> tuple[Ageing, Floats]:
+        """Maximise the posterior density of the variances; return also the inverse covariance."""
+        middle = np.log(list(vars(centre).values()))
+
+        def loss(logs: Floats) -> tuple[float, Floats]:
+            sd = np.exp(logs)
+            factor = cho_factor(self.covariance(Ageing(*sd)), lower=True)
+            inverse = cho_solve(factor, np.eye(len(self.rows.y)))
+            alpha = inverse @ self.rows.y
+            away = (logs - middle) / _LOG_SD
+            value = np.log(np.diag(factor[0])).sum() + 0.5 * (self.rows.y @ alpha + away @ away)
+            slope = [
+                v**2 * float((inverse * part).sum() - alpha @ part @ alpha)
+                for v, part in zip(sd, self.parts, strict=True)
+            ]
+            return float(value), np.array(slope) + away / _LOG_SD
+
+        # Small variances have no gradient, so the search begins twice: all scatter is of the
+        # starts, or all of it is a walk.
+        steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
+        step = max(float(np.median(steps)), centre.rest)
+        bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD
+        found = min(
+            (
+                minimize(
+                    loss,
+                    np.clip(np.log(step * np.array(shares)), *bounds),
+                    jac=True,
+                    method='L-BFGS-B',
+                    bounds=list(zip(*bounds, strict=True)),
+                    options={'maxiter': 30, 'ftol': 1e-5},
+                )
+                for shares in ((0.1, 0.1, 1.0, 0.3), (1.0, 1.0, 0.3, 0.1))
+            ),
+            key=lambda one: one.fun,
+        )
+        ageing = Ageing(*np.exp(found.x).tolist())
+        factor = cho_factor(self.covariance(ageing), lower=True)
+        return ageing, cho_solve(factor, np.eye(len(self.rows.y)))
+
+
+def usual(calibration: Calibration) -> Ageing:
+    """Return the centre of the priors: the turn-on is like the residual, or the noise in 1 Hz."""
+    residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
+    turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
+    walk = _WALK_SHARE * turn_on
+    return Ageing(walk, walk, turn_on, _SCATTER_SHARE * turn_on)
+
+
+def learn(series: Series, calibration: Calibration, since: float) -> tuple[Ageing, Model, Series]:
+    """
+    Find variances and changes by evidence; leave out rests that contradict all others.
+
+    Returns the variances, the model of all rows, and the rests that were used.
+    """
+    centre = usual(calibration)
+    is_used = np.ones(len(series), dtype=np.bool_)
+    for _ in range(2):
+        used = series.at(is_used)
+        rows = rows_of(used, centre.rest)
+        few = rows.at(rows.rank < _SEARCH_ROWS)
+        changes: tuple[Change, ...] = ()
+        while True:
+            model = Model(few, calibration, since, changes)
+            ageing, inverse = model.fitted(centre)
+            best = max(
+                _candidates(model, inverse), key=lambda one: one.log_bayes_factor, default=None
+            )
+            if best is None or best.log_bayes_factor < _BELIEVED or len(changes) == _MOST_CHANGES:
+                break
+            changes += (best,)
+        everything = Model(rows, calibration, since, changes)
+        inverse = cho_solve(
+            cho_factor(everything.covariance(ageing), lower=True), np.eye(len(rows.y))
+        )
+        left_out = (inverse @ rows.y) / np.sqrt(np.diag(inverse))
+        bad = rows.start[np.abs(left_out) > _OUTLIER]
+        at = np.flatnonzero(is_used)
+        is_bad = np.isin(used.start, bad)
+        # Starts that are off together are no outliers but what the model does not know.
+        if not len(bad) or is_bad.sum() > 0.1 * len(used):
+            break
+        is_used[at[is_bad]] = False
+    return ageing, everything, used
+
+
+def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
+    """Yield the jumps before each start, and a change of the curve, with log Bayes factors."""
+    rows = model.rows
+    alpha, by_level = inverse @ rows.y, rows.by_level * _JUMP_SHARES
+    _, first = np.unique(rows.start, return_index=True)
+    n = len(first)
+    precision = np.empty((n, n, 6, 6))
+    for j in range(6):
+        half = np.add.reduceat(inverse * by_level[:, j], first, axis=1)
+        for i in range(6):
+            precision[:, :, i, j] = np.add.reduceat(by_level[:, [i]] * half, first, axis=0)
+    pull = np.add.reduceat(by_level * alpha[:, np.newaxis], first, axis=0)
+    # A jump before a start moves it and all later ones.
+    after = np.cumsum(np.cumsum(precision[::-1, ::-1], axis=0), axis=1)[::-1, ::-1]
+    pull = np.cumsum(pull[::-1], axis=0)[::-1]
+    known = {change.time for change in model.changes}
+    for k in range(n):
+        time = float(rows.time[first[k]])
+        for sd in _JUMPS if time not in known else ():
+            gain = _log_bayes_factor(after[k, k], pull[k], sd) - np.log(n * len(_JUMPS))
+            yield Change(time, sd, gain)
+    if None in known:
+        return
+    columns = Change(None, 1.0, 0.0).columns(rows)
+    for sd in _BENDS:
+        gain = _log_bayes_factor(columns.T @ inverse @ columns, columns.T @ alpha, sd)
+        yield Change(None, sd, gain - float(np.log(len(_BENDS))))
+
+
+def _log_bayes_factor(precision: Floats, pull: Floats, sd: float) -> float:
+    """Return the gain in log evidence by a change of this prior sd, with all else integrated."""
+    inner = np.eye(len(pull)) + sd**2 * precision
+    gain = 0.5 * sd**2 * pull @ np.linalg.solve(inner, pull)
+    return float(gain - 0.5 * np.linalg.slogdet(inner)[1])
+
+
+@dataclass(frozen=True)
+class Solution:
+    """
+    Change of the file's parameters by the rests; their covariance before and after at the last
+    rest, and what a time of use after it adds. Estimates by fewer rows are sums over `gains`.
+    """
+
+    shift: Floats
+    prior: Floats
+    posterior: Floats
+    future: Floats
+    gains: Floats
+    innovations: Floats
+
+    def before(self, row: int) -> Floats:
+        """Return the shift by the rows before one."""
+        return np.asarray(self.gains[:row].T @ self.innovations[:row])
+
+
+def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: float) -> Solution:
+    """
+    Condition the parameters on the rests.
+
+    `to_file`: derivatives of the file's parameters by the six levels, (n_parameters, 6); `bend`:
+    by a slope of each axis, (n_parameters, 3); `ahead`: time of use after the last rest [days].
+    """
+    rows = model.rows
+    age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]
+    walk = np.repeat([ageing.bias**2, ageing.scale**2], 3)
+    crossed = rows.by_parameter @ model.prior + (age * rows.by_level * walk) @ to_file.T
+    prior = model.prior + (to_file * walk * float(age[-1, 0])) @ to_file.T
+    for change in model.changes:
+        onto = bend if change.time is None else to_file * _JUMP_SHARES
+        crossed += change.sd**2 * change.columns(rows) @ onto.T
+        prior += change.sd**2 * onto @ onto.T
+    lower = np.linalg.cholesky(model.covariance(ageing))
+    gains = solve_triangular(lower, crossed, lower=True)
+    innovations = solve_triangular(lower, rows.y, lower=True)
+    return Solution(
+        gains.T @ innovations,
+        prior,
+        prior - gains.T @ gains,
+        (to_file * walk * ahead) @ to_file.T,
+        gains,
+        innovations,
+    )

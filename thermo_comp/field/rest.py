@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the record of a rest, one line of text with a checksum, and how such lines are thinned.
+
+A rest log is a folder of files, one per day (UTC). A file holds two kinds of lines, each a CRC-32
+in hexadecimal, a blank, and JSON: an object describes a start of the node, a list is a window at
+rest since that start. A line whose checksum is wrong is skipped: a process that is killed, a power
+failure or a full disk can damage only the line that was being written.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import astuple, dataclass
+from typing import Any
+
+from ..thermal.memory import MemorySpec
+from ..thermal.state import Layout
+
+#: Ending of the files of a log; their names are the days, 2026-11-25.rests.
+SUFFIX = '.rests'
+#: Bound of every number, far above any sample; last stamp, in the year 2262 [ns].
+_LARGEST, _LATEST_NS = 1e12, 1 << 63
+#: First bytes after the checksum of a start and of a rest.
+_OF_START, _OF_REST = b' {', b' ['
+
+
+@dataclass(frozen=True)
+class Start:
+    """A start of the node, or a change of its calibration since (then `start_ns` stays)."""
+
+    start_ns: int
+    serial: str
+    input: str
+    gravity: float
+    sha256: str
+    memory: MemorySpec
+
+
+@dataclass(frozen=True)
+class Rest:
+    """
+    A window at rest. `stamp_ns`: its middle; `n`: number of samples; `mean` and `sd` of one sample
+    [input units]; `state`: mean thermal state, laid out as by `thermal.state.Layout` of the
+    start's memory; `shares`: remaining share of the unseen start of each lag; `rate`: mean angular
+    rate [rad/s], empty if unknown.
+    """
+
+    stamp_ns: int
+    n: int
+    mean: tuple[float, ...]
+    sd: tuple[float, ...]
+    state: tuple[float, ...]
+    shares: tuple[float, ...] = ()
+    rate: tuple[float, ...] = ()
+
+
+def encode(one: Start | Rest) -> bytes:
+    """Write one record as a line."""
+    if isinstance(one, Start):
+        memory = [one.memory.sensors, one.memory.lags, one.memory.plays]
+        data: Any = {**vars(one), 'memory': memory}
+    else:
+        # Nine digits resolve a thousandth of a count of 24 bits.
+        data = [
+            [float(f'{value:.9g}') for value in part] if isinstance(part, tuple) else part
+            for part in astuple(one)
+        ]
+    text = json.dumps(data, separators=(',', ':'), ensure_ascii=True).encode()
+    return b'%08x %s\n' % (zlib.crc32(text), text)
+
+
+def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
+    """Read the rests of a file, each with its start; count the damaged lines."""
+    found: list[tuple[Start, Rest]] = []
+    start: Start | None = None
+    n_damaged = 0
+    for line in content.splitlines():
+        text = line[9:]
+        if line[:9] != b'%08x ' % zlib.crc32(text):
+            n_damaged += bool(line)
+            continue
+        try:
+            data = json.loads(text)
+            if isinstance(data, dict):
+                start = _start(data)
+            elif start is not None:
+                found.append((start, _rest(data, start.memory)))
+        except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
+            # Whoever writes a checksum can write anything behind it.
+            n_damaged += 1
+    return found, n_damaged
+
+
+def _start(data: dict[str, Any]) -> Start:
+    sensors, lags, plays = data['memory']
+    memory = MemorySpec(
+        tuple(map(str, sensors)),
+        tuple((str(name), _number(tau)) for name, tau in lags),
+        tuple((_number(tau), _number(width)) for tau, width in plays),
+    )
+    start = Start(**{**data, 'memory': memory})
+    _whole(start.start_ns)
+    if not 1.0 <= start.gravity <= 100.0:
+        raise ValueError(start.gravity)
+    return start
+
+
+def _rest(data: list[Any], memory: MemorySpec) -> Rest:
+    stamp_ns, n, *parts = data
+    mean, sd, state, shares, rate = (tuple(map(_number, part)) for part in parts)
+    lengths = (len(mean), len(sd), len(state), len(shares), len(rate) % 3)
+    if lengths != (3, 3, Layout(memory).width, len(memory.lags), 0) or min(sd) < 0.0:
+        raise ValueError(lengths)
+    return Rest(_whole(stamp_ns), _whole(n), mean, sd, state, shares, rate)
+
+
+def _number(value: float) -> float:
+    if not abs(value) < _LARGEST:
+        raise ValueError(value)
+    return float(value)
+
+
+def _whole(value: int) -> int:
+    if type(value) is not int or not 0 < value < _LATEST_NS:
+        raise ValueError(value)
+    return value
+
+
+def counted_rests(content: bytes) -> int:
+    """Count the rests of a file without decoding them."""
+    return content.count(_OF_REST)
+
+
+def thinned(content: bytes) -> bytes:
+    """Drop every second rest of a file, and damaged lines; each start keeps its first rest."""
+    kept: list[bytes] = []
+    n = 0
+    for line in content.splitlines(keepends=True):
+        if line[8:10] == _OF_START:
+            n = 0
+            kept.append(line)
+        elif line[8:10] == _OF_REST and line.endswith(b'\n'):
+            if not n % 2:
+                kept.append(line)
+            n += 1
+    return b''.join(kept)
+
+
+def most_thinnable(sizes: dict[str, int], limit: int, floor: int) -> str | None:
+    """Return the oldest day above `floor` if the total exceeds `limit` [bytes], or None."""
+    if sum(sizes.values()) <= limit:
+        return None
+    return next((day for day in sorted(sizes) if sizes[day] > floor), None)
+
+
+def rests_of(
+    contents: Iterable[bytes], is_wanted: Callable[[Start], bool]
+) -> tuple[list[tuple[Start, Rest]], int]:
+    """Decode several files into rests in order of their stamps, without duplicates."""
+    everything: dict[tuple[int, int], tuple[Start, Rest]] = {}
+    n_damaged = 0
+    for content in contents:
+        found, n = decode(content)
+        n_damaged += n
+        everything |= {(s.start_ns, r.stamp_ns): (s, r) for s, r in found if is_wanted(s)}
+    return [everything[key] for key in sorted(everything)], n_damaged

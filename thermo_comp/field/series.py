@@ -1,0 +1,324 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns rests as measurements of a calibration: ``|f| - g`` and its derivatives by every parameter.
+
+A rest at an unknown attitude measures one number. With x the axes' forces before the misalignment
+M, f = M x, u = f / |f| and v = M^T u, an error d_bias [input units] and d_scale [relative] of axis
+i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. So, to first order, the true error
+of the calibration along u is ``|f| - g = H (true - calibrated) + noise``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import RecordingError
+from ..files import read_bounded
+from ..text import counted
+from ..thermal.memory import MemorySpec
+from ..thermal.state import BOARD, Layout
+from ..typing import Bools, Floats, Ints
+from ..unit.calibration import Calibration, parameter_layout
+from ..unit.correction import Correction
+from ..unit.prediction import SlowUncertainty
+from ..unit.provenance import Source
+from .rest import SUFFIX, Rest, Start, rests_of
+
+_DAY_NS = 86_400e9
+#: Name of the source of an update: time of its last rest, days by which its claim was aged.
+_UNTIL, _AGED = 'rests until ', ', claim aged '
+_LONGEST_DAYS = 36525.0  # a century
+#: Largest file of a log that is read [bytes]: a day of the node has at most 320 kB.
+_LARGEST = 1 << 26
+#: Windows of one start are averaged while the direction of f [rad] and the temperature [K] differ
+#: by less from the first: means of vectors are shorter than vectors by half the squared angle.
+_SAME_DIRECTION, _SAME_TEMPERATURE = 1e-3, 1.0
+#: ... and up to this number of windows.
+_LONGEST_GROUP = 60
+
+
+@dataclass(frozen=True)
+class Series:
+    """
+    Rests in order of time, (n,) and (n, ...); accelerations and their sd in m/s^2.
+
+    `time`: days since 1970; `start`: number of the start; `direction`: v; `force`: x; `miss`:
+    ``|f| - g``; `by_parameter`: H, (n, n_parameters); `by_level`: derivatives by the bias of each
+    axis and by its scale times g, (n, 6); `noise`: variance of one rest by samples and
+    thermometers; `lack`: v times the sd of the lack of fit; `claim`: claimed sd of `miss`.
+    """
+
+    time: Floats
+    start: Ints
+    temperature: Floats
+    state: Floats
+    direction: Floats
+    force: Floats
+    miss: Floats
+    by_parameter: Floats
+    by_level: Floats
+    noise: Floats
+    lack: Floats
+    claim: Floats
+    n_windows: Ints
+    reference_temperature: float
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def day(self) -> Ints:
+        """Number of the day of the start of each rest, since 1970."""
+        _, first = np.unique(self.start, return_index=True)
+        return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
+
+    def at(self, chosen: Bools | slice) -> Series:
+        """Return some of the rests; starts are numbered anew."""
+        parts: dict[str, Any] = {
+            name: value[chosen]
+            for name, value in vars(self).items()
+            if isinstance(value, np.ndarray)
+        }
+        parts['start'] = np.unique(parts['start'], return_inverse=True)[1]
+        return replace(self, **parts)
+
+
+def is_rest_log(path: Path) -> bool:
+    """Whether a path is a rest log or one of its files."""
+    return path.suffix == SUFFIX or (path.is_dir() and any(path.glob(f'*{SUFFIX}')))
+
+
+def read_rests(
+    paths: Sequence[Path],
+    calibration: Calibration,
+    *,
+    ahead: float = 0.0,
+    is_for_update: bool = True,
+) -> tuple[list[tuple[Start, Rest]], Source, list[str]]:
+    """
+    Read rest logs of a calibration's unit: its rests, the logs as a source of an update that is
+    aged `ahead` days, and notes.
+
+    Rests before the calibration are left out, unless all are; for an update those of an earlier
+    one always are. Raises RecordingError if no rest of the unit is left.
+    """
+    files: list[Path] = []
+    for path in paths:
+        found = sorted(path.glob(f'*{SUFFIX}')) if path.is_dir() else [path]
+        if not found or not path.exists():
+            raise RecordingError(f'no rest log: expected a folder of *{SUFFIX} files', path)
+        files += found
+    others: set[str] = set()
+    unit = calibration.unit
+
+    def is_wanted(start: Start) -> bool:
+        is_own = (start.serial, start.input) == (unit.serial, unit.input)
+        if not is_own:
+            others.add(start.serial)
+        return is_own
+
+    try:
+        contents = [read_bounded(file, _LARGEST) for file in files]
+    except (OSError, ValueError) as error:
+        reason = getattr(error, 'strerror', None) or str(error)
+        raise RecordingError(f'cannot be read: {reason}', str(paths[0])) from error
+    rests, n_damaged = rests_of(contents, is_wanted)
+    notes = [f'{counted(n_damaged, "damaged line")} skipped'] if n_damaged else []
+    if others:
+        notes.append(
+            f'rests of {", ".join(sorted(others))} are not of unit {unit.serial}: left out'
+        )
+    if not rests:
+        raise RecordingError(f'no rest of unit {unit.serial}', ', '.join(map(str, paths)))
+    begin, _, is_update = valid_since(calibration)
+    # The end is stated to the second.
+    first_ns = begin * _DAY_NS + 1e9 * is_update
+    later = [(start, rest) for start, rest in rests if rest.stamp_ns > first_ns]
+    if is_update and not is_for_update:
+        notes.append(f'{counted(len(rests) - len(later), "window")} took part in its last update')
+    elif is_update and not later:
+        raise RecordingError('the calibration has been updated with all of these rests', paths[0])
+    elif later and len(later) < len(rests):
+        day = np.datetime64(int(begin * 86400.0), 's')
+        notes.append(f'{counted(len(rests) - len(later), "window")} before {day}: left out')
+        rests = later
+    digest = hashlib.sha256(b''.join(contents)).hexdigest()
+    return rests, source_of(rests, digest, ahead), notes
+
+
+def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
+    """Describe rests for the provenance of an update: its name says their end and `ahead`."""
+    end = np.datetime64(rests[-1][1].stamp_ns, 'ns').astype('datetime64[s]')
+    n_samples = sum(rest.n for _, rest in rests)
+    return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
+
+
+def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
+    """
+    Return from when a calibration holds [days since 1970], until when its claim has been aged, and
+    whether this is by an update, from its last rest on; else it is the date of the file, or minus
+    infinity without a date.
+    """
+    names = [one.name for one in calibration.provenance.sources if one.name.startswith(_UNTIL)]
+    text = names[-1].removeprefix(_UNTIL) if names else calibration.provenance.created
+    date, _, aged = text.partition(_AGED)
+    try:
+        moment = np.datetime64(date.removesuffix('Z'), 'ns')
+        ahead = float(aged.removesuffix(' d') or 0.0)
+    except ValueError:
+        return -np.inf, -np.inf, False
+    if np.isnat(moment) or not 0.0 <= ahead < _LONGEST_DAYS:
+        return -np.inf, -np.inf, False
+    begin = int(moment.astype(np.int64)) / _DAY_NS
+    return begin, begin + ahead, bool(names)
+
+
+def series_of(
+    rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
+) -> Series:
+    """
+    Evaluate rests with a calibration; gravity is that of the log unless stated.
+
+    Raises RecordingError if the thermal states of the log lack a lag that the calibration needs.
+    """
+    correction = Correction(calibration)
+    layout, K = Layout(correction.memory), correction.K[:, 0]
+    places = {one: _places(one, correction.memory) for one in {s.memory for s, _ in rests}}
+    n_lags = len(correction.memory.lags)
+    states = np.array([np.array(r.state)[places[s.memory][0]] for s, r in rests])
+    states = states.reshape(len(rests), layout.width)
+    shares = np.array([np.array(r.shares)[places[s.memory][1]] for s, r in rests])
+    mean, sd = (np.array([getattr(r, name) for _, r in rests]) for name in ('mean', 'sd'))
+    n = np.array([r.n for _, r in rests])
+    stamps = np.array([r.stamp_ns for _, r in rests])
+    beginnings = np.array([s.start_ns for s, _ in rests])
+    local = np.array([s.gravity if gravity is None else gravity for s, _ in rests])
+    group = _grouped(beginnings, states[:, BOARD], mean / K)
+    sizes = np.bincount(group)
+
+    def averaged(values: Floats) -> Floats:
+        total = np.zeros((len(sizes), *values.shape[1:]))
+        np.add.at(total, group, values)
+        return np.asarray((total.T / sizes).T)
+
+    first = np.searchsorted(group, np.arange(len(sizes)))
+    states, mean = averaged(states), averaged(mean)
+    shares, local = averaged(shares.reshape(len(rests), n_lags)), averaged(local)
+    bias, scale = (one.T for one in correction.bias_scale(states.T))
+    x = (mean - bias) / scale
+    M = np.array(calibration.misalignment)
+    force = x @ M.T
+    size = np.sqrt((force**2).sum(axis=1))
+    u = force / size[:, np.newaxis]
+    v = u @ M
+    white = averaged(np.maximum((sd / K) ** 2, correction.noise) / n[:, np.newaxis])
+    noise = (v**2 * white).sum(axis=1) / sizes
+    bare = SlowUncertainty(replace(calibration, posterior=None), correction)
+    whole = SlowUncertainty(calibration, correction)
+    unexplained = correction.curves.unexplained(states[:, BOARD])[0].T
+    unexplained = np.broadcast_to(unexplained, x.shape)
+    residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
+    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
+    doubt, claim = (
+        _along(correction, states, shares, one, v, x) - of_one_sample for one in (bare, whole)
+    )
+    doubt -= (v**2 * unexplained).sum(axis=1)
+    return Series(
+        time=averaged(stamps / _DAY_NS),
+        start=np.unique(beginnings[first], return_inverse=True)[1],
+        temperature=states[:, BOARD],
+        state=states,
+        direction=v,
+        force=x,
+        miss=size - local,
+        by_parameter=_by_parameter(calibration, correction, states, u, v, x, scale),
+        by_level=np.hstack((v * K / scale, v * x / calibration.gravity_m_s2)),
+        noise=noise + np.maximum(doubt, 0.0),
+        lack=v * np.sqrt(np.maximum(unexplained - residual, 0.0)),
+        claim=np.sqrt(np.maximum(claim, 0.0) + noise),
+        n_windows=sizes,
+        reference_temperature=calibration.reference_temperature_c,
+    )
+
+
+def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
+    """Return the places of the wanted state, and of the shares of its lags, in a log's."""
+    layout, target = Layout(memory), Layout(wanted)
+    places = np.arange(target.width)
+    try:
+        for kind in ('gradients', 'lags'):
+            for name, place in getattr(target, kind).items():
+                at = getattr(layout, kind)[name]
+                places[place : place + 2] = at, at + 1
+        for play, place in target.plays.items():
+            places[place] = layout.plays[play]
+        return places, np.array([memory.lags.index(lag) for lag in wanted.lags], np.int64)
+    except (KeyError, ValueError) as error:
+        raise RecordingError(
+            'the rests were logged with a calibration of other columns, and hold no thermal state '
+            'for this one'
+        ) from error
+
+
+def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
+    """Assign the windows to groups: consecutive, of one start, direction and temperature."""
+    direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
+    group = np.zeros(len(start), dtype=np.int64)
+    first = 0
+    for k in range(1, len(start)):
+        is_same = (
+            start[k] == start[first]
+            and abs(temperature[k] - temperature[first]) < _SAME_TEMPERATURE
+            and np.abs(direction[k] - direction[first]).max() < _SAME_DIRECTION
+            and k - first < _LONGEST_GROUP
+        )
+        first = first if is_same else k
+        group[k] = group[k - 1] + (not is_same)
+    return group
+
+
+def _along(
+    correction: Correction,
+    states: Floats,
+    shares: Floats,
+    slow: SlowUncertainty,
+    v: Floats,
+    x: Floats,
+) -> Floats:
+    """Project the error variance of one sample on the direction of the force."""
+    parts = np.array(
+        [slow.at(s, p) for s, p in zip(states.tolist(), shares.tolist(), strict=True)]
+    )
+    columns = states.T
+    line = correction.line(columns, columns, parts.T, np.zeros(len(states)))
+    a, b, c = np.moveaxis(line[12:].reshape(3, 3, -1), 1, 0)
+    return np.asarray((v.T**2 * (a + x.T * (b + x.T * c))).sum(axis=0))
+
+
+def _by_parameter(
+    calibration: Calibration,
+    correction: Correction,
+    states: Floats,
+    u: Floats,
+    v: Floats,
+    x: Floats,
+    scale: Floats,
+) -> Floats:
+    columns, layout = states.T, parameter_layout(calibration)
+    regressors = correction.curves.regressors(columns, correction.table.values(columns))
+    result = np.zeros((len(states), layout.n_parameters))
+    for axis, K in enumerate(correction.K[:, 0]):
+        on_bias = v[:, [axis]] / scale[:, [axis]]
+        blocks = (layout.bias[axis], on_bias), (layout.scale[axis], on_bias * K * x[:, [axis]])
+        for k, (block, factor) in enumerate(blocks):
+            result[:, block.static : block.end] = regressors[axis + 3 * k].T * factor
+    by_tilt = (u[:, 1] * x[:, 0], u[:, 2] * x[:, 0], u[:, 2] * x[:, 1])
+    result[:, layout.misalignment :] = -np.transpose(by_tilt)
+    return result

@@ -1,0 +1,299 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the update of a calibration from rests in the field, and its judgement on rests left out.
+
+A rest shows the error along gravity alone. Which axes the rests determine is a matter of the
+attitudes: an axis is moved only if they reduce the uncertainty of some reading of it to `_TOLD`;
+the other axes keep their values, and their claim has aged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import eigh
+
+from ..errors import FitError
+from ..fitting.assembly import parameters_of, with_parameters
+from ..text import counted
+from ..typing import Bools, Floats
+from ..unit.calibration import AXES, Calibration, RegimeSet, parameter_layout
+from ..unit.correction import Correction
+from ..unit.gravity import spoken
+from ..unit.provenance import ResidualSummary, Source
+from .ageing import Ageing, Change, Model, Solution, learn, solve
+from .series import Series, valid_since
+
+#: An axis is moved if the sd of its best known reading falls to this part.
+_TOLD = 0.6
+#: Days after the last rest for which the claim is aged, unless stated.
+AHEAD_DAYS = 1.0
+#: Fewest days that are judged as such; with less, starts are.
+_FEWEST = 5
+
+
+@dataclass(frozen=True)
+class Moved:
+    """
+    Change of one axis, each with the sd that remains: bias at the temperature of the rests
+    [m/s^2], scale [relative], bias over the temperatures of the rests [m/s^2]; a change that
+    follows from no rest is 0. `reading`: change of bias plus scale at the rests' mean force.
+    """
+
+    axis: str
+    is_told: bool
+    bias: float
+    bias_sd: float
+    scale: float
+    scale_sd: float
+    curve: float
+    curve_sd: float
+    reading: float
+    reading_sd: float
+
+
+@dataclass(frozen=True)
+class Judged:
+    """
+    RMS of ``|f| - g`` over the rests of days (or starts) left out [m/s^2], by the calibration and
+    by an update from the earlier ones; `gain` and `gain_sd`: mean over them of the difference of
+    the mean squares, and its standard error [m^2/s^4].
+    """
+
+    over: str
+    n: int
+    before: float
+    after: float
+    gain: float
+    gain_sd: float
+    n_worse: int
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the gain exceeds its standard error."""
+        return self.gain > self.gain_sd
+
+    def __str__(self) -> str:
+        gained = 'better' if self.is_better else 'not better beyond one standard error'
+        return (
+            f'left-out {self.over}: |f| - g {spoken(self.before)} RMS before, '
+            f'{spoken(self.after)} after the update, {gained} ({self.n} {self.over})'
+        )
+
+
+@dataclass(frozen=True)
+class Update:
+    """An updated calibration, and what led to it."""
+
+    calibration: Calibration
+    moved: tuple[Moved, ...]
+    ageing: Ageing
+    changes: tuple[Change, ...]
+    judged: Judged
+    series: Series
+    n_outliers: int
+    model: Model
+    solution: Solution
+
+
+def update(
+    series: Series,
+    calibration: Calibration,
+    source: Source | None = None,
+    created: str = '',
+    ahead: float = AHEAD_DAYS,
+) -> Update:
+    """
+    Update a calibration by rests; `source` and `created` are for the new file's provenance, and
+    the claim is aged for `ahead` days after the last rest.
+
+    Raises FitError if there are too few starts to leave some out.
+    """
+    n_starts = int(series.start[-1]) + 1
+    if n_starts < 3:
+        raise FitError(
+            f'rests of {counted(n_starts, "start")}, need 3 at least: each start has a bias of '
+            'its own, and the update is judged on starts left out'
+        )
+    _, aged, is_update = valid_since(calibration)
+    first, last = float(series.time[0]), float(series.time[-1])
+    # The walk begins where the claim's ageing ends, or at the first rest if no date is before it.
+    since = aged if -np.inf < aged < (last if is_update else first) else first
+    ageing, model, used = learn(series, calibration, since)
+    to_file, bend = _levels(calibration), _slopes(calibration)
+    solution = solve(model, ageing, to_file, bend, ahead)
+    told, moved = _moved(used, calibration, solution)
+    judged = _judged(used, model, solution, told)
+    shift, kept = solution.shift * told, solution.shift * ~told
+    # What stays as it was is off by the shift that was not made.
+    covariance = solution.posterior + solution.future + np.outer(kept, kept)
+    turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
+    axis_told = [one.is_told for one in moved]
+    new = _shifted(calibration, shift, covariance)
+    residuals = ResidualSummary(
+        f'left-out {judged.over}',
+        judged.n,
+        judged.before,
+        judged.after,
+        float(np.abs(series.miss).max()),
+    )
+    provenance = calibration.provenance
+    day = np.datetime64(int(series.time[-1]), 'D')
+    note = (
+        f'updated by {int(series.n_windows.sum())} windows at rest up to {day}; before: '
+        f'{provenance.created or "no date"}. {judged}'
+    )
+    new = replace(
+        new,
+        static=_with_residual(new.static, turn_on, axis_told),
+        dynamic=_with_residual(new.dynamic, turn_on, axis_told),
+        provenance=replace(
+            provenance,
+            created=created or provenance.created,
+            sources=(*provenance.sources, *([source] if source else [])),
+            residuals=(*provenance.residuals, residuals),
+            notes=(*provenance.notes, note),
+        ),
+    )
+    n_outliers = len(series) - len(used)
+    return Update(new, moved, ageing, model.changes, judged, used, n_outliers, model, solution)
+
+
+def _levels(calibration: Calibration) -> Floats:
+    """Differentiate the parameters by bias [m/s^2] and scale [times g] of each axis, (n, 6)."""
+    layout = parameter_layout(calibration)
+    result = np.zeros((layout.n_parameters, 6))
+    for axis, reference in enumerate(calibration.axes):
+        bias, scale = layout.bias[axis], layout.scale[axis]
+        result[[bias.static, bias.dynamic], axis] = reference.scale_factor
+        result[[scale.static, scale.dynamic], axis + 3] = 1.0 / calibration.gravity_m_s2
+    return result
+
+
+def _slopes(calibration: Calibration) -> Floats:
+    """Differentiate the parameters by a slope of the bias of each axis [m/s^2 per K], (n, 3)."""
+    layout = parameter_layout(calibration)
+    result = np.zeros((layout.n_parameters, 3))
+    for axis, reference in enumerate(calibration.axes):
+        block = layout.bias[axis]
+        for part, level in zip(calibration.regime_sets(), block[:2], strict=True):
+            function = part.axes()[axis].bias_function
+            t = np.linspace(*part.temperature_range_c, 50) - calibration.reference_temperature_c
+            if function.n_free:
+                basis = np.array(function.basis(t)).T
+                free = np.linalg.lstsq(basis, t, rcond=None)[0]
+                places = slice(level + 1, level + 1 + function.n_free)
+                result[places, axis] = reference.scale_factor * free
+    return result
+
+
+def _moved(
+    series: Series, calibration: Calibration, solution: Solution
+) -> tuple[Bools, tuple[Moved, ...]]:
+    """Find the parameters that the rests determine, and list the changes by axis."""
+    layout, correction = parameter_layout(calibration), Correction(calibration)
+    coolest, warmest = np.argsort(series.temperature)[[len(series) // 10, -1 - len(series) // 10]]
+    states = np.array([series.state.mean(axis=0), series.state[coolest], series.state[warmest]]).T
+    regressors = correction.curves.regressors(states, correction.table.values(states))
+    told = np.zeros(layout.n_parameters, dtype=np.bool_)
+    gravity, found = calibration.gravity_m_s2, []
+    weights = series.n_windows / series.n_windows.sum()
+    for axis, name in enumerate(AXES):
+        bias, scale = layout.bias[axis], layout.scale[axis]
+        K = correction.K[axis, 0]
+        rows = np.zeros((4, layout.n_parameters))
+        rows[0, bias.static : bias.end] = regressors[axis][:, 0] / K
+        rows[1, scale.static : scale.end] = regressors[axis + 3][:, 0] * gravity
+        rows[2, bias.static : bias.end] = (regressors[axis] @ [0.0, -1.0, 1.0]) / K
+        rows[3] = rows[0] + rows[1] * float(weights @ series.force[:, axis]) / gravity
+        prior, posterior = (rows @ one @ rows.T for one in (solution.prior, solution.posterior))
+        least = 1e-12 * np.trace(prior[:2, :2]) * np.eye(2) + 1e-30 * np.eye(2)
+        ratio = eigh(posterior[:2, :2], prior[:2, :2] + least, eigvals_only=True)[0]
+        is_told = bool(ratio <= _TOLD**2)
+        told[bias.static : scale.end] = is_told
+        change = rows @ solution.shift * is_told
+        sd = np.sqrt(np.maximum(np.diag(posterior if is_told else prior), 0.0))
+        of_scale = change[1] / gravity, sd[1] / gravity
+        values = (change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3])
+        found.append(Moved(name, is_told, *map(float, values)))
+    told[layout.misalignment :] = all(one.is_told for one in found)
+    return told, tuple(found)
+
+
+def _judged(series: Series, model: Model, solution: Solution, told: Bools) -> Judged:
+    """Judge updates by earlier rests on each day (or start), against the calibration."""
+    over, labels = 'days', series.day
+    if len(np.unique(labels)) < _FEWEST:
+        over, labels = 'starts', series.start
+    rows, squares = model.rows, []
+    for label in np.unique(labels)[1:]:
+        at = labels == label
+        earlier = int(np.searchsorted(rows.start, series.start[at].min()))
+        shift = np.where(told, solution.before(earlier), 0.0)
+        left = series.miss[at] - series.by_parameter[at] @ shift
+        share = series.n_windows[at] / series.n_windows[at].sum()
+        squares.append((float(share @ series.miss[at] ** 2), float(share @ left**2)))
+    before, after = np.array(squares).T
+    gain = before - after
+    gain_sd = float(gain.std(ddof=1) / np.sqrt(len(gain))) if len(gain) > 1 else np.inf
+    return Judged(
+        over,
+        len(gain),
+        float(np.sqrt(before.mean())),
+        float(np.sqrt(after.mean())),
+        float(gain.mean()),
+        gain_sd,
+        int((gain < -gain_sd).sum()),
+    )
+
+
+def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Calibration:
+    """Add a shift to the parameters; the levels of the scale multiply K."""
+    layout = parameter_layout(calibration)
+    of_scale = np.array([shift[block.static] for block in layout.scale])
+    K = np.array([axis.scale_factor for axis in calibration.axes])
+    if not shift.any():
+        return with_parameters(calibration, K, parameters_of(calibration), covariance)
+    return with_parameters(
+        calibration, K * (1.0 + of_scale), parameters_of(calibration) + shift, covariance
+    )
+
+
+def _with_residual(part: RegimeSet, turn_on: float, told: Sequence[bool]) -> RegimeSet:
+    """Replace the slow error of each axis by that of the starts; untold axes keep a larger one."""
+    axes: dict[str, Any] = {
+        name: replace(
+            axis, residual_sd_m_s2=turn_on if is_told else max(turn_on, axis.residual_sd_m_s2)
+        )
+        for name, axis, is_told in zip(AXES, part.axes(), told, strict=True)
+    }
+    return replace(part, **axes)
+
+
+def what_moved(result: Update) -> list[str]:
+    """Say in sentences what has changed, and what the rests do not tell."""
+    ageing = result.ageing
+    lines = [
+        f'bias walks {spoken(ageing.bias)} and scale '
+        f'{1e6 * ageing.scale / result.calibration.gravity_m_s2:.2g} ppm per root day; a start '
+        f'differs by {spoken(ageing.turn_on)}, a rest by {spoken(ageing.rest)}'
+    ]
+    for change in result.changes:
+        if change.time is None:
+            lines.append('the curves of the bias have changed')
+        else:
+            day = np.datetime64(int(change.time * 86400.0), 's')
+            lines.append(f'a jump before {day}: a shock, no ageing')
+    untold = [one.axis for one in result.moved if not one.is_told]
+    if untold:
+        lines.append(
+            f'the rests cannot tell {", ".join(untold)}: these axes keep their values, their '
+            'claim has aged; rests in other attitudes would tell'
+        )
+    if result.n_outliers:
+        lines.append(f'{result.n_outliers} rests contradict all others and are left out')
+    return lines

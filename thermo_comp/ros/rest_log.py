@@ -1,0 +1,236 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the rest log of the node: samples at rest become lines of a folder, beside the samples' way.
+
+The samples' way appends references of messages to a list. The sums are done in blocks of
+`BLOCK` messages, as arrays; a thread writes the lines, so a slow or hanging disk delays nothing.
+What cannot be kept is counted and named in the diagnostics.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from queue import Full, Queue
+from typing import Any
+
+import numpy as np
+
+from ..errors import OutputError
+from ..field.gather import RestFinder
+from ..field.rest import SUFFIX, Start, counted_rests, encode, most_thinnable, thinned
+from ..online.compensator import Compensator
+from ..thermal.state import Layout
+from ..typing import Floats, Stamps
+from .reader import LoadedCalibration
+
+#: Messages that are summed at a time, unless a report comes first.
+BLOCK = 1024
+#: Largest size of a day, and of the folder [bytes]: 10 MB a month at most.
+DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
+#: Days are not thinned below this size [bytes].
+_FLOOR = 16_000
+#: Largest number of lines that wait for the disk.
+_WAITING = 1000
+#: Stamps before 2000-01-01 [ns] count from a start: such rests get the time of this computer.
+_EPOCH_NS = 946_684_800 * 10**9
+#: Backward step of the stamps [ns] from which a recording has begun anew.
+_JUMP_NS = 10**9
+# Plain form of a message (see `relay`): offsets from its end of counts, force and angular rate.
+_PLAIN, _COUNTS, _FORCE, _RATE = b'\0\1', -24, -96, -192
+_SHORTEST = {False: 44, True: 316}  # shortest message [bytes]; True: an Imu
+
+
+class RestLog:
+    """A folder of rests, written by a thread; `n_lost` lines could not be kept, for `reason`."""
+
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder).expanduser()
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f'parameter `rest_log`: {error.strerror}', folder) from error
+        if not os.access(self._folder, os.W_OK | os.X_OK):
+            raise OutputError('parameter `rest_log`: the folder is closed to the node', folder)
+        self.n_rests = self.n_days = self.n_lost = 0
+        self.reason = ''
+        self._is_torn = True  # the last line may be incomplete
+        self._start = b''
+        self._day = ''
+        self._lines: Queue[tuple[str, bytes, bytes] | None] = Queue(_WAITING)
+        self._thread = threading.Thread(target=self._write_all, name='rests', daemon=True)
+        self._thread.start()
+
+    def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
+        """Queue the line of a rest, and that of the start it belongs to."""
+        day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
+        try:
+            self._lines.put_nowait((str(day), start, rest))
+        except Full:
+            self._lose('the disk does not answer')
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Write what waits, within the time."""
+        try:
+            self._lines.put(None, timeout=timeout_s)
+        except Full:
+            return
+        self._thread.join(timeout_s)
+
+    def _lose(self, reason: str) -> None:
+        self.n_lost, self.reason = self.n_lost + 1, reason
+
+    def _write_all(self) -> None:
+        try:
+            files = list(self._folder.glob(f'*{SUFFIX}'))
+            self.n_days = len(files)
+            self.n_rests = sum(counted_rests(file.read_bytes()) for file in files)
+        except OSError as error:
+            self.reason = error.strerror or str(error)
+        while (one := self._lines.get()) is not None:
+            self._try(*one)
+
+    def _try(self, day: str, start: bytes, rest: bytes) -> None:
+        try:
+            self._write(day, start, rest)
+        except OSError as error:
+            self._is_torn = True
+            self._lose(error.strerror or str(error))
+
+    def _write(self, day: str, start: bytes, rest: bytes) -> None:
+        path = self._folder / f'{day}{SUFFIX}'
+        is_new = not path.exists()
+        text = b'\n' * (self._is_torn and not is_new)
+        if is_new or self._is_torn or (day, start) != (self._day, self._start):
+            text += start
+        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            text += rest
+            if os.write(descriptor, text) != len(text):
+                raise OSError(0, 'the disk is full')
+            os.fdatasync(descriptor)
+            size = os.fstat(descriptor).st_size
+        finally:
+            os.close(descriptor)
+        self._is_torn = False
+        self.n_rests, self.n_days = self.n_rests + 1, self.n_days + is_new
+        if size > DAY_BYTES:
+            self._thin(path)
+        if is_new or start != self._start:
+            self._bound_folder()
+        self._day, self._start = day, start
+
+    def _thin(self, path: Path) -> None:
+        content = path.read_bytes()
+        less = thinned(content)
+        partial = path.with_suffix('.partial')
+        partial.write_bytes(less)
+        partial.replace(path)
+        self.n_rests -= counted_rests(content) - counted_rests(less)
+
+    def _bound_folder(self) -> None:
+        while True:
+            sizes = {one.name: one.stat().st_size for one in self._folder.glob(f'*{SUFFIX}')}
+            day = most_thinnable(sizes, FOLDER_BYTES, _FLOOR)
+            if day is None:
+                return
+            self._thin(self._folder / day)
+            if (self._folder / day).stat().st_size >= sizes[day]:
+                return
+
+
+class RestKeeper:
+    """Turns the samples of a node into lines of its rest log."""
+
+    def __init__(self, folder: str) -> None:
+        self.log = RestLog(folder)
+        self._compensator: Compensator | None = None
+        self._loaded: LoadedCalibration | None = None
+        self._start_ns = time.time_ns()
+        self._last_ns = 0
+
+    def gather(
+        self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
+    ) -> None:
+        """Sum messages that the compensator has corrected; queue the rests that end in them."""
+        # The sums refer to what is in use now; after a reload a second or two may be mixed.
+        self._use(loaded, compensator)
+        stamps, samples = samples_of(messages, is_imu=loaded.calibration.unit.input != 'counts')
+        if not len(stamps):
+            return
+        if stamps[-1] < self._last_ns - _JUMP_NS:
+            self._last_ns = 0  # a new recording: what is out of order within it is left out
+        if stamps[0] <= self._last_ns or (np.diff(stamps) <= 0).any():
+            before = np.maximum.accumulate(np.concatenate(([self._last_ns], stamps[:-1])))
+            samples, stamps = samples[stamps > before], stamps[stamps > before]
+        self._last_ns = int(stamps[-1]) if len(stamps) else self._last_ns
+        for rest in self._finder.add(stamps, samples):
+            stamp_ns = rest.stamp_ns if rest.stamp_ns >= _EPOCH_NS else time.time_ns()
+            self.log.put(stamp_ns, self._start, encode(replace(rest, stamp_ns=stamp_ns)))
+
+    def _use(self, loaded: LoadedCalibration, compensator: Compensator) -> None:
+        is_new = loaded is not self._loaded
+        if not is_new and compensator is self._compensator:
+            return
+        self._loaded, self._compensator = loaded, compensator
+        calibration, correction = loaded.calibration, compensator.thermal.correction
+        self._start = encode(
+            Start(
+                self._start_ns,
+                calibration.unit.serial,
+                calibration.unit.input,
+                compensator.config.local_gravity_m_s2 or calibration.gravity_m_s2,
+                loaded.sha256,
+                correction.memory,
+            )
+        )
+        if is_new:
+            self._finder = RestFinder(
+                correction.K[:, 0],
+                np.array(correction.noise),
+                calibration.unit.full_scale,
+                self._state_now,
+            )
+
+    def _state_now(self) -> tuple[Sequence[float], Sequence[float]] | None:
+        compensator = self._compensator
+        if compensator is None or compensator.now_ns is None:
+            return None
+        thermal, now_ns = compensator.thermal, compensator.now_ns
+        if now_ns > thermal.fresh_until_ns or thermal.rate.is_too_fast:
+            return None
+        if thermal.is_unmeasured:
+            width = Layout(thermal.correction.memory).width
+            return (*thermal.sample(now_ns), *[0.0] * width)[:width], ()
+        return thermal.sample(now_ns), thermal.tracker.memory.start_shares(now_ns)
+
+
+def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
+    """Read stamps [ns] and samples of messages in plain form and of the last one's size."""
+    size = len(messages[-1]) if messages else 0
+    # Shorter messages than those with an empty frame_id are malformed.
+    if size < _SHORTEST[is_imu]:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
+    content = b''.join(messages)
+    if len(content) != size * len(messages):
+        content = b''.join([one for one in messages if len(one) == size])
+    at = size + (_FORCE if is_imu else _COUNTS)
+    # An angular rate and the first element of its covariance, which is -1 where there is none.
+    fields = [('plain', 'S4', 0), ('sec', '<i4', 4), ('nanosec', '<u4', 8), ('force', '3<f8', at)]
+    fields += [('rate', '4<f8', size + _RATE)] * is_imu
+    row = zip(('names', 'formats', 'offsets'), map(list, zip(*fields, strict=True)), strict=True)
+    kind: Any = {**dict(row), 'itemsize': size}
+    table: Any = np.frombuffer(content, np.dtype(kind))
+    is_plain = table['plain'] == _PLAIN
+    if not is_plain.all():
+        table = table[is_plain]
+    samples = table['force']
+    if is_imu and (table['rate'][:, 3] != -1.0).all():
+        samples = np.hstack((samples, table['rate'][:, :3]))
+    stamps = table['sec'] * np.int64(1_000_000_000) + table['nanosec']
+    return stamps, samples
