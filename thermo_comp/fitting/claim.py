@@ -32,6 +32,8 @@ from .unknowns import Layout, Prior
 _MOUNTINGS = 10.0 ** np.arange(-3.0, 1.51, 0.25)
 # Noises of a window that an unseen column may add before it counts.
 _OPEN = 4.0
+# A column stands still if it moves by less than this share of the temperature's own change.
+_STANDS = 0.01
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,8 @@ def _with_unseen(
 
     A column that is absent was not needed; whether it is 0 the data determine to ``1 / sqrt(S)``,
     S what they say of it beside the columns that stayed. Where that is more than some standard
-    deviations of a window's noise, once the column moves as far as the temperature did, the
-    covariance has it with that width; its weight stays 0.
+    deviations of a window's noise, the covariance has it with that width; its weight stays 0. A
+    column that stood still, as in soaks, is judged as if it moved as far as the temperature did.
     """
     groups = np.array(regression.windows.groups)
     inactive = regression.inactive(posterior, prior, np.isin(groups, LAGS) & typical.any(axis=0))
@@ -115,7 +117,8 @@ def _with_unseen(
         sd = np.where(own, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
     kelvins = regression.windows.kelvins
-    farther = np.maximum(float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
+    stood = kelvins < _STANDS * float(kelvins[0])
+    farther = np.where(stood, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
     matters = (sd > 0.0) & (sd * farther > _OPEN * float(np.mean(prior.sigma)) * units)
     return replace(prior, column_sd=np.where(matters, sd, prior.column_sd))
 
