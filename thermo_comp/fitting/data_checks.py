@@ -173,6 +173,14 @@ def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
     )
 
 
+def judge_copies(names: Sequence[str]) -> list[Finding]:
+    """Say which thermometers repeat the board's readings."""
+    return [
+        _advice('copy', f'temperature/{name} repeats the readings of the board: it is left out')
+        for name in names
+    ]
+
+
 def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterator[Finding]:
     """Judge what the still windows cover: temperatures, ramps, directions `up`, shape (n, 3)."""
     yield _judge_positions(up)

@@ -35,7 +35,7 @@ from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
 from .selection import Selected, is_better
-from .sensors import board_span, gradients_at_rest, learn_detector
+from .sensors import board_span, gradients_at_rest, learn_detector, without_copies
 from .sources import FitSource
 from .start import position_means
 from .windows import FEWEST_WINDOWS, SET, Model, ThermalWindows, thermal_windows
@@ -183,6 +183,8 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     serial = check_serial([bag.source for bag in bags], options)
     findings = enforce(data_checks.judge_prior(serial, options.prior), options)
     findings += enforce(data_checks.judge_bags(bags, options), options)
+    bags, copies = without_copies(bags)
+    findings += data_checks.judge_copies(copies)
     known = options.prior
     detector = options.detector or (known.detector if known else learn_detector(bags))
     tell(0.55)

@@ -207,6 +207,22 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
     return result
 
 
+def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
+    """Leave out thermometers that repeat the board's readings in every bag; name them."""
+    names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
+    copies = [
+        name
+        for name in names
+        if all(np.array_equal(bag.temperatures[name].value, bag.board.value) for bag in bags)
+        and any(len(bag.board.value) for bag in bags)
+    ]
+    kept = [
+        replace(bag, temperatures={k: v for k, v in bag.temperatures.items() if k not in copies})
+        for bag in bags
+    ]
+    return kept, copies
+
+
 def board_span(bags: Sequence[ReducedBag], reference: float) -> tuple[float, float]:
     """Return the board temperatures seen, from the reference [K], but for stray readings."""
     values = np.concatenate([bag.board.value for bag in bags])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bias whose slope changes at one temperature, fitted and corrected through the public API."""
+"""Fits through the public API: a knee in the curve, a thermometer on two topics."""
 
 from __future__ import annotations
 
@@ -60,3 +60,25 @@ def test_a_curve_without_a_knee_has_no_bend(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(globals(), 'SLOPE', 0.0)
     unit, _ = left_by(('curve', 'bend'))
     assert not [term for term in unit.response if term.group == 'bend']
+
+
+def test_a_thermometer_on_two_topics_is_one() -> None:
+    bags = []
+    for copies in (('board',), ('board', 'case')):
+        rng = np.random.default_rng(9)
+        bags.append(
+            [
+                tc.Columns(
+                    time_s,
+                    force,
+                    dict.fromkeys(copies, (time_s[::5], board[::5])),
+                    name=f'rest{k}',
+                )
+                for k, (time_s, force, board) in enumerate(recording(up, rng) for up in UPS[:3])
+            ]
+        )
+    one, two = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
+    assert one.static == two.static
+    assert one.axes == two.axes
+    assert any('temperature/case repeats' in note for note in two.provenance.notes)
+    assert not any('repeats' in note for note in one.provenance.notes)
