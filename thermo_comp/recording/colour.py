@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what coloured noise does to cells at rest: how far their variances and changes may spread.
+Owns the effect of coloured noise on cells at rest: the spread of their variances and changes.
 """
 
 from __future__ import annotations
