@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the drift of an accelerometer does to an inertial navigator, and what is left of it.
+Owns the position error of an inertial navigator due to accelerometer drift, raw and compensated.
 
-A platform stands in the chamber of the held-out bag: whatever its navigator says of motion is
-error. It levels itself for five minutes, then navigates freely for half an hour; or it is told
-every minute that it stands (ZUPT), and then coasts for five minutes. Every minute of the run
-begins such a flight, with the raw accelerometer, with one set of coefficients, and compensated.
+A platform stands in the chamber of the held-out bag, so that any motion that its navigator
+computes is an error. The navigator levels itself for five minutes, then navigates freely for half
+an hour; or it gets a zero-velocity update (ZUPT) every minute, and then coasts for five minutes.
+Such a flight begins in every minute of the run, with the raw accelerometer, with one set of
+coefficients, and compensated.
 
-The gyroscopes are ideal and the Earth does not turn, so nothing but the accelerometer is judged;
-the vertical channel, which no navigator has without a barometer, is held. The filter has four
+The gyroscopes are ideal and the Earth does not rotate, so that only the accelerometer matters; the
+vertical channel, which needs a barometer, is held. The filter has four
 errors per level axis, position p, velocity v, tilt a and accelerometer b, as of [1]_ chapter 12::
 
     p' = v      v' = b - g a      a' = v / R      b' = -b / tau + noise

@@ -158,8 +158,8 @@ class Desk:
 
     def run(self, command: str, cli: Cli | None = None) -> subprocess.CompletedProcess[str]:
         """
-        Run one example as it is written but for a wait; it must succeed. Each has a fresh folder,
-        but a fleet goes on in its own.
+        Run one example as written, with a shorter wait; it must succeed. Each example has a new
+        folder, except that fleets share one.
 
         Parameters
         ----------

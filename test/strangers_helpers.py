@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the units and attitudes that the tests of the benchmark for strangers share."""
+"""Owns units and attitudes for the tests of the strangers benchmark."""
 
 from __future__ import annotations
 

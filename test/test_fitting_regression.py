@@ -34,7 +34,10 @@ from thermo_comp.typing import Bools, Floats
 
 
 class Dense:
-    """The same posterior the slow way: one vector, dense covariances, numerical derivatives."""
+    """
+    The same posterior by a slow second route: one vector, dense covariances, numerical
+    derivatives.
+    """
 
     def __init__(self, regression: Regression, prior: Prior, at: Posterior) -> None:
         self.windows, self.prior, self.at = regression.windows, prior, at
@@ -49,7 +52,7 @@ class Dense:
         self.determinant = -2.0 * sum(np.log(np.diag(root)).sum() for root in self.roots)
 
     def state(self, x: Floats) -> State:
-        """Move the mode of the fast way by x."""
+        """Move the mode of the fast route by x."""
         layout, at = self.at.layout, self.at.state
         padded = np.append(x, 0.0)
         up = at.up + np.einsum('pij,pj->pi', tangent_basis(at.up), x[layout.up])
@@ -65,7 +68,7 @@ class Dense:
         )
 
     def residual(self, x: Floats) -> Floats:
-        """All residuals in sd, those of the prior behind those of the windows."""
+        """All residuals in sd: those of the windows, then those of the prior."""
         w, prior, state = self.windows, self.prior, self.state(x)
         rms = np.sqrt(np.mean(w.columns**2, axis=0))
         moved = w.columns.copy()
@@ -88,7 +91,7 @@ class Dense:
             state.offset.ravel() / prior.offset_sd,
             state.tilt.ravel() / prior.tilt_sd,
             state.start.ravel() / np.sqrt(prior.start_share),
-            # What the bags have in common: its mean has a tenth of the sd of each start.
+            # The mean over all bags has a tenth of the sd of each start.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_share)),
         ]
         for weights, sd in zip(state.weights, prior.column_sd, strict=True):
@@ -96,7 +99,7 @@ class Dense:
         return np.concatenate(parts)
 
     def jacobian(self, x: Floats) -> Floats:
-        """By central differences of a tenth of each sd: linear to some 1e-9 there."""
+        """Return central differences with steps of a tenth of each sd: linear to some 1e-9."""
         sd = np.sqrt(self.at.variance)
         columns = []
         for k in range(self.n):
@@ -126,7 +129,7 @@ def test_the_mode_is_that_of_the_dense_problem(
     dense = Dense(regression, prior, found)
     at = dense.residual(np.zeros(dense.n))
     gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(found.variance)
-    # In sds: Gauss-Newton was repeated until it stands.
+    # In sds: Gauss-Newton is repeated until it converges.
     assert np.abs(gradient).max() < 1e-4
     other = least_squares(
         dense.residual, np.zeros(dense.n), x_scale=np.sqrt(found.variance), method='trf'
@@ -147,19 +150,19 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
-        # Correlations of 0.999 lose three digits of the derivatives' eight. What a bag knows of
-        # its own unknowns is told without the bound on what all bags have in common.
+        # Correlations of 0.999 lose three of the eight digits of the derivatives. The information
+        # of a bag about its own unknowns is computed without the bound on the mean of all bags.
         np.testing.assert_allclose(
             mode.covariance / np.outer(sd[:n], sd[:n]), covariance, atol=1e-4
         )
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
-        # Laplace: -2 ln Z = misfit + ln det of noise, of prior and of Hessian; directions are
-        # flat.
+        # Laplace: -2 ln Z = misfit + ln det of noise, of prior and of Hessian; directions have no
+        # prior.
         precision = regression.precision(one, mode.layout)
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # But for the number of bags: the bound is a fixed part of the sd of a start.
+    # Except for the number of bags: the bound is a fixed part of the sd of a start.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
@@ -169,7 +172,7 @@ def test_truth_comes_out_without_noise(rng: np.random.Generator) -> None:
     regression, state = begin(windows, up)
     prior = replace(prior_of(truth), sigma=np.full(3, MICRO))
     found = mode_of(regression, state, prior).state
-    # The priors pull by some 1e-6 of the sd, which is of 1 ug.
+    # The priors shift the result by 1e-6 of the sd, which is of the order of 1 ug.
     np.testing.assert_allclose(found.kappa, truth.kappa, atol=1e-9)
     np.testing.assert_allclose(found.bias, truth.bias, atol=1e-8)
     np.testing.assert_allclose(found.misalignment, truth.misalignment, atol=1e-8)
@@ -178,15 +181,15 @@ def test_truth_comes_out_without_noise(rng: np.random.Generator) -> None:
         weights = found.weights[part] / regression.rms
         np.testing.assert_allclose(weights, truth.weights[part], atol=atol)
     np.testing.assert_allclose(found.start, 0.0, atol=1e-2)
-    # As the compensator would: forward and back again.
+    # As in the compensator: forward and back again.
     force = regression.force(found)
     np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
 
 
 def test_claimed_sd_is_the_scatter() -> None:
-    # Under the right priors the inverse Hessian is the Cramer-Rao bound: errors over claimed sd
-    # have an rms of 1. 36 units of 3 x 2 + 3 + 24 numbers, some of them correlated: the rms of
-    # each kind is known to 13 % at the worst.
+    # Under the true priors the inverse Hessian is the Cramer-Rao bound: errors over claimed sd
+    # have an RMS of 1. 36 units of 3 x 2 + 3 + 24 numbers, some of them correlated: the RMS of
+    # each kind is determined to 13 % or better.
     rng = np.random.default_rng(11)
     truth = Truth(noise=Noise(0.5, 1000.0), offset_sd=MICRO, start_sd=0.3)
     errors = []
@@ -201,7 +204,7 @@ def test_claimed_sd_is_the_scatter() -> None:
 
 
 def refit_of(whole: Posterior, regression: Regression, prior: Prior, kept: Bools) -> State:
-    """Fit some rows alone; weights in units of the whole table's RMS."""
+    """Fit some rows alone; weights are in units of the whole table's RMS."""
     windows = regression.windows
     rest = Regression(rows_of(windows, np.flatnonzero(kept)), GRAVITY, NOMINAL)
     units = rest.rms / regression.rms
@@ -214,9 +217,9 @@ def refit_of(whole: Posterior, regression: Regression, prior: Prior, kept: Bools
     return replace(found, weights=found.weights / units)
 
 
-#: Linear in all but directions, which are known to some urad: exact but for rounding. Else first
-#: order (positions), or two steps (sections): what is left is the product of two moves, the
-#: start's and the weight's.
+#: Linear in everything except directions, which are determined to some urad: exact except for
+#: rounding. Otherwise first order (positions) or two steps (sections): the remainder is the
+#: product of two changes, of the start and of the weight.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -269,7 +272,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(
         size = np.sqrt(np.mean(expected**2))
         assert score.sections.square[section] == pytest.approx(size**2, rel=2.0 * tolerance)
     assert score.sections.rms == pytest.approx(np.sqrt(score.sections.square.mean()))
-    # With one position there is nothing else to leave out: the drift is that of the sections.
+    # One position cannot be left out: the drift is that of the sections.
     alone, state = begin(rows_of(windows, np.arange(24)), up[:1])
     alone_score = score_of(alone, alone.solve(state, prior), prior)
     assert np.isnan(alone_score.positions.rms)
@@ -280,7 +283,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(
 def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(
     rng: np.random.Generator,
 ) -> None:
-    # Six faces: without one of them nothing tells that axis' bias from its scale.
+    # Six faces: without one of them the bias of its axis is not separated from the scale.
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
     regression, state = begin(windows, up)
@@ -289,7 +292,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(
     score = score_of(regression, found, prior)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift needs neither; and M stays where it was, as widely known as before.
+    # The drift needs neither; M keeps its value and its uncertainty.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(found.state.misalignment, 0.0, atol=1e-6)
     places = found.layout.misalignment
@@ -298,7 +301,8 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
 def test_no_step_goes_uphill(seed: int) -> None:
-    # Bags that began far from rest, and little to tell a start from a weight: a product.
+    # Bags that started far from rest, with little data to separate a start from a weight: a
+    # product.
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
     windows, up = table_of(truth, 4, rng, n_windows=12, step_s=400.0)
@@ -315,7 +319,7 @@ def test_no_step_goes_uphill(seed: int) -> None:
 def test_what_takes_no_part_any_more_is_gone(solved: tuple[Regression, Prior, Posterior]) -> None:
     regression, prior, found = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
-    # Even where no step is made.
+    # The result also holds for a state to which no step has been applied.
     state = regression.solve(found.state, narrow, n_steps=0).state
     assert not state.weights[0, :, 2:4].any()
     np.testing.assert_array_equal(state.weights[1], found.state.weights[1])
@@ -367,8 +371,8 @@ def test_published_huygens_coefficients_come_back(rng: np.random.Generator) -> N
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
 def test_inactive_columns_are_known_as_if_they_took_part(noise: Noise) -> None:
-    # In a linear problem S is the inverse covariance that a flat prior would leave them, S^-1 Q
-    # the weight that they would get, and the gain that of the log evidence.
+    # In a linear problem S is the inverse covariance of the columns under a flat prior, S^-1 Q
+    # their estimated weight, and the gain that of the log evidence.
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
     regression, state = begin(without_starts(windows), up)

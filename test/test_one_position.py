@@ -59,7 +59,7 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
     # Prior of any unit: scale 5 %, misalignment 1 mrad.
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-3, rtol=0.02)
-    assert 'stays at its prior' in next(
+    assert 'keep their prior' in next(
         one.message for one in one_position.findings if one.name == 'positions'
     )
 

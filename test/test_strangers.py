@@ -66,8 +66,8 @@ def test_own_heat_warms_the_board_above_the_case() -> None:
 
 
 def test_still_air_is_another_law_of_the_hidden_node() -> None:
-    # In the chamber and in still air the hidden node stands elsewhere between case and board:
-    # what the board tells of it in the chamber is wrong outside.
+    # In still air the hidden node has another temperature between case and board than in the
+    # chamber, so that a prediction from the board in the chamber is wrong outside.
     shares = []
     for environment in (CHAMBER, STILL_AIR):
         _, states = ramp(unit(), 0.01, 12, environment)
@@ -83,7 +83,7 @@ def test_samples_of_a_perfect_unit_are_the_force() -> None:
 
 
 def test_noise_bias_scale_and_misalignment_follow_their_definition() -> None:
-    # corrected = M (measured - bias) / scale must give back the force, but for white noise.
+    # corrected = M (measured - bias) / scale must give the force, except for white noise.
     given = unit(
         bias=np.array([100.0, -200.0, 300.0]), gain=np.array([0.01, -0.02, 0.03]),
         skew=np.array([1e-3, 2e-3, -3e-3]), density=5.0,
@@ -127,7 +127,8 @@ def test_a_support_tilts_with_the_square_of_temperature() -> None:
     bag = record(unit(), program(20, 10, (35, 1, 60)), LEVEL, rng_of('tilt'), tilt=axis)
     case = np.interp(bag.time_s - 1.0, *bag.temperatures['case'])
     angle = np.arctan2(-bag.force[:, 1], bag.force[:, 2])
-    # Readings are 5 s apart and linear between; half a micro-radian is 1/450 of the largest tilt.
+    # Readings are 5 s apart and interpolated linearly; half a micro-radian is 1/450 of the largest
+    # tilt.
     assert angle == pytest.approx(1e-6 * (case - 20.0) ** 2, abs=5e-7)
     assert np.linalg.norm(bag.force, axis=1) == pytest.approx(GRAVITY)
 
@@ -138,7 +139,8 @@ def test_cold_start_is_as_cold_as_the_air_and_then_warms_up() -> None:
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
     for bag, heat in ((cold, 0.0), (warm, 2.0)):
         board, case = bag.temperatures['board'][1][0], bag.temperatures['case'][1][0]
-        # The chamber hunts by 0.03 K and the first reading comes 0.3 s after the switch-on.
+        # The chamber's control oscillates by 0.03 K, and the first reading is 0.3 s after the
+        # switch-on.
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
@@ -153,13 +155,13 @@ def test_attitudes_are_unit_vectors_far_from_each_other() -> None:
     up = spread(18, rng_of('spread'))
     cosine = up @ up.T - np.eye(18)
     assert np.linalg.norm(up, axis=1) == pytest.approx(1.0)
-    # 18 points on a sphere can be 49 degrees apart at best; drawn ones reach most of that.
+    # 18 points on a sphere can be at most 49 degrees apart; random ones reach most of that.
     assert np.degrees(np.arccos(cosine.max())) > 30.0
 
 
 @pytest.fixture
 def recorded(monkeypatch):
-    """Replace recording by notes of what would be recorded."""
+    """Replace recordings by notes of their programs."""
     notes = {}
 
     def note(given, corners, up, rng, *, name='bag', **keys):
@@ -246,7 +248,7 @@ def test_the_bound_falls_with_noise_and_with_data() -> None:
     assert louder == pytest.approx(2.0 * sd, rel=1e-6)
     twice = cases.bias_bound(given, np.concatenate((up, up)), bags + bags)
     assert twice == pytest.approx(sd / np.sqrt(2.0), rel=1e-6)
-    # Bias alone, all else known, would be known to the noise of the mean over all samples.
+    # If only the bias is unknown, its sd is the noise of the mean over all samples.
     least = UG * given.density / np.sqrt(sum(len(bag.time_s) for bag in bags) * 2.0)
     assert (sd > least).all()
     assert (sd < 100.0 * least).all()

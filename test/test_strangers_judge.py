@@ -24,7 +24,7 @@ from thermo_comp.unit.calibration import Axes, AxisReference
 
 
 def of_attitudes(given, board):
-    """Make means of minutes of a unit in all attitudes at some temperatures of the board."""
+    """Make minute means of a unit in all attitudes at some temperatures of the board."""
     force = GRAVITY * np.repeat(ATTITUDES, len(board), axis=0)
     at = np.tile(board, len(ATTITUDES))
     parts = np.repeat(at[:, None], 3, axis=1)
@@ -33,7 +33,7 @@ def of_attitudes(given, board):
 
 
 def curved_unit():
-    """Make a unit that the cubic by hand describes."""
+    """Make a unit that the cubic fitted by hand describes."""
     rng = rng_of('curved')
     return unit(
         bias=1500.0 * rng.standard_normal(3), gain=0.01 * rng.standard_normal(3),
@@ -53,13 +53,13 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not() -> None:
         strangers.error_of([by_norm([fit], order=order)(held)], [held], is_drift=False)
         for order in (3, 0)
     )
-    # What is left: products of two small terms that the cubic's form leaves out.
+    # Remaining error: products of two small terms that the cubic does not contain.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
 
 
 def test_constants_by_hand_keep_the_scale_of_few_attitudes() -> None:
-    # One attitude and much scatter: a scale that makes one force of everything fits best.
+    # One attitude and much scatter: the best fit is a scale that makes all forces equal.
     rng = rng_of('few')
     samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
     few = Minutes(samples, np.full(200, 20.0), np.full((200, 3), np.nan))
@@ -68,12 +68,12 @@ def test_constants_by_hand_keep_the_scale_of_few_attitudes() -> None:
 
 
 def test_a_bias_at_the_reference_is_held_against_its_bound() -> None:
-    # A calibration in counts that knows the bias but for 1 count, 1 / 300 m/s^2, on x.
+    # A calibration in counts whose bias is wrong by 1 count, 1 / 300 m/s^2, on x.
     bias = np.array([0.1, -0.2, 0.3])
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
     bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
     study = cases.Study('', (), {}, bound=bound)
-    # An sd of 2e-3 m/s^2 that the calibration claims beside its white noise.
+    # An sd of 2e-3 m/s^2 that the calibration claims in addition to its white noise.
     claimed = axis_set(residual_sd_m_s2=2e-3)
     known = regime_set(x=claimed, y=claimed, z=claimed)
     found = strangers.bias_score(calibration(axes=axes, static=known, dynamic=known), study)
@@ -114,13 +114,13 @@ def test_a_ratio_is_1_where_errors_are_as_claimed() -> None:
     claim = np.broadcast_to(root @ root.T, (n, 3, 3))
     out = strangers.Corrected(truth + error, claim, np.zeros(3))
     found = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
-    # 20000 windows tell an RMS to half a percent.
+    # 20000 windows determine an RMS to half a percent.
     assert (found.ratio, found.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
     assert found.claim == pytest.approx(found.vector, rel=0.02)
 
 
 def test_a_claim_of_a_minute_is_the_noise_of_its_mean() -> None:
-    # The calibration of the tests claims nothing but white noise and the rounding of counts.
+    # The calibration of the tests only claims white noise and the rounding of counts.
     samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
     samples[::2] += 1.0
     samples[1::2] -= 1.0
@@ -202,7 +202,7 @@ def test_each_case_has_a_limit_and_each_limit_a_case() -> None:
 
 
 def carried_bag():
-    """Make a day at 1 Hz whose attitude changes after 5 h, and bumps for two minutes at 10 h."""
+    """Make a day at 1 Hz whose attitude changes after 5 h, with bumps for two minutes at 10 h."""
     time_s = np.arange(1.0, 86401.0)
     force = np.where((time_s > 18000.0)[:, None], GRAVITY * LEVEL, GRAVITY * ATTITUDES[0])
     force[36000:36120] = 0.5
@@ -211,7 +211,7 @@ def carried_bag():
 
 def test_rests_of_a_recording_are_its_long_stays() -> None:
     rows = rests_of(carried_bag())
-    # Without the minute at both ends.
+    # Without a minute at each end.
     expected = [(60, 17940), (18060, 35940), (36180, 86340)]
     assert [(rest.start, rest.stop) for rest in rows] == expected
 
@@ -221,7 +221,7 @@ def test_blocks_go_by_the_clock_and_share_no_sample() -> None:
     blocks = blocks_of(part(bag, slice(9000, 86400), 'rest'), 'rest')
     assert list(blocks) == list(range(8))
     times = np.concatenate([block.time_s for block in blocks.values()])
-    # The last sample would be a block of its own.
+    # The last sample would be a block alone.
     assert times.tolist() == bag.time_s[9000:-1].tolist()
     assert all((block.time_s // 10800.0 == number).all() for number, block in blocks.items())
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the way from the recordings' own files to bags."""
+"""Owns the conversion of the recordings' files to bags."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def fleet_fit(
     )
     out.told((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
-        # Of a test with a calibration the reservations name the bags left out, too.
+        # The reservations of a calibrated test also name the bags left out.
         said = (row['problem'], row['reservations'] or row['left_out'])
         out.points(f'{row["name"]}: {one}' for one in said if one)
     out.points(

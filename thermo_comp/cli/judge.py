@@ -160,7 +160,7 @@ def report(
 
     Shows temperatures, regime, |f| before and after, the functions of
     temperature with their uncertainty, and the verdict of evaluate, with
-    its exit code. The report of a fit itself comes from: fit --report.
+    its exit code. `fit --report` writes the report of the fit itself.
 
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html

@@ -101,7 +101,7 @@ FORCE = option('Overwrite an output of the same kind.', False, '--force', '-f')
 QUIET = option('Print nothing but errors.', False, '--quiet', '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
 JUDGED_BAGS = argument('Bags to judge it on.', None, metavar='[BAG]...')
-CERTIFICATE_INFO = option('What the laboratory states: number, customer, ... (YAML).')
+CERTIFICATE_INFO = option('Statements of the laboratory: number, customer, ... (YAML).')
 TABLE_RATE = option('Samples per second of a table without times.', min=0.01, callback=check_rate)
 SERIAL = option(
     "Serial of the unit, instead of the bag's; '' accepts any calibration.", callback=check_serial

@@ -258,17 +258,20 @@ def _judge_positions(up: Floats) -> Finding:
     if n < POSITIONS_NEEDED:
         return _advice(
             'positions',
-            f'{counted(n, "distinct position")}: what tells bias from scale stays at its prior '
-            f'(that takes {POSITIONS_NEEDED}, the misalignment {POSITIONS_FOR_MISALIGNMENT})',
+            f'{counted(n, "position")}: bias and scale cannot be separated and keep their prior; '
+            f'{POSITIONS_NEEDED} positions separate them, '
+            f'{POSITIONS_FOR_MISALIGNMENT} give the misalignment',
         )
     if not can_tell_misalignment(up):
         return _advice(
             'misalignment',
-            f'{n} distinct positions tell bias and scale, the misalignment stays at its prior: '
-            f'it takes {POSITIONS_FOR_MISALIGNMENT} well spread ones',
+            f'{n} positions determine bias and scale; the misalignment keeps its prior: it needs '
+            f'{POSITIONS_FOR_MISALIGNMENT} well spread positions',
         )
     if n < POSITIONS_ADVISED:
-        return _advice('positions', f'{n} positions; {POSITIONS_ADVISED} give more')
+        return _advice(
+            'positions', f'{n} positions; {POSITIONS_ADVISED} would reduce the uncertainty'
+        )
     return Finding('positions', 'good', f'{n} positions')
 
 
@@ -277,8 +280,8 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
     if least is not None and least.sd_m_s2 >= _UNSEEN * least.seen_sd_m_s2:
         yield _advice(
             'unseen',
-            f'{least.away_deg:.0f} deg away from every position |f| is known to '
-            f'{spoken(least.sd_m_s2)} (1 sd), in them to {spoken(least.seen_sd_m_s2)}: record one '
+            f'{least.away_deg:.0f} deg away from every position the sd of |f| is '
+            f'{spoken(least.sd_m_s2)}, in the positions {spoken(least.seen_sd_m_s2)}: record one '
             f'with {spoken_direction(np.array(least.up))}',
         )
 

@@ -132,7 +132,7 @@ def _speaks(row: Row) -> bool:
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
     """Build the prior from the valid units; otherwise return the reason why there is none."""
-    # Of a unit that was tested twice only the later test counts.
+    # Only the later test of a unit that was tested twice counts.
     tests = sorted((row for row in rows if _speaks(row)), key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}
     if len(latest) < UNITS_NEEDED:

@@ -113,7 +113,7 @@ class RateCheck:
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def update(self, n_seen: int, stamp_ns: int) -> None:
-        """Take the number of samples with different stamps before a stamp."""
+        """Update the rate with the number of samples so far and the stamp of the latest [ns]."""
         last = self._last
         self._last = (n_seen, stamp_ns)
         if last is None:

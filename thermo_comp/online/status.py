@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what surrounds the compensator's arithmetic: settings and counters."""
+"""Owns the settings and counters of the compensator."""
 
 from __future__ import annotations
 

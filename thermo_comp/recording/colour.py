@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what coloured noise does to cells at rest: how far their variances and changes may spread.
+Owns the effect of coloured noise on cells at rest: the spread of their variances and changes.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
 
 def spread_of_variances(cells: Cells, believable: Bools, level: Floats) -> Floats:
     """
-    How much further the variances of cells at rest spread than those of white noise, per axis.
+    Return the spread of the variances of cells at rest relative to white noise, per axis.
 
-    Behind a low pass a cell holds few independent samples. With a correlation r from one to the
-    next they are worth (1 - r) / (1 + r) of their number, and the roughness is 1 - r of the
-    variance; that follows from the tenth percentile `level` for as many degrees of freedom.
+    After a low pass a cell has few independent samples. With a correlation r of successive samples
+    their effective number is smaller by (1 - r) / (1 + r), and the roughness is 1 - r of the
+    variance, which follows from the tenth percentile `level` for these degrees of freedom.
     """
     n_free = float(np.median(cells.count[believable])) - 1.0
     quiet = believable & (cells.variance <= level).any(axis=1)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what makes a report a certificate after ISO/IEC 17025: results, budget, conformity."""
+"""Owns the parts of a certificate after ISO/IEC 17025: results, budget, conformity."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ _RC: dict[str, Any] = {
     'text.parse_math': False,
     'svg.fonttype': 'none',
     'svg.hashsalt': 'thermo_comp',
-    # Of many points in one pixel matplotlib draws only the extremes.
+    # matplotlib draws only the extremes of many points in one pixel.
     'path.simplify_threshold': 0.5,
 }
 _PNG_DPI = 160

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way of the samples through the node, in order of arrival and independent of wake-ups.
+Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
 Messages do not identify their publisher. While a topic has more than one publisher it is ignored,
 and so is the first batch afterwards, which may still be from the publisher that left

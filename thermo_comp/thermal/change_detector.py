@@ -4,10 +4,10 @@
 Owns the detection of a change: has the rate of one sensor left the baseline of the soak?
 
 Two linear filters of temperature and rate, of different memory, integrate the second derivative.
-A rate counts as departed when it is beyond the baseline by more than the soak is known to swing,
-and by more than the filter's noise reaches at the allowed rate of false alarms (Rice's formula,
-see docs/regime.md). The swing is the larger of two rates: the declared ripple of the surroundings
-seen through the sensor's lag, and the swing observed.
+A rate has departed if it differs from the baseline by more than the swing plus a multiple of the
+filter's noise, which follows from the permitted rate of false alarms (Rice's formula, see
+docs/regime.md). The swing is the larger of two rates: the declared ripple of the surroundings,
+reduced by the sensor's lag, and the observed swing.
 
 If a sensor's quantum is so wide that noise cannot cross a cell, the filters are not used: two
 edges crossed in the same direction give the mean rate between them.

@@ -6,21 +6,6 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 With ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s, ``L_tau(u)`` the first-order
 lag of u, ``P_r(v)`` the play of half-width r on v, and w the weight of the dynamic regime:
 
-=============  ====================================================
-now        g_s                         heat that flows now
-rate       dT_board/dt [K/s]           the same, as seen by one thermometer
-board      T_board - L_tau(T_board)    parts that lag the board
-neighbour  L_tau(g_s)                  parts between the thermometers
-square     (T_board - L_tau)^2, or     curves of parts that lag the board; losses of a flow
-           q_s^2 where tau is 0
-cube       (T_board - L_tau)^3         the same, and a flow that grows faster than its cause
-even       tanh((q_s / width)^2)       heat load whichever way the heat flows
-size       abs(q_s)                    the same, as a heat pump's
-play       P_r(v) - v, v = t or        rate-independent hysteresis
-           v = L_tau(t)
-bend       max(v - knee, 0)            a slope that changes at one temperature of a part
-=========  ==========================  ====================================================
-=======
 =============  ==========================  ================================================
 kind           value u                     effect
 =============  ==========================  ================================================

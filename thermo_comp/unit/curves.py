@@ -32,7 +32,7 @@ class Curves:
         self._reference = calibration.reference_temperature_c
         sets = calibration.regime_sets()
         edges = np.array([(one.temperature_range_c, one.rate_range_k_min) for one in sets])
-        # Of each set lower and upper edge, shape (2, 2, 1), first lower.
+        # Edges of each set, shape (2, 2, 1): the lower ones, then the upper ones.
         self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
         self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
         rows = [

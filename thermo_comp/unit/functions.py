@@ -28,10 +28,10 @@ from ..typing import Floats
 #: One temperature difference or an array of them [K].
 Kelvins: TypeAlias = float | Floats
 
-#: How far curves go on along their tangent beyond their range, in spans of that range. There
+#: Length of the tangent that continues a curve beyond its range, in spans of that range. There
 #: a parabola is a sixteenth as far from that tangent as it is at the other end of the range.
 TANGENT_SPANS = 0.25
-#: How exactly a function must meet its value at the reference.
+#: Largest error of a function at the reference.
 NORMALISATION_TOLERANCE = 1e-9
 #: Smallest distance of knots, and largest distance of a knot from the reference [K]; the spline
 #: would overflow beyond them.

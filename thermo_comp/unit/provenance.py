@@ -56,7 +56,7 @@ class ResidualSummary:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where the numbers come from."""
+    """Origin of the numbers of a calibration."""
 
     created: str = ''
     tool_version: str = ''

@@ -30,7 +30,7 @@ FULL_SCALES = 2.0
 WORST = 1e6
 #: Number of temperatures at which a function is checked.
 _GRID = 513
-#: How far beyond its range a function is looked at.
+#: Distance beyond its range in which a function is checked.
 _AROUND = f'and along its tangents, {TANGENT_SPANS:g} of the range on each side'
 _DIFFERENCE_K = QUANTITIES['temperature span'].at_most or 0.0
 _RATE_K_S = (QUANTITIES['temperature rate'].at_most or 0.0) / 60.0
