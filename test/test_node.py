@@ -29,6 +29,7 @@ from thermo_comp.ros.player import lossless
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.unit.calibration import Calibration, Unit
 from thermo_comp.unit.calibration_file import save_calibration
+from thermo_comp.unit.nonlinearity import Nonlinearity
 
 START_NS = 1_767_225_600 * SECOND_NS
 CYCLE_NS = 10_000_000
@@ -300,9 +301,9 @@ def test_a_case_is_missed_only_by_a_calibration_that_knew_one(
 
 def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]) -> None:
     wait = diagnosis(peer)
-    with node_in_thread(
-        *saved(thermal_calibration(), 'temperature_timeout:=20', 'case_timeout:=10')
-    ) as node:
+    # Of a fit that has seen less than 1 g.
+    unit = replace(thermal_calibration(), nonlinearity=Nonlinearity((1.0, 5.0), 1e-4))
+    with node_in_thread(*saved(unit, 'temperature_timeout:=20', 'case_timeout:=10')) as node:
         driver = drive(peer, node)
         # 50 degC: 15 K above the calibrated range.
         for k in range(5):
@@ -310,6 +311,8 @@ def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]
             driver.counts(START_NS + k * SECOND_NS, *standing(k))
         _, status, values = wait(lambda _, values: values['samples out'] == '5')
         assert 'board temperature +15' in status.message
+        assert 'above the largest of the fit' in status.message
+        assert float(values['force excess [m/s^2]']) == pytest.approx(4.81, abs=0.02)
         assert 'calibrated range: curves continued along their tangent' in status.message
         assert float(values['temperature excess [K]']) == pytest.approx(15.0, abs=0.1)
         assert values['board temperature [degC]'].startswith('50.0')

@@ -103,6 +103,7 @@ _PREPARED: dict[str, Bounds] = {
     'deviation': _up_to(1e4, 'm/s^2', '1000 g: nothing is known'),
     'rate deviation': _up_to(1e3, 'rad/s', '57000 deg/s: nothing is known'),
     'misalignment deviation': _up_to(1.0, 'rad', 'nothing is known'),
+    'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'at 1 g it reads 2 g'),
     # Results of a fit and numbers of samples.
     'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
     'number': _up_to(1e15, '', 'exact as a float'),

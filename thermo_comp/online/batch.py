@@ -19,6 +19,7 @@ from ..recording.blocks import Block
 from ..thermal.reading_queue import DISORDER_NS, NEVER_NS, PENDING_LIMIT
 from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.correction import Correction, is_sound
+from ..unit.nonlinearity import corrected_nonlinear
 from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
@@ -175,10 +176,11 @@ def _apply(
     correction, of_rate = compensator.thermal.correction, compensator.thermal.rate_correction
     line = rate_line = np.empty((21, 0))
     if segments:
-        line = _line(correction, segments, slice(9))
+        n_slow = correction.n_slow
+        line = _line(correction, segments, slice(n_slow))
         is_good = is_sound(line)
         if of_rate is not None:
-            rate_line = _line(of_rate, segments, slice(9, None))
+            rate_line = _line(of_rate, segments, slice(n_slow, None))
             is_good &= is_sound(rate_line)
         if not is_good.all():
             counts = [count for _, count in segments]
@@ -203,7 +205,7 @@ def _apply(
 
 
 def _line(correction: Correction, segments: Segments, part: slice) -> Floats:
-    """Evaluate the lines of segments, with `part` of their slow variance, shape (21, n)."""
+    """Evaluate the lines of segments, with `part` of their slow variance, see `line`."""
     each = [segment for segment, _ in segments]
     start, end, slow = (np.array([one[at] for one in each]).T for at in (4, 5, 6))
     excess = np.array([one.noise_excess for one in each])
@@ -222,6 +224,7 @@ def _corrected(
     start_ns = np.array([one.start_ns for one in each], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
     order = range(6) if misalignment is None else _COLUMNS
+    corrected_force = corrected if len(table) == 21 else corrected_nonlinear
     n = len(stamps)
     result = np.empty((len(order), n))
     # Samples that are not finite are corrected like the rest; the caller drops them.
@@ -237,7 +240,7 @@ def _corrected(
             values = (
                 corrected_rate(line, dt, x, y, z)
                 if misalignment is None
-                else corrected(line, misalignment, dt, x, y, z)
+                else corrected_force(line, misalignment, dt, x, y, z)
             )
             for column, place in zip(result, order, strict=True):
                 column[begin:stop] = values[place]

@@ -23,6 +23,7 @@ from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.correction import Excess, is_sound
 from ..unit.functions import TANGENT_SPANS
+from ..unit.nonlinearity import corrected_nonlinear
 from .checks import GravityCheck, StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
@@ -105,6 +106,7 @@ class Compensator:
         self.calibration = calibration
         self._full_scale = self._limit = calibration.unit.full_scale
         self.gravity = self._gravity_check()
+        self._corrected = corrected_nonlinear if calibration.nonlinearity else corrected
         self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
 
     def _gravity_check(self) -> GravityCheck:
@@ -146,7 +148,7 @@ class Compensator:
             return None
         self.counters.n_out += 1
         start_ns, line, misalignment = self._segment
-        return corrected(line, misalignment, (stamp_ns - start_ns) * 1e-9, x, y, z)
+        return self._corrected(line, misalignment, (stamp_ns - start_ns) * 1e-9, x, y, z)
 
     @property
     def corrects_rate(self) -> bool:
@@ -193,10 +195,11 @@ class Compensator:
         start_ns, is_new, is_too_fast, excess, start, end, slow = segment
         self.event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
         correction = thermal.correction
-        line = correction.line(start, end, slow[:9], excess)
+        n_slow = correction.n_slow
+        line = correction.line(start, end, slow[:n_slow], excess)
         is_good = is_sound(line)
         if thermal.rate_correction is not None:
-            rate_line = thermal.rate_correction.line(start, end, slow[9:], excess)
+            rate_line = thermal.rate_correction.line(start, end, slow[n_slow:], excess)
             is_good &= is_sound(rate_line)
             self.rate_line = rate_line.tolist()
         if not is_good:

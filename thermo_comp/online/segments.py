@@ -47,7 +47,7 @@ class Segment(NamedTuple):
     noise_excess: float  # excess noise variance by the rate of the samples, relative
     start: tuple[float, ...]  # thermal states at both ends
     end: tuple[float, ...]
-    #: Slow part of a, b, c of each axis; then that of the angular rate.
+    #: Slow part of the variance of the force (`Correction.n_slow`), then of the angular rate.
     slow: list[float]
 
 

@@ -26,6 +26,7 @@ from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT
 from ..topics import STATUS
+from ..unit.calibration import Calibration
 from .messages import qos_of, type_name
 from .reader import LoadedCalibration
 from .relay import Relay
@@ -63,6 +64,8 @@ _FAULTS = {
     Fault.FROZEN: 'frozen: the other moves; its readings are not used',
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
 }
+
+_BEYOND_FORCE = 'above the largest of the fit: nonlinear terms continued, the covariance grows'
 
 Finding = tuple[int, str]  # level and text
 
@@ -104,6 +107,8 @@ class Reporter:
         self._before, self._before_ns = counts, status.stamp_ns
         found = findings_of(loaded, status, new, rate, silence_s)
         findings = [*self._inputs(), *self._lost_rests(), *found]
+        if (over := self._force_excess(loaded.calibration)) > 0.0:
+            findings.append((_WARN, f'|f| {over:.3g} m/s^2 {_BEYOND_FORCE}'))
         findings.sort(key=lambda finding: -finding[0])
         values = self._values(loaded, status, counts, rate)
         message = DiagnosticStatus(
@@ -125,6 +130,13 @@ class Reporter:
                 log.warning(message.message)
             else:
                 log.error(message.message)
+
+    def _force_excess(self, calibration: Calibration) -> float:
+        """Return how far |f| of the last sample is above the fit's largest [m/s^2], or 0."""
+        last = self._relay.running.converter.last_result
+        if last is None or calibration.nonlinearity is None:
+            return 0.0
+        return max(0.0, math.hypot(*last[:3]) - calibration.nonlinearity.force_range_m_s2[1])
 
     def _count(self) -> dict[str, int]:
         counters, traffic = self._compensator.counters, asdict(self._relay.traffic)
@@ -188,6 +200,8 @@ class Reporter:
             'temperature excess [K]': f'{status.excess.temperature:.3f}',
             'rate excess [K/min]': f'{60.0 * status.excess.rate:.3f}',
         }
+        if calibration.nonlinearity is not None:
+            values['force excess [m/s^2]'] = f'{self._force_excess(calibration):.3f}'
         if gravity is not None:
             values |= {
                 'gravity residual [m/s^2]': f'{gravity.residual:.3e}',

@@ -12,7 +12,7 @@ Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the
 
     bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
     scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
-    x_i   = (N_i - bias) / scale
+    x_i   = (N_i - bias) / scale, less the nonlinearity over specific force (`nonlinearity`)
     f     = M x
 """
 
@@ -30,6 +30,7 @@ from ..text import LONGEST_SERIAL, valid_serial
 from ..thermal.settings import DetectorSettings, ThermometerSettings
 from .columns import Column
 from .functions import TemperatureFunction, check_reference
+from .nonlinearity import Nonlinearity
 from .posterior import ParameterLayout, Posterior, lay_out
 from .provenance import GroupEvidence, Provenance
 from .rate_bias import LARGEST_RATE, Gyroscope
@@ -217,6 +218,9 @@ class Calibration:
     posterior: Annotated[
         Posterior | None, 'Covariance of all parameters; null where it is unknown.'
     ] = None
+    nonlinearity: Annotated[
+        Nonlinearity | None, 'Of the axes over specific force; null: only 1 g was seen.'
+    ] = None
     gyroscope: Annotated[
         Gyroscope | None, "Bias of the unit's gyroscope; null: the angular rate is not corrected."
     ] = None
@@ -281,6 +285,10 @@ class Calibration:
         )
         reference = self.reference_temperature_c
         all_edges = [edge for part in self.regime_sets() for edge in part.temperature_range_c]
+        if self.nonlinearity is not None:
+            largest = full_scale / min(abs(axis.scale_factor) for axis in self.axes)
+            edges_t = min(all_edges) - reference, max(all_edges) - reference
+            self.nonlinearity.check_slope(largest, edges_t)
         for regime, part in zip(('static', 'dynamic'), self.regime_sets(), strict=True):
             edges = part.temperature_range_c
             reach = Reach(edges, all_edges, reference, FULL_SCALES * full_scale)
@@ -380,5 +388,6 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
         pairs.append((static.bias_function, dynamic.bias_function))
         pairs.append((static.scale_function, dynamic.scale_function))
     blocks = lay_out(pairs, len(calibration.response))
-    end = blocks[-1].end
-    return ParameterLayout(blocks[0::2], blocks[1::2], end, end + 3)
+    end, nonlinearity = blocks[-1].end, calibration.nonlinearity
+    after = end + (6 * len(nonlinearity.terms) if nonlinearity else 0)
+    return ParameterLayout(blocks[0::2], blocks[1::2], end, after, after + 3)

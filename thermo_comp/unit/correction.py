@@ -26,6 +26,7 @@ from .columns import ColumnTable, memory_of
 from .curves import Curves
 from .functions import hold
 from .gravity import MICRO_G
+from .nonlinearity import ForceCorrection
 
 #: Largest rate of change of the output while the sets are blended [m/s^3]: 1 ug per second ...
 GENTLE_RATE = MICRO_G
@@ -62,7 +63,7 @@ class Correction:
     memory: memory that the tracker needs for force and angular rate, or the memory it has
     noise: noise variance of one message per axis, rounding included [m^2/s^4]
     noise_trace: the sum of `noise`
-    misalignment: yx, zx, zy of M and their variances
+    misalignment: yx, zx, zy of M and their variances; with a nonlinearity then its constants
     """
 
     def __init__(self, calibration: Calibration, memory: MemorySpec | None = None) -> None:
@@ -99,7 +100,14 @@ class Correction:
         if posterior is not None:
             own = (posterior.matrix[-3:] ** 2).sum(axis=1) + posterior.variances[-3:]
             variances = own.tolist()
-        self.misalignment = (M[1][0], M[2][0], M[2][1], *variances)
+        self.misalignment: tuple[float, ...] = (M[1][0], M[2][0], M[2][1], *variances)
+        #: The nonlinearity over specific force; None without.
+        self.of_force: ForceCorrection | None = None
+        if calibration.nonlinearity is not None:
+            self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
+            self.misalignment += self.of_force.constants
+        #: Number of rows of the slow part of the variance.
+        self.n_slow = 9 if self.of_force is None else 24
 
     def _find_felt(self) -> None:
         """Find the columns that depend on each gradient and lag, to propagate its variance."""
@@ -185,7 +193,8 @@ class Correction:
         Evaluate the correction of segments as linear in time between states at both ends.
 
         `slow` is the slow part of a, b, c by axis, shape (9, n). Returns by axis bias, its change,
-        scale, its change, then by axis a, b, c with a message's noise: (21,) or (21, n).
+        scale, its change, then by axis a, b, c with a message's noise: (21,) or (21, n). With a
+        nonlinearity `slow` has 15 more rows and the result 21 more, see `ForceCorrection.rows`.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -205,15 +214,21 @@ class Correction:
         both[:, :, 1] -= both[:, :, 0]
         factors_at_end = factors[0][:, n:], factors[1][:, n:]
         gap = (sets[1] - sets[0])[:, n:]
-        unchanging = np.reshape(slow, (3, 3, n))
+        slow = np.reshape(slow, (self.n_slow, n))
+        unchanging = slow[:9].reshape(3, 3, n)
         v = self._variance(states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, unchanging)
         # The largest force that each axis can measure [m/s^2], and the variance there.
         most = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
         whole = v[:, 0] + most * (np.abs(v[:, 1]) + most * (v[:, 2] + max(self.misalignment[3:])))
         least = _LEAST_SHARE * whole.max(axis=0)
         v[:, 0] += np.maximum(self._noise * (1.0 + np.asarray(noise_excess)), least)
-        line = np.concatenate((both.swapaxes(0, 1).reshape(12, n), v.reshape(9, n)))
-        return line.reshape(21, *ends.shape[2:])
+        beyond = np.empty((0, n))
+        if self.of_force is not None:
+            v[:, 2] += slow[9::5]
+            middle = 0.5 * (board[:n] + board[n:])
+            beyond = self.of_force.rows(middle, slow[9:])
+        line = np.concatenate((both.swapaxes(0, 1).reshape(12, n), v.reshape(9, n), beyond))
+        return line.reshape(-1, *ends.shape[2:])
 
     def _variance(
         self,

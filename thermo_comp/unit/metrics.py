@@ -30,8 +30,11 @@ def residual_statistics(residual: Floats) -> ResidualStatistics:
     return ResidualStatistics(len(values), float(values.mean()), rms, peak)
 
 
-def norm_residual(specific_force: Floats, gravity: float) -> Floats:
-    """Return ``|f| - g`` of forces, shape (..., 3): the residual that needs no attitude."""
+def norm_residual(specific_force: Floats, gravity: float | Floats) -> Floats:
+    """
+    Return ``|f| - g`` of forces, shape (..., 3): the residual that needs no attitude. Where |f| is
+    known and not g it takes its place.
+    """
     square = np.einsum('...i,...i->...', specific_force, specific_force)
     return np.asarray(np.sqrt(square) - gravity)
 

@@ -107,11 +107,13 @@ def lay_out(
 class ParameterLayout(NamedTuple):
     """
     The order of a calibration's parameters in its posterior: axis by axis the bias [input units],
-    then the scale [relative]; M[1][0], M[2][0], M[2][1] from `misalignment` on.
+    then the scale [relative]; axis by axis from `nonlinear` on the coefficients of its terms, then
+    their changes per kelvin; M[1][0], M[2][0], M[2][1] from `misalignment` on.
     """
 
     bias: list[Block]
     scale: list[Block]
+    nonlinear: int
     misalignment: int
     n_parameters: int
 

@@ -13,6 +13,7 @@ ramp. Noise and the uncertainty of the thermometers are left out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,7 @@ class SlowUncertainty:
         self._n_sensors = len(correction.memory.sensors)
         self._root = np.asarray(np.linalg.cholesky(start_covariance(correction.memory.lags)))
         self._blocks: list[tuple[Floats, Floats, Floats, Floats]] = []
+        self._of_force: list[tuple[Floats, Floats]] = []
         posterior = calibration.posterior
         if posterior is None:
             return
@@ -40,14 +42,25 @@ class SlowUncertainty:
         for bias, scale in zip(layout.bias, layout.scale, strict=True):
             of_bias, of_scale = slice(bias.static, bias.end), slice(scale.static, scale.end)
             rows = np.concatenate((matrix[of_bias], matrix[of_scale]))
+            n_bias, n_linear, of_force = bias.end - bias.static, len(rows), rest[:0]
+            if correction.of_force is not None:
+                n_each = (layout.misalignment - layout.nonlinear) // 3
+                first = layout.nonlinear + n_each * len(self._blocks)
+                rows = np.concatenate((rows, matrix[first : first + n_each]))
+                of_force = rest[first : first + n_each]
             if matrix.shape[1] > len(rows):
                 # The same covariance of one axis from fewer columns.
                 rows = np.ascontiguousarray(np.linalg.qr(rows.T)[1].T)
-            n_bias = bias.end - bias.static
-            self._blocks.append((rows[:n_bias], rest[of_bias], rows[n_bias:], rest[of_scale]))
+            self._blocks.append(
+                (rows[:n_bias], rest[of_bias], rows[n_bias:n_linear], rest[of_scale])
+            )
+            self._of_force.append((rows[n_linear:], of_force))
 
     def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[float]:
-        """Evaluate a, b, c of each axis at one state: ``v(x) = a + b x + c x^2`` [m^2/s^4]."""
+        """
+        Evaluate a, b, c of each axis at one state: ``v(x) = a + b x + c x^2`` [m^2/s^4]; with a
+        nonlinearity then what it adds to the coefficients of x^2 to x^6 of each axis.
+        """
         states = np.array(state)[:, np.newaxis]
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
@@ -56,17 +69,25 @@ class SlowUncertainty:
         moved = felt * np.array(start_shares)[:, np.newaxis]
         regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
         result: list[float] = []
+        beyond: list[float] = []
+        nonlinear = self._correction.of_force
         for axis, K in enumerate(self._K):
             bias, scale = ((self._root * moved[:, [row]]).sum(axis=0) for row in (axis, axis + 3))
             v = _products(bias / K, scale)
             if self._blocks:
                 of_bias, var_bias, of_scale, var_scale = self._blocks[axis]
                 on_bias, on_scale = regressors[axis] / K, regressors[axis + 3]
-                v += _products((of_bias * on_bias).sum(axis=0), (of_scale * on_scale).sum(axis=0))
+                both = (of_bias * on_bias).sum(axis=0), (of_scale * on_scale).sum(axis=0)
+                v += _products(*both)
                 v[0] += (var_bias * on_bias[:, 0] ** 2).sum()
                 v[2] += (var_scale * on_scale[:, 0] ** 2).sum()
+                if nonlinear is not None:
+                    t = float(nonlinear.held(states[BOARD])[0])
+                    beyond += nonlinear.variance(t, *self._of_force[axis], *both)
+            elif nonlinear is not None:
+                beyond += [0.0] * 5
             result += v.tolist()
-        return result
+        return result + beyond
 
     def of_bias(
         self, states: Floats, mean_of: Callable[[Floats], Floats]
@@ -102,6 +123,41 @@ def in_a_soak(
     return bias[0], sd_bias[0], scale[0], sd_scale[0]
 
 
+class Coefficients(NamedTuple):
+    """A nonlinear coefficient of the axes with its sd, shapes (3,), in a unit for people."""
+
+    name: str
+    unit: str
+    value: Floats
+    sd: Floats
+
+
+def nonlinear_coefficients(calibration: Calibration) -> list[Coefficients]:
+    """List the coefficients of the nonlinearity, and their changes per kelvin."""
+    nonlinearity, posterior = calibration.nonlinearity, calibration.posterior
+    terms = nonlinearity.terms if nonlinearity else ()
+    layout = parameter_layout(calibration)
+    sd = np.full((3, 2, len(terms)), np.nan)
+    if posterior is not None:
+        rows = slice(layout.nonlinear, layout.misalignment)
+        variance = (posterior.matrix[rows] ** 2).sum(axis=1) + posterior.variances[rows]
+        sd = np.sqrt(variance).reshape(sd.shape)
+    names = {'square': ('K2', 'µg/g²'), 'odd_square': ('Kq', 'µg/g²'), 'cube': ('K3', 'µg/g³')}
+    found = []
+    for k, one in enumerate(terms):
+        name, unit = names[one.kind]
+        found += [
+            Coefficients(name, unit, 1e6 * np.array(one.coefficient), 1e6 * sd[:, 0, k]),
+            Coefficients(
+                f'{name} per kelvin',
+                f'{unit}/K',
+                1e6 * np.array(one.per_kelvin),
+                1e6 * sd[:, 1, k],
+            ),
+        ]
+    return found
+
+
 def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
     """Evaluate bias [m/s^2] and scale [input units per m/s^2] at states, shapes (n, 3)."""
     correction = Correction(calibration)
@@ -114,7 +170,8 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
     forgotten = [0.0] * len(correction.memory.lags)
-    variance = np.array([slow.at(state, forgotten) for state in states.tolist()]).reshape(-1, 3, 3)
+    variance = np.array([slow.at(state, forgotten)[:9] for state in states.tolist()])
+    variance = variance.reshape(-1, 3, 3)
     is_dynamic = np.rint(states[:, WEIGHT]) == 1.0
     both = np.broadcast_to(correction.curves.unexplained(states[:, BOARD]), (2, 3, len(states)))
     unexplained = np.where(is_dynamic, both[1], both[0]).T

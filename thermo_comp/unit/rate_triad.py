@@ -45,6 +45,7 @@ def rate_triad(calibration: Calibration) -> Calibration:
         provenance=Provenance(),
         evidence=(),
         posterior=None,
+        nonlinearity=None,
         gyroscope=None,
     )
     if gyroscope.posterior is None:

@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Nonlinear axes in the correction: closed forms of the inverse, bits of stream and batch, variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders import calibration, columns_from_events, rich_calibration
+from test_correction import UNCHECKED, assert_same, run_of, stream
+
+from thermo_comp.errors import CalibrationError
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.thermal.state import BOARD, Layout
+from thermo_comp.unit.calibration import parameter_layout
+from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
+from thermo_comp.unit.correction import Correction
+from thermo_comp.unit.gravity import STANDARD_GRAVITY as G
+from thermo_comp.unit.nonlinearity import Nonlinearity, NonlinearTerm, linearised
+from thermo_comp.unit.posterior import posterior_of
+from thermo_comp.unit.prediction import SlowUncertainty
+
+
+def term(kind, x, y, z, slope=0.0):
+    per_kelvin = (slope * x, slope * y, slope * z)
+    return NonlinearTerm(kind, (x, y, z), per_kelvin, 1e-4)
+
+
+SQUARE = term('square', 1e-5, -2e-5, 3e-5, 0.01)
+ODD = term('odd_square', 5e-6, -5e-6, 1e-5, 0.01)
+CUBE = term('cube', 1e-6, -1e-6, 2e-6, 0.01)
+BENT = Nonlinearity((9.0, 60.0), 1e-4, (SQUARE, ODD, CUBE))
+
+
+def with_covariance(unit, rng, size=1e-5):
+    n = parameter_layout(unit).n_parameters
+    root = size * rng.standard_normal((n, 4))
+    return replace(unit, posterior=posterior_of(root @ root.T + size**2 * np.eye(n)))
+
+
+# At 10 g the remainder of Halley's step is 1e-14 g, of MEMS with 1 mg/g^2 2e-8 g.
+@pytest.mark.parametrize(('k2', 'tolerance'), [(1e-5, 1e-12), (-1e-4, 1e-12), (1e-3, 3e-8)])
+def test_the_inverse_of_a_square_is_the_root_of_a_quadratic(k2, tolerance):
+    x = np.linspace(-10.0, 10.0, 41)
+    root = 2.0 * x / (1.0 + np.sqrt(1.0 + 4.0 * k2 * x))
+    np.testing.assert_allclose(linearised(x, k2, 0.0, 0.0), root, rtol=0.0, atol=tolerance)
+    for one, expected in zip(x.tolist(), root.tolist(), strict=True):
+        signed = np.copysign(k2, k2 * one)
+        odd = 2.0 * one / (1.0 + np.sqrt(1.0 + 4.0 * signed * one))
+        found = linearised(one, 0.0, k2, 0.0), linearised(one, k2, 0.0, 0.0)
+        assert found == pytest.approx((odd, expected), abs=tolerance)
+
+
+def test_the_inverse_of_a_cube_is_the_real_root():
+    for x in np.linspace(-10.0, 10.0, 9).tolist():
+        roots = np.roots([1e-6, 1e-5, 1.0, -x])
+        real = roots[np.argmin(np.abs(roots - x))].real
+        assert linearised(x, 1e-5, 0.0, 1e-6) == pytest.approx(real, abs=1e-11)
+
+
+def test_a_correction_undoes_the_terms_at_their_temperature():
+    unit = calibration(nonlinearity=BENT)
+    f = np.array([5.0, -3.0, 2.0])
+    t = 6.0
+    at = [np.array(one.coefficient) + t * np.array(one.per_kelvin) for one in BENT.terms]
+    x = f + at[0] * f**2 + at[1] * np.abs(f) * f + at[2] * f**3
+    compensator = Compensator(unit, UNCHECKED)
+    for k in range(120):
+        compensator.push('board', k * 10**9, 20.0 + t)
+        compensator.push('case', k * 10**9, 20.0 + t)
+        found = compensator.process(k * 10**9, *(300.0 * G * x).tolist())
+    assert np.array(found[:3]) / G == pytest.approx(f, abs=1e-11)
+
+
+def test_stream_and_batch_have_the_same_bits(rng):
+    bent = replace(rich_calibration(), posterior=None, nonlinearity=BENT)
+    unit = with_covariance(bent, rng)
+    # Up to 10 g on an axis, beyond the 6 g of the fit.
+    events = [
+        (kind, stamp, tuple(9.0 * one for one in value) if kind == 'accel' else value)
+        for kind, stamp, value in run_of(rng, seconds=60)
+    ]
+    rows = stream(Compensator(unit, UNCHECKED), events)
+    assert (np.abs(rows[:, 2]) > BENT.force_range_m_s2[1]).any()
+    cut = Compensator(unit, UNCHECKED)
+    pieces = [events[k : k + 77] for k in range(0, len(events), 77)]
+    assert_same([process_block(Compensator(unit, UNCHECKED), columns_from_events(events))], rows)
+    assert_same([process_block(cut, columns_from_events(piece)) for piece in pieces], rows)
+
+
+def test_without_terms_every_bit_is_that_of_a_file_without_a_nonlinearity(rng):
+    plain, events = rich_calibration(), run_of(rng, seconds=30)
+    empty = replace(plain, nonlinearity=Nonlinearity((9.0, 100.0), 1e-4))
+    before = stream(Compensator(plain, UNCHECKED), events)
+    np.testing.assert_array_equal(stream(Compensator(empty, UNCHECKED), events), before)
+    assert 'nonlinearity: null' in dump_calibration(plain)
+
+
+def test_the_variance_is_that_of_all_parameters_together(rng):
+    # No |f| f: what it has in common with others is left out, on the safe side.
+    unit = calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE)))
+    unit = with_covariance(unit, rng)
+    layout, correction = parameter_layout(unit), Correction(unit)
+    whole, t = unit.posterior.covariance(), 7.0
+    state = np.zeros(Layout(correction.memory).width)
+    state[BOARD] = 20.0 + t
+    slow = SlowUncertainty(unit, correction).at(state.tolist(), [])
+    linear, beyond = np.reshape(slow[:9], (3, 3)), np.reshape(slow[9:], (3, 5))
+    for axis in range(3):
+        for f in (-60.0, -9.8, 0.0, 30.0):
+            along = np.zeros(layout.n_parameters)
+            along[layout.bias[axis].static] = 1.0 / 300.0
+            along[layout.scale[axis].static] = f
+            powers = np.array([f**2 / G, f**3 / G**2])
+            first = layout.nonlinear + 4 * axis
+            along[first : first + 4] = [*powers, *(t * powers)]
+            found = np.polyval(linear[axis, ::-1], f) + f**2 * np.polyval(beyond[axis, ::-1], f)
+            assert found == pytest.approx(along @ whole @ along, rel=1e-5)
+
+
+def test_beyond_the_largest_force_an_unknown_square_begins():
+    unit = calibration(nonlinearity=Nonlinearity((9.0, 60.0), 1e-4))
+    compensator = Compensator(unit, UNCHECKED)
+    variances = []
+    for k, f in enumerate((50.0, 59.99, 70.0, 90.0)):
+        compensator.push('board', k * 10**9, 20.0)
+        compensator.push('case', k * 10**9, 20.0)
+        variances.append(compensator.process(k * 10**9, 300.0 * f, 0.0, 1.0)[3])
+    assert variances[1] == pytest.approx(variances[0], rel=0.01)
+    for f, variance in zip((70.0, 90.0), variances[2:], strict=True):
+        grown = (1e-4 / G * (f - 60.0) ** 2) ** 2
+        assert variance - variances[0] == pytest.approx(grown, rel=0.01)
+
+
+def test_a_file_keeps_the_terms_and_refuses_those_that_no_axis_has():
+    unit = calibration(nonlinearity=BENT)
+    text = dump_calibration(unit)
+    assert parse_calibration(text.encode()) == unit
+    for before, after, said in (
+        ('kind: square', 'kind: quartic', "must be 'square', 'odd_square' or 'cube'"),
+        ('coefficient: [1.0e-05', 'coefficient: [0.1', 'must have a slope below 0.2'),
+        ('[9.0, 60.0]', '[60.0, 9.0]', 'must be [lower, upper] with lower < upper'),
+    ):
+        assert before in text
+        with pytest.raises(CalibrationError, match='nonlinearity') as caught:
+            parse_calibration(text.replace(before, after).encode())
+        assert said in str(caught.value)
+    with pytest.raises(ValueError, match='each once, in this order'):
+        replace(BENT, terms=(CUBE, SQUARE))

@@ -1,0 +1,220 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the nonlinearity of the axes over specific force: its terms, their inverse, their variance.
+
+With x the reading of an axis less its bias, over its scale factor, and f the specific force along
+its sensitivity axis, both in g, as in IEEE Std 1293::
+
+    x = f + K2 f^2 + Kq |f| f + K3 f^3,    K(t) = coefficient + per_kelvin t
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+
+import numpy as np
+
+from ..quantities import QUANTITIES
+from ..typing import Floats
+from .functions import hold
+from .gravity import STANDARD_GRAVITY
+from .schema import Vector, check_ranges
+
+if TYPE_CHECKING:
+    from .calibration import Calibration
+
+Kind = Literal['square', 'odd_square', 'cube']
+#: The terms in the order of a file, and the power of 1/g that makes each a coefficient.
+POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
+#: Largest slope of the terms within full scale: beyond it the inverse is not exact to the noise.
+LARGEST_SLOPE = 0.2
+
+Real = TypeVar('Real', float, Floats)  # the value of one sample, or an array of many
+
+
+@dataclass(frozen=True)
+class NonlinearTerm:
+    """One term of the nonlinearity; `coefficient` and `per_kelvin` are for x, y, z."""
+
+    kind: Annotated[Kind, 'K2 f^2, Kq |f| f or K3 f^3.']
+    coefficient: Annotated[Vector, 'At the reference temperature [g/g^2; of the cube g/g^3].']
+    per_kelvin: Annotated[Vector, 'Change per kelvin of the board; held outside the range.']
+    prior_sd: Annotated[float, QUANTITIES['nonlinearity'], 'Prior sd of `coefficient`.']
+    effective_parameters: Annotated[
+        float, QUANTITIES['number'], 'Effective number of coefficients determined by the data.'
+    ] = 0.0
+    log_evidence_change: Annotated[
+        float, QUANTITIES['log evidence'], 'Loss of log evidence without the term.'
+    ] = 0.0
+    left_out_gain: Annotated[
+        float, QUANTITIES['log evidence'], 'Gain by the term: log ratio of left-out mean squares.'
+    ] = 0.0
+
+
+@dataclass(frozen=True)
+class Nonlinearity:
+    """
+    The nonlinearity of the three axes. Its polynomials continue beyond the forces that the fit has
+    seen, where an unknown square term of `beyond_sd_g_g2` from the edge on adds to the covariance.
+    """
+
+    force_range_m_s2: Annotated[
+        tuple[Annotated[float, QUANTITIES['error']], Annotated[float, QUANTITIES['error']]],
+        'Smallest and largest |f| of the fit.',
+    ]
+    beyond_sd_g_g2: Annotated[
+        float, QUANTITIES['nonlinearity'], 'Sd of the square term beyond the largest |f|.'
+    ]
+    terms: tuple[NonlinearTerm, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_ranges(self, force_range_m_s2=QUANTITIES['error'])
+        kinds = [one.kind for one in self.terms]
+        if kinds != [kind for kind in POWERS if kind in kinds]:
+            raise ValueError(f'`terms` must be of {list(POWERS)}, each once, in this order')
+
+    def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
+        """Raise ValueError if the terms are too steep up to a force [m/s^2] at some t [K]."""
+        for t in temperatures:
+            k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
+            slope = float(np.max(2.0 * (k2 + kq) * force + 3.0 * k3 * force * force))
+            if not slope < LARGEST_SLOPE:
+                raise ValueError(
+                    f'`nonlinearity.terms` must have a slope below {LARGEST_SLOPE:g} up to full '
+                    f'scale, got {slope:.3g} at {t:+.3g} K from the reference'
+                )
+
+    def coefficients(self, t: Floats) -> Floats:
+        """Return K2, Kq [s^2/m], K3 [s^4/m^2] by axis at temperatures t [K], shape (3, 3, n)."""
+        result = np.zeros((3, 3, len(t)))
+        for one in self.terms:
+            at, slope = np.array([one.coefficient, one.per_kelvin])[:, :, np.newaxis]
+            result[list(POWERS).index(one.kind)] = (at + slope * t) / unit_of(one.kind)
+        return result
+
+
+def unit_of(kind: Kind) -> float:
+    """Return the unit of a term's coefficient: coefficient [g/g^n] over it is in m and s."""
+    return float(STANDARD_GRAVITY ** POWERS[kind])
+
+
+def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
+    """
+    Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. Its
+    error is (k2^2 + k3) times the cube of the correction: at 10 g 1e-14 g with 100 ug/g^2, 1e-11 g
+    with 10 ug/g^3.
+    """
+    r = k3 * x * x
+    s = k2 * x + kq * abs(x) + r
+    d = 1.0 + (s + s + r)
+    return x - x * s * d / (d * d - s * (s + r + r))
+
+
+def bent(f: Floats, k2: Floats, kq: Floats, k3: Floats) -> Floats:
+    """Evaluate the terms at specific forces: what the reading has beside f."""
+    return np.asarray(f * (k2 * f + kq * np.abs(f) + k3 * f * f))
+
+
+def corrected_nonlinear(
+    line: Iterable[Real], constants: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
+) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
+    """Do what `online.compensator.corrected` does, for an instrument with a nonlinearity."""
+    (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
+     ax, lx, qx, ay, ly, qy, az, lz, qz,
+     k2x, kqx, k3x, dx, ex, fx, gx, k2y, kqy, k3y, dy, ey, fy, gy,
+     k2z, kqz, k3z, dz, ez, fz, gz) = line  # fmt: skip
+    yx, zx, zy, var_yx, var_zx, var_zy, edge, growth = constants
+    # Eq. (7), solved for the input of each axis, then the nonlinearity.
+    x = linearised((x - (bx + bx1 * dt)) / (sx + sx1 * dt), k2x, kqx, k3x)
+    y = linearised((y - (by + by1 * dt)) / (sy + sy1 * dt), k2y, kqy, k3y)
+    z = linearised((z - (bz + bz1 * dt)) / (sz + sz1 * dt), k2z, kqz, k3z)
+    vx = ax + x * (lx + x * (qx + x * (dx + x * (ex + x * (fx + x * gx)))))
+    vy = ay + y * (ly + y * (qy + y * (dy + y * (ey + y * (fy + y * gy)))))
+    vz = az + z * (lz + z * (qz + z * (dz + z * (ez + z * (fz + z * gz)))))
+    vx = vx + _grown(x, edge, growth)
+    vy = vy + _grown(y, edge, growth)
+    vz = vz + _grown(z, edge, growth)
+    xx = x * x
+    cxy = yx * vx
+    cxz = zx * vx
+    return (
+        x,
+        yx * x + y,
+        zx * x + zy * y + z,
+        vx,
+        cxy,
+        cxz,
+        yx * cxy + vy + xx * var_yx,
+        yx * cxz + zy * vy,
+        zx * cxz + zy * zy * vy + vz + xx * var_zx + y * y * var_zy,
+    )
+
+
+def _grown(x: Real, edge: float, growth: float) -> Real:
+    """Return the variance of the unknown square term that begins at the edge."""
+    over = abs(x) - edge
+    over = over + abs(over)  # twice the distance beyond the edge, or 0
+    over = over * over
+    return growth * over * over
+
+
+class ForceCorrection:
+    """
+    The nonlinearity of a calibration, prepared for the segments of a correction.
+
+    constants: largest |f| of the fit, and what `corrected_nonlinear` multiplies the fourth power
+        of twice the distance beyond it by
+    """
+
+    def __init__(
+        self, calibration: Calibration, nonlinearity: Nonlinearity, span: tuple[float, float]
+    ) -> None:
+        self._of = nonlinearity
+        self._reference, self._span = calibration.reference_temperature_c, span
+        growth = nonlinearity.beyond_sd_g_g2 / STANDARD_GRAVITY
+        self.constants = nonlinearity.force_range_m_s2[1], growth * growth / 16.0
+
+    def held(self, board: Floats) -> Floats:
+        """Return board temperatures less the reference, held at the calibrated range's edges."""
+        return hold(board, *self._span) - self._reference
+
+    def rows(self, board: Floats, slow: Floats) -> Floats:
+        """
+        Return by axis K2, Kq, K3 and the variance's coefficients of x^3 to x^6, shape (21, n);
+        rows of the slow part: by axis the coefficients of x^2 to x^6, shape (15, n).
+        """
+        k = self._of.coefficients(self.held(board)).swapaxes(0, 1)
+        return np.concatenate((k, slow.reshape(3, 5, -1)[:, 1:]), axis=1).reshape(21, -1)
+
+    def variance(
+        self, t: float, rows: Floats, rest: Floats, on_bias: Floats, on_scale: Floats
+    ) -> list[float]:
+        """
+        Return what the terms add to the coefficients of x^2 to x^6 in the variance of one axis.
+
+        `rows`: factor of the covariance of its coefficients (2 k, rank), `rest`: variances beside
+        it; `on_bias`, `on_scale`: the factor of bias and relative scale, shape (rank,). What |f| f
+        has in common with other parameters is left out, which overstates the variance.
+        """
+        kinds = [one.kind for one in self._of.terms]
+        n = len(kinds)
+        units = np.array([unit_of(kind) for kind in kinds])
+        along = (rows[:n] + t * rows[n:]) / units[:, np.newaxis]
+        alone = (rest[:n] + t * t * rest[n:]) / (units * units)
+        none = np.zeros(rows.shape[1])
+        n2, nq, n3 = (along[kinds.index(k)] if k in kinds else none for k in POWERS)
+        v2, vq, v3 = (float(alone[kinds.index(k)]) if k in kinds else 0.0 for k in POWERS)
+        # Explicit products and sums: BLAS results depend on the arrays' alignment.
+        products = (
+            2.0 * on_bias * n2,
+            2.0 * (on_scale * n2 + on_bias * n3),
+            n2 * n2 + nq * nq + 2.0 * on_scale * n3,
+            2.0 * n2 * n3,
+            n3 * n3,
+        )
+        c, d, e, f, g = (float(one.sum()) for one in products)
+        return [c, d, e + (v2 + vq), f, g + v3]
