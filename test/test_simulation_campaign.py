@@ -90,6 +90,8 @@ def test_plans_are_what_their_names_say() -> None:
             'tumble-3': 15.0,
             'tumble-1': 9.0,
             'held-out': 3 * 26220 / 3600,
+            'centrifuge': 45.0,
+            'rate-table': 45.0,
         },
         rel=1e-2,
     )

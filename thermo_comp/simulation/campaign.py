@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..typing import Floats
+from ..unit.gravity import STANDARD_GRAVITY
+from .spin import Spin, steps
 from .unit import Stream, generator
 
 _STEP = re.compile(
@@ -36,6 +38,8 @@ _PROGRAMS = {
     # Ninety minutes, for the sample bags: both regimes and both directions.
     'demo': '15 12min, 30@1 22min, 8@1.1 21min',
     'soak': '20 4h',
+    # Three temperatures with time to settle, for runs on a centrifuge or a rate table.
+    'three-soaks': '20 60min, 35@1 60min, 5@1 60min',
 }
 CYCLOGRAM_NAMES = tuple(_PROGRAMS)
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
@@ -53,7 +57,15 @@ _CORNERS = [
 _SPREAD_DEG = 3.0
 # Attitudes of three positions: each axis has both signs of gravity.
 _THREE = np.array([(1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
-PLAN_NAMES = ('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out')
+PLAN_NAMES = (
+    *('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out'),
+    *('centrifuge', 'rate-table'),
+)
+# Runs begin so long before the end of each soak [s] and hold each rate; ramps between them [s].
+_SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
+# Centrifuge: 1 m, 2 to 10 g beside the vertical 1 g; rate table: 0.25 m, up to 1000 deg/s.
+_CENTRIFUGE = 1.0, tuple(math.sqrt(g * STANDARD_GRAVITY) for g in (2.0, 4.0, 7.0, 10.0))
+_RATE_TABLE = 0.25, tuple(math.radians(rate) for rate in (400.0, 600.0, 800.0, 1000.0))
 
 
 @dataclass(frozen=True)
@@ -142,17 +154,22 @@ def positions(n: int, seed: int = 0) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """A position of a test: the chamber's program, and the direction of the specific force."""
+    """
+    A position of a test: the chamber's program, the direction of the specific force, and the
+    rotation that adds to it.
+    """
 
     program: Cyclogram
     up: Floats
+    spin: Spin | None = None
 
 
 def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     """
     Return the positions of a test in the order of their recording: 'chamber-18' (of 9.5 h each),
     'chamber-9' (3 h), 'tumble' (18 of 20 min at room temperature), 'tumble-3', 'tumble-1' (the
-    same and 3 or 1 of 3 h in the chamber) or 'held-out' (3 with other ramps and attitudes).
+    same and 3 or 1 of 3 h in the chamber), 'held-out' (3 with other ramps and attitudes),
+    'centrifuge' or 'rate-table' (12 mountings, each at 1 g and at four rates in three soaks).
     `seed` determines the attitudes and the room temperature.
     """
     if name not in PLAN_NAMES:
@@ -162,6 +179,8 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
         # Attitudes that no plan has: random directions without a vertical axis.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(parse_cyclogram('held-out'), ups)
+    if name in ('centrifuge', 'rate-table'):
+        return _spinning(*(_CENTRIFUGE if name == 'centrifuge' else _RATE_TABLE), seed)
     if name.startswith('chamber'):
         n, preset = (18, 'long') if name == 'chamber-18' else (9, 'three-hours')
         return _positions(parse_cyclogram(preset), positions(n, seed))
@@ -174,6 +193,19 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
         return tuple(bench)
     ups = _THREE[: int(name[-1])] + rng.normal(0.0, 0.15, (int(name[-1]), 3))
     return (*bench, *_positions(parse_cyclogram('three-hours'), ups))
+
+
+def _spinning(radius: float, rates: tuple[float, ...], seed: int) -> tuple[Position, ...]:
+    program = parse_cyclogram('three-soaks')
+    begins = tuple(end - _LEAD_S for end in _SOAK_ENDS_S)
+    time, rate = steps(begins, rates, _DWELL_S, _RAMP_S)
+    across = np.roll(positions(12, seed), 1, axis=1)
+    result = []
+    for inward, other in zip(positions(12, seed), across, strict=True):
+        up = np.cross(inward, other)
+        spin = Spin(time, rate, radius, inward)
+        result.append(Position(program, up / np.linalg.norm(up), spin))
+    return tuple(result)
 
 
 def _positions(program: Cyclogram, ups: Floats) -> tuple[Position, ...]:

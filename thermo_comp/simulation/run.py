@@ -20,7 +20,8 @@ from ..unit.rate_bias import MILLIDEGREE
 from .campaign import Cyclogram, Position
 from .drift import PartHistory, drift_of
 from .network import ThermalResponse
-from .unit import Stream, SwitchedLoad, UnitModel, first_charge, generator, white
+from .spin import Spin
+from .unit import REFERENCE_C, Stream, SwitchedLoad, UnitModel, first_charge, generator, white
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 _NS = 1_000_000_000
@@ -33,7 +34,8 @@ class Truth:
     The truth of a run on the thermal grid (m points) and at the accelerometer's n cycles.
 
     Bias is in counts per cycle (`rate_bias`: rad/s), scale is relative; `bias_grid` includes the
-    random walk, which no model predicts. `cycle_s` are the middles of the cycles.
+    random walk, which no model predicts. `cycle_s` are the middles of the cycles; `specific_force`
+    is constant, shape (3,), or in a rotation that of each cycle, shape (n, 3).
     """
 
     unit: UnitModel
@@ -94,7 +96,15 @@ def arrays(
 ) -> list[SimulatedRun]:
     """Run a unit through a test in memory; each position has another seed, stamps from 0."""
     return [
-        simulate(unit, one.program, one.up, rate_hz=rate_hz, seed=1000 * seed + k, start_ns=0)
+        simulate(
+            unit,
+            one.program,
+            one.up,
+            rate_hz=rate_hz,
+            seed=1000 * seed + k,
+            start_ns=0,
+            spin=one.spin,
+        )
         for k, one in enumerate(stations)
     ]
 
@@ -110,13 +120,14 @@ def simulate_blocks(
     seed: int = 0,
     start_ns: int = START_NS,
     gravity: float = STANDARD_GRAVITY,
+    spin: Spin | None = None,
 ) -> Iterator[SimulatedRun]:
     """
     Run a unit through a program in bounded memory; the result does not depend on the block size.
 
     A reading is in the block with the cycles around it, or in the last. `up` is the direction of
-    the specific force; K in counts per cycle does not depend on `rate_hz`. `seed` determines all
-    random numbers of the run.
+    the specific force, without `spin`; K in counts per cycle does not depend on `rate_hz`. `seed`
+    determines all random numbers of the run.
     """
     readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz
     positive = {'rate_hz': rate_hz, 'temperature_rate_hz': readings_hz, 'gravity': gravity}
@@ -146,7 +157,6 @@ def simulate_blocks(
     def blocks() -> Iterator[SimulatedRun]:
         K = np.array(unit.scale_factor)
         to_axes = np.linalg.inv(unit.M)
-        s = sum(truth.specific_force[j] * to_axes[:, j] for j in range(3))
         # Mean of white noise over a cycle: density times the root of the cycle rate.
         root = math.sqrt(rate_hz)
         noise_sd = np.array(unit.noise_density) * MICRO_G * K * root
@@ -158,14 +168,29 @@ def simulate_blocks(
             cycle = np.arange(first, last)
             stamp_ns = np.rint((cycle + 1.0) * (_NS / rate_hz)).astype(np.int64)
             part = replace(truth, cycle_s=(cycle + 0.5).astype(np.float64) / rate_hz)
+            force = truth.specific_force
+            if spin is not None:
+                force = spin.forces(force, part.cycle_s)
+                part = replace(part, specific_force=force)
+            s: Floats = np.zeros(3)
+            for j in range(3):
+                s = s + force[..., j, None] * to_axes[:, j]
+            if unit.bend is not None:
+                node = unit.network.nodes.index(unit.board.node)
+                t = truth.temperatures[:, [node]] - REFERENCE_C
+                s = s + unit.bend.added(s, part.on_cycles(t)[:, 0])
             # Eq. (2), (8) and (9)
             charge = part.bias + K * part.scale * s + noise_sd * noise(len(cycle))
             counts, remainder = unit.converter(charge, remainder)
-            rate, gyro = None, unit.gyro
+            rate: Floats | None = None
+            gyro = unit.gyro
             if gyro is not None:
                 rate_sd = np.array(gyro.noise_density) * MILLIDEGREE * root
                 rate = part.on_cycles(part.rate_bias) + gyro.constant(seed)
                 rate += rate_sd * rate_noise(len(cycle))
+                if spin is not None:
+                    turning = spin.rate_at(part.cycle_s)[:, None]
+                    rate += turning * truth.specific_force / gravity
             until = sys.maxsize if last == n_cycles else int(stamp_ns[-1])
             (board_ns, board), (case_ns, case) = (
                 (stamps[rows] + start_ns, values[rows])

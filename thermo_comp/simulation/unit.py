@@ -18,9 +18,10 @@ from ..unit.gravity import EARTH_RATE, MICRO_G
 from ..unit.rate_bias import MILLIDEGREE
 from .drift import ZERO, Effect, PartHistory, Triple, drift_of
 from .network import ThermalNetwork, ThermalResponse
+from .spin import Bend
 
 _NS = 1_000_000_000
-_REFERENCE_C = 20.0  # board temperature in a soak at which K and bias are stated
+REFERENCE_C = 20.0  # board temperature in a soak at which K and bias are stated
 _RANGE = -(1 << 15), (1 << 15) - 1  # of the output, counts
 _FRACTION_BITS = 40
 _ONE = 1 << _FRACTION_BITS
@@ -46,6 +47,7 @@ class Stream(IntEnum):
     SIBLING = 14
     GYRO_NOISE = 15
     GYRO_OFFSET = 16
+    SPIN = 17
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
@@ -160,9 +162,10 @@ class UnitModel:
     A physical unit with all its constants: the truth that a calibration estimates.
 
     Per axis, ``counts = K * scale(T) * s + bias(T) + noise`` summed into whole counts, where ``s =
-    inverse(M) @ f`` is the specific force along the sensitivity axes. K [counts/cycle per m/s^2]
-    and bias [counts/cycle] are those at the reference. `noise_density` is in ug/sqrt(Hz): the mean
-    over T seconds has the deviation ``noise_density / sqrt(T)``; `bias_walk` in ug/sqrt(h).
+    inverse(M) @ f`` is the specific force along the sensitivity axes, and what `bend` adds to it.
+    K [counts/cycle per m/s^2] and bias [counts/cycle] are those at the reference. `noise_density`
+    is in ug/sqrt(Hz): the mean over T seconds has the deviation ``noise_density / sqrt(T)``;
+    `bias_walk` in ug/sqrt(h).
     """
 
     serial: str
@@ -178,6 +181,7 @@ class UnitModel:
     bias_walk: Triple = ZERO
     load: SwitchedLoad | None = None
     gyro: GyroModel | None = None
+    bend: Bend | None = None
 
     @property
     def counts_per_micro_g(self) -> Floats:
@@ -192,7 +196,7 @@ class UnitModel:
     @property
     def origin(self) -> Floats:
         """Temperatures [degC] of the parts in the reference's steady state, shape (n_parts,)."""
-        air = self.network.air_for(self.board.node, _REFERENCE_C)
+        air = self.network.air_for(self.board.node, REFERENCE_C)
         return self.network.equilibrium(air)
 
     def with_thermometers(self, **changes: Any) -> UnitModel:

@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns forces beyond 1 g in a simulation: a rotation in the chamber, and nonlinear axes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from ..typing import Floats
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
+from .drift import ZERO, Triple
+
+
+@dataclass(frozen=True)
+class Bend:
+    """
+    Nonlinear terms of the axes, as in `unit.nonlinearity`: K2 [ug/g^2] and K3 [ug/g^3] at the
+    reference, and their relative change per kelvin of the board.
+    """
+
+    square: Triple = ZERO
+    cube: Triple = ZERO
+    per_kelvin: float = 0.0
+
+    def added(self, force: Floats, t: Floats) -> Floats:
+        """Return what the axes read beside forces, shape (n, 3) [m/s^2], t K off the reference."""
+        f = force / STANDARD_GRAVITY
+        terms = np.array(self.square) * f**2 + np.array(self.cube) * f**3
+        return np.asarray(MICRO_G * (1.0 + self.per_kelvin * t)[:, None] * terms)
+
+
+@dataclass(frozen=True, eq=False)
+class Spin:
+    """
+    A rotation about a vertical axis: rate [rad/s] linear between times [s], radius [m], and the
+    direction from the unit to the axis, across the vertical, in the frame of the unit.
+    """
+
+    time_s: tuple[float, ...]
+    rate: tuple[float, ...]
+    radius: float
+    inward: Floats
+
+    def rate_at(self, time: Floats) -> Floats:
+        """Return the rate at times [s]."""
+        return np.interp(time, self.time_s, self.rate)
+
+    def forces(self, upward: Floats, time: Floats) -> Floats:
+        """Return the specific force at times, shape (n, 3), beside that against gravity."""
+        return np.asarray(upward + (self.rate_at(time) ** 2 * self.radius)[:, None] * self.inward)
+
+    def sections(self, gravity: float) -> list[tuple[float, float, float]]:
+        """List the parts of constant rate: begin, end [s], |f| [m/s^2]."""
+        knots = zip(self.time_s, self.rate, strict=True)
+        return [
+            (begin, end, math.hypot(gravity, rate * rate * self.radius))
+            for (begin, rate), (end, after) in pairwise(knots)
+            if rate == after
+        ]
+
+
+def steps(
+    begins_s: tuple[float, ...], rates: tuple[float, ...], dwell_s: float, ramp_s: float
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the knots of runs that begin at given times: each rate is held, between ramps."""
+    time, rate = [0.0], [0.0]
+    for begin in begins_s:
+        now = begin
+        for wanted in (*rates, 0.0):
+            time += [now, now + ramp_s]
+            rate += [rate[-1], wanted]
+            now += ramp_s + dwell_s
+    time.append(math.inf)
+    rate.append(0.0)
+    return tuple(time), tuple(rate)
