@@ -104,6 +104,7 @@ def made(
         is_swapped=np.zeros(n, bool),
         raw=constant,
         force=force,
+        size=np.full(n, GRAVITY),
         claimed_sd=np.full(n, claimed * MICRO_G),
         noise_sd=np.zeros(n),
         gyro=np.zeros((n, 0)),
@@ -423,7 +424,7 @@ def test_windows_as_a_table(tmp_path: Path) -> None:
     assert first == [
         *('bag', 'position', 'start_ns', 'time_s', 'window_s', 'samples'),
         *('board_c', 'board_rate_k_min', 'regime', 'is_inside'),
-        *('force_x_m_s2', 'force_y_m_s2', 'force_z_m_s2'),
+        *('force_x_m_s2', 'force_y_m_s2', 'force_z_m_s2', 'known_force_m_s2'),
         *('raw_residual_ug', 'residual_ug', 'claimed_sd_ug'),
     ]
     assert len(rows) == len(windows)

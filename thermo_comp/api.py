@@ -54,6 +54,8 @@ class Columns:
         Serial of the unit, if the recording contains it.
     name : str, optional
         Name of the recording in messages.
+    specific_force : str, optional
+        |f| of rests not at 1 g, as in the metadata of a bag; empty: at rest |f| is gravity.
 
     """
 
@@ -63,6 +65,7 @@ class Columns:
     start_ns: int = 0
     serial: str | None = None
     name: str = 'arrays'
+    specific_force: str = ''
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +239,7 @@ def fit(
     from .convert.readers import as_bags
     from .fitting import FitOptions, FitSource
     from .fitting import fit as run
+    from .fitting.known_force import KnownForce, parse_sections
     from .fitting.sources import fit_sources
 
     items = [recordings] if isinstance(recordings, (str, Path, Columns)) else list(recordings)
@@ -249,7 +253,10 @@ def fit(
                 nothing: Temperature = ([], [])
                 readings = {'board': nothing, 'case': nothing, **one.temperatures}
                 block = _block(one.time_s, one.counts, readings, one.start_ns)
-                sources.append(FitSource(one.name, partial(list, [block]), serial=one.serial))
+                said = parse_sections(one.specific_force) if one.specific_force else ()
+                known = KnownForce(one.name, said) if said else None
+                source = FitSource(one.name, partial(list, [block]), None, one.serial, known)
+                sources.append(source)
         return run(sources, FitOptions(gravity=gravity, **options)).calibration
 
 

@@ -52,6 +52,7 @@ def fit(
     certificate_info: Path | None = options.CERTIFICATE_INFO,
     serial: str | None = option("Serial, instead of the bags'.", callback=options.check_serial),
     offset: float | None = options.OFFSET,
+    known_force: Any = options.force,
     columns: Path | None = option('Column map of the tables, as for convert.', metavar='YAML'),
     rate_hz: float | None = options.TABLE_RATE,
     topics: Any = options.reading_part,
@@ -96,7 +97,7 @@ def fit(
     with flags_named():
         # Until the command ends.
         bags = context.with_resource(as_bags(bags, tell, columns=columns, rate_hz=rate_hz))
-    sources, kind = fit_sources(bags, topics)
+    sources, kind = fit_sources(bags, topics, known_force)
     info = None
     if certificate_info is not None:
         from ..report.statements import load_certificate_info
@@ -157,6 +158,26 @@ def prior(
     out.end(output=output, units=[one.unit.serial for one in units])
 
 
+def _say_terms(out: Output, calibration: Any) -> None:
+    """Print the nonlinear terms, if the fit had any to look for."""
+    from ..unit.prediction import nonlinear_coefficients
+
+    if calibration.nonlinearity is None:
+        return
+    rows: list[tuple[Cell, ...]] = []
+    for one in nonlinear_coefficients(calibration):
+        pairs = zip(one.value.tolist(), one.sd.tolist(), strict=True)
+        rows.append((one.name, one.unit, *(f'{value:.4g} +- {sd:.2g}' for value, sd in pairs)))
+    terms = calibration.nonlinearity.terms
+    losses = ', '.join(f'{one.kind} {one.log_evidence_change:.1f}' for one in terms) or 'no term'
+    low, high = calibration.nonlinearity.force_range_m_s2
+    out.table(
+        ('coefficient', 'unit', 'x', 'y', 'z'),
+        rows,
+        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; log evidence: {losses}',
+    )
+
+
 def _names(text: str) -> tuple[str, ...]:
     return tuple(name for name in map(str.strip, text.split(',')) if name)
 
@@ -199,6 +220,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
             ],
             title='groups kept; log evidence: its loss if the group is removed',
         )
+    _say_terms(out, calibration)
     white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
     walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
     out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')

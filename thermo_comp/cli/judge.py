@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..files import CSV, PAGE, check_output, shown_name
+from ..unit.gravity import STANDARD_GRAVITY
 from . import shared_options as options
 from .field import evaluate_rests
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
@@ -22,6 +23,7 @@ def evaluate(
         'Calibration; the first is judged, more are compared.', ..., '--calibration', '-c'
     ),
     judging: dict[str, Any] = options.judging,
+    known_force: Any = options.force,
     csv: Path | None = option('File for the windows, one a line.', metavar='FILE'),
     topics: Any = options.reading_part,
     force: bool = options.FORCE,
@@ -60,7 +62,7 @@ def evaluate(
     is_named = len({path.stem for path in calibration}) == len(calibration)
     models = [(one.stem if is_named else str(one), load_calibration(one)) for one in calibration]
     with out.progress('evaluating') as done:
-        result = run(bags, models, **judging, topics=topics, progress=done)
+        result = run(bags, models, **judging, topics=topics, force=known_force, progress=done)
     out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)
     judged = result.judgements[models[0][0]]
     if csv is not None:
@@ -78,6 +80,18 @@ def evaluate(
         row += [micro_g(one.bias), micro_g(one.bias_sd)]
         row += [micro(1e6 * one.scale), micro(1e6 * one.scale_sd)]
     out.table(columns, axes, title=title)
+    if judged.by_force:
+        out.table(
+            ('|f| g', 'windows', 'raw ug', 'RMS ug', 'mean ug', 'claimed ug'),
+            [
+                (
+                    *(f'{size / STANDARD_GRAVITY:.4g}', one.n, micro_g(one.raw_rms)),
+                    *(micro_g(one.rms), micro_g(one.mean), micro_g(one.claimed_rms)),
+                )
+                for size, one in judged.by_force.items()
+            ],
+            title='what is left over |f|: corrected less known magnitude',
+        )
     rates = {name: one.rate for name, one in result.judgements.items() if one.rate is not None}
     if rows := _sections(rates, millidegrees):
         out.table(
@@ -151,6 +165,7 @@ def report(
     figures: Path | None = option('Folder for the figures as PNG files.', metavar='DIR'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
     judging: dict[str, Any] = options.judging,
+    known_force: Any = options.force,
     topics: Any = options.reading_part,
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -182,7 +197,9 @@ def report(
         info = load_certificate_info(certificate_info, loaded.unit.serial if loaded else None)
     with out.progress('reading') as done:
         window_s = judging['window_s']
-        opened = open_bags(paths, known[:1], topics=topics, window_s=window_s, progress=done)
+        opened = open_bags(
+            *(paths, known[:1]), topics=topics, window_s=window_s, force=known_force, progress=done
+        )
     with options.usage_of():
         evidence = evidence_of_bags(opened, loaded, **judging, others=known[1:])
     out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in opened)

@@ -231,6 +231,29 @@ def judging(
 
 
 @expanded
+def force(
+    specific_force: str | None = option(
+        'Known |f| of rests not at 1 g: a value for all bags, as 5g, or a file of lines '
+        "[BAG] BEGIN END |f| [SD] in s and m/s^2; default: the bags' metadata.",
+        metavar='VALUE|FILE',
+    ),
+    rotation: str | None = option(
+        'Topic of the rotation rate about a vertical axis in rad/s, with --radius.',
+        metavar='TOPIC[:FIELD]',
+    ),
+    radius: float | None = option('Distance of the unit from that axis, in m.', min=1e-3),
+    radius_sd: float | None = option(
+        'Its standard deviation, in m: the radius is then estimated.', min=0.0
+    ),
+) -> Any:
+    """Build what the user says of |f|."""
+    from ..fitting.known_force import AskedForce
+
+    with usage_of():
+        return AskedForce(specific_force, rotation, radius, radius_sd)
+
+
+@expanded
 def fitting(
     where: dict[str, float] = site,
     model: Literal['response', 'golovach'] = option(
@@ -258,6 +281,12 @@ def fitting(
         'Repeatability of mounting and turn-on (sd of the bias), as 30ug; default: estimated from '
         'the bags.'
     ),
+    k2_sd: float | None = option(
+        'Data-sheet bound (1 sd) of the quadratic nonlinearity, in ug/g^2; default: 100 if rests '
+        'are not all at 1 g, else none.',
+        min=1e-6,
+    ),
+    k3_sd: float | None = option('The same of the cubic one, in ug/g^3; default: 10.', min=1e-6),
     allow: list[str] | None = option('Refusal to override, as its message names it.'),
 ) -> dict[str, Any]:
     """Return the keywords of FitOptions."""
@@ -270,6 +299,8 @@ def fitting(
         | {
             'still_sd': acceleration(still_sd, '--still-sd'),
             'mounting_sd': acceleration(mounting_sd, '--mounting-sd'),
+            'k2_sd': None if k2_sd is None else k2_sd * 1e-6,
+            'k3_sd': None if k3_sd is None else k3_sd * 1e-6,
             'allow': tuple(allow or ()),
         }
     )

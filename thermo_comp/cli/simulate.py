@@ -5,6 +5,7 @@
 import json
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from .shared_options import option
 
 if TYPE_CHECKING:
     from ..recording.writer import BagWriter
+    from ..simulation.campaign import Position
     from ..simulation.run import SimulatedRun
     from ..simulation.unit import UnitModel
 
@@ -31,7 +33,7 @@ def simulate(
     unit_seed: int = option('Seed of the specimen of that kind.', 1, min=0),
     plan: str | None = option(
         'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
-        'tumble, tumble-3, tumble-1 or held-out.'
+        'tumble, tumble-3, tumble-1, held-out; on a rotation: centrifuge or rate-table.'
     ),
     profile: str | None = option(
         "Chamber program: a name (default: chamber), or steps as '20 30min, 35@0.5 1h, 5@1 1h'."
@@ -48,6 +50,8 @@ def simulate(
         'Write sensor_msgs/Imu, with the angular rate if the unit has a gyroscope.', False, '--imu'
     ),
     level: int = option('zstd level, 1 fast to 19 small.', 3, min=1, max=19),
+    k2: float = option('K2 of all axes in ug/g^2; it changes by 1 %/K.', 0.0),
+    k3: float = option('K3 of all axes in ug/g^3; it changes by 1 %/K.', 0.0),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -64,6 +68,7 @@ def simulate(
     from .. import __version__
     from ..recording.writer import BagWriter
     from ..simulation import campaign, presets, run
+    from ..simulation.spin import Bend
 
     with options.usage_of():
         specimen = presets.unit_preset(unit, unit_seed)
@@ -76,6 +81,8 @@ def simulate(
             raise options.usage('--plan is a whole test: leave out --profile and --positions')
         else:
             stations = campaign.plan(plan, position_seed)
+    if k2 or k3:
+        specimen = replace(specimen, bend=Bend((k2,) * 3, (k3,) * 3, 0.01))
     n = len(stations)
     names = [output] if n == 1 else [output / f'{i:02d}.mcap' for i in range(1, n + 1)]
     for name in names:
@@ -95,11 +102,13 @@ def simulate(
                 'up': station.up.tolist(),
                 **picked(specimen, 'scale_factor bias_at_reference'),
                 'misalignment': specimen.M.tolist(),
+                **({'k2_ug_g2': k2, 'k3_ug_g3': k3} if k2 or k3 else {}),
             }
             metadata = {
                 'serial': specimen.serial,
                 'simulated_by': f'thermo_comp {__version__}',
                 'truth': json.dumps(truth),
+                **_said_force(station, gravity, is_known=plan == 'centrifuge'),
             }
             with options.usage_of():
                 runs = run.simulate_blocks(
@@ -107,11 +116,14 @@ def simulate(
                     station.program,
                     station.up,
                     temperature_rate_hz=temperature_rate_hz,
+                    spin=station.spin,
                     **settings,
                 )
             n_cycles = station.program.duration_s * rate_hz
             count = Counter(counts=0, board=0, case=0)
             with BagWriter(name, metadata=metadata, level=level, overwrite=force) as writer:
+                if station.spin is not None:
+                    _write_rate(writer, station)
                 for more in _write(writer, runs, specimen, imu):
                     count.update(more)
                     done(i + count['counts'] / n_cycles)
@@ -119,6 +131,44 @@ def simulate(
     out.table(('bag', 'counts', 'board', 'case'), [tuple(row.values()) for row in written])
     seconds = max(station.program.duration_s for station in stations)
     out.end(serial=specimen.serial, duration_s=seconds, bags=written)
+
+
+#: Topic of the rotation rate, its interval [s], and sd of the stated radius [m].
+_RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
+
+
+def _said_force(station: 'Position', gravity: float, *, is_known: bool) -> dict[str, str]:
+    """Return the metadata from which a fit learns |f| in a rotation."""
+    from ..fitting import known_force
+
+    spin = station.spin
+    if spin is None:
+        return {}
+    if not is_known:
+        return {
+            known_force.ROTATION: _RATE_TOPIC,
+            known_force.RADIUS: f'{spin.radius:g}',
+            known_force.RADIUS_SD: f'{_RADIUS_SD_M:g}',
+        }
+    end_s = station.program.duration_s
+    rows = [one for one in spin.sections(gravity) if one[0] < end_s]
+    lines = [f'{begin:g} {min(end, end_s):g} {size:.9g}' for begin, end, size in rows]
+    return {known_force.MAGNITUDE: '; '.join(lines)}
+
+
+def _write_rate(writer: 'BagWriter', station: 'Position') -> None:
+    """Write the rate of the table, along the vertical z."""
+    import numpy as np
+
+    from ..simulation.run import START_NS
+
+    if station.spin is None:
+        return
+    time = np.arange(0.0, station.program.duration_s, _RATE_STEP_S)
+    rate = np.zeros((len(time), 3))
+    rate[:, 2] = station.spin.rate_at(time)
+    stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
+    writer.write_counts(_RATE_TOPIC, stamps, rate, 'table')
 
 
 def _write(

@@ -27,6 +27,7 @@ from ..unit.calibration import (
 )
 from ..unit.columns import USUAL_BOARD_LAG_S, Column
 from ..unit.functions import TemperatureFunction
+from ..unit.nonlinearity import Kind, Nonlinearity
 from ..unit.posterior import posterior_of
 from ..unit.provenance import Provenance, ResidualSummary, Source
 from .bayes_factors import group_evidence
@@ -64,13 +65,15 @@ def build_calibration(
     residuals: Sequence[ResidualRow] = (),
     findings: Sequence[Finding] = (),
     known: Calibration | None = None,
+    nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
     """Write a posterior as a calibration; it holds where a prior did, too, `known`."""
     model, prior, state = windows.model, selected.prior, selected.posterior.state
     layout = claim.layout
     taken = (layout.weights[:, 0, len(model.sets.levels()) :] >= 0).any(axis=0)
     used = np.flatnonzero(taken).tolist()
-    to_file = file_parameters(regression, layout, state, model.sets, used)
+    kinds = tuple(one.kind for one in nonlinearity.terms) if nonlinearity else ()
+    to_file = file_parameters(regression, layout, state, model.sets, used, kinds)
     values = to_file @ as_vector(state, layout)[: layout.n_unit]
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
     is_seen = windows.was_measured
@@ -156,6 +159,7 @@ def build_calibration(
             ),
         ),
         evidence=group_evidence(regression, selected.posterior, prior) if is_seen else (),
+        nonlinearity=nonlinearity,
     )
     covariance = to_file @ claim.covariance @ to_file.T
     return with_parameters(blank, state.kappa * regression.nominal_scale, values, covariance)
@@ -184,6 +188,10 @@ def parameters_of(calibration: Calibration) -> Floats:
         for one in sets:
             values += [0.0, *one.scale_function.free_coefficients]
         values += [term.scale[axis] for term in calibration.response]
+    terms = calibration.nonlinearity.terms if calibration.nonlinearity else ()
+    for axis in range(3):
+        values += [one.coefficient[axis] for one in terms]
+        values += [one.per_kelvin[axis] for one in terms]
     M = calibration.misalignment
     return np.array([*values, M[1][0], M[2][0], M[2][1]])
 
@@ -211,8 +219,19 @@ def with_parameters(
         regimes.append(replace(regime, x=x, y=y, z=z))
     a, b, c = _triple(values[-3:])
     biases, scales = (np.array([one.response for one in part]) for part in layout[:2])
+    nonlinearity = calibration.nonlinearity
+    if nonlinearity is not None:
+        each = values[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
+        nonlinearity = replace(
+            nonlinearity,
+            terms=tuple(
+                replace(one, coefficient=_triple(each[:, 0, k]), per_kelvin=_triple(each[:, 1, k]))
+                for k, one in enumerate(nonlinearity.terms)
+            ),
+        )
     return replace(
         calibration,
+        nonlinearity=nonlinearity,
         axes=Axes(
             *(
                 AxisReference(float(K), float(values[bias.static]))
@@ -232,9 +251,17 @@ def with_parameters(
 
 
 def file_parameters(
-    regression: Regression, layout: Layout, state: State, sets: Sets, used: Sequence[int]
+    regression: Regression,
+    layout: Layout,
+    state: State,
+    sets: Sets,
+    used: Sequence[int],
+    kinds: Sequence[Kind] = (),
 ) -> Floats:
-    """Differentiate the file's parameters, in its order, by the regression's."""
+    """
+    Differentiate the file's parameters, in its order, by the regression's; `kinds`: its nonlinear
+    terms.
+    """
     n, m = sets.static.n_free, sets.dynamic.n_free
     # Place -1 is that of nothing.
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)
@@ -252,6 +279,11 @@ def file_parameters(
                 both[:m] += dynamic
                 dynamic = both
             rows += [level, *static, level + delta, *dynamic, *response[used]]
+    if regression.forces is not None:
+        every = regression.forces.kinds
+        at = [every.index(kind) for kind in kinds]
+        for places in layout.nonlinear:
+            rows += [*unknown[places[at]], *unknown[places[[len(every) + k for k in at]]]]
     a, _, c = state.misalignment
     # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the elements (a, b, c) of its inverse.
     of_a, of_b, of_c = unknown[layout.misalignment]

@@ -47,7 +47,7 @@ def group_evidence(
     names = np.array(regression.windows.groups)
     state, layout = posterior.state, posterior.layout
     mode = as_vector(state, layout)[: layout.n_unit]
-    force = regression.gravity * state.up[regression.windows.position]
+    force = (regression.norms(state)[:, None] * state.up)[regression.windows.position]
     effective = posterior.effective_parameters
     parts: tuple[Literal['bias', 'scale'], ...] = ('bias', 'scale')
     result = []

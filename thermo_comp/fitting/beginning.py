@@ -15,6 +15,7 @@ from ..errors import FitError
 from ..typing import Floats
 from .coverage import distinct_directions
 from .data_checks import POSITIONS_NEEDED
+from .nonlinear import starting_sd, with_terms
 from .options import FitOptions
 from .priors import informative_priors, with_calibration
 from .regression import Regression
@@ -78,6 +79,8 @@ def regress(
         sigma=np.full(3, sigma),
         offset_scale=_mounting_scale(windows, start),
     )
+    if data.forces is not None:
+        prior = replace(prior, nonlinear_sd=starting_sd(data.forces, options))
     if options.mounting_sd is not None:
         prior = replace(prior, offset_sd=options.mounting_sd, offset_scale=0.0)
 
@@ -87,6 +90,7 @@ def regress(
     if options.prior is not None:
         known = options.prior
         state = with_calibration(known, regression, state)
+        state = with_terms(state, known)
         *others, widest = informative_priors(known, regression, state, windows.model.sets, options)
         prior = replace(prior, column_sd=data.parts.astype(np.float64), informative=widest)
         fixed = replace(candidates, fixed=np.ones_like(candidates.fixed))
@@ -98,7 +102,7 @@ def regress(
     held = prior
     if is_open:
         norms = np.linalg.norm(position_means(data) / start.scale, axis=1)
-        off = _NORM_ERRORS * float(np.abs(norms - options.gravity).max())
+        off = _NORM_ERRORS * float(np.abs(norms - regression.norms(state)).max())
         bias, scale = (
             float(np.clip(most, _LEAST_HELD, 1.0))
             for most in (off / BIAS_SD, off / options.gravity / SCALE_SD)
@@ -141,7 +145,13 @@ def _candidates(
     if data.n_positions >= POSITIONS_NEEDED:
         # Rests at one temperature each drift from one to the other.
         force = (position_means(data) - start.bias) / start.scale
-        drift = max(drift, float(np.std(np.linalg.norm(force, axis=1))))
+        sizes = sizes_of(windows, options)
+        off = np.linalg.norm(force, axis=1) - sizes
+        if np.ptp(sizes) > 0.0:
+            # What is nonlinear in |f| is no drift.
+            smooth = np.vander(sizes / sizes.max(), 4)
+            off -= smooth @ np.linalg.lstsq(smooth, off, rcond=None)[0]
+        drift = max(drift, float(np.std(off)))
     moved = float(np.std(windows.temperature)) or 1.0
     slope = float(np.clip(drift / moved, _FLATTEST, STEEPEST[0] / 3.0))
     slopes = np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])
@@ -162,21 +172,30 @@ def _candidates(
     return Candidates(typical, largest, forced, fixed)
 
 
+def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
+    """Return |f| of each position as stated, shape (n_positions,)."""
+    forces = windows.data.forces
+    if forces is None:
+        return np.full(windows.data.n_positions, options.gravity)
+    return forces.sizes
+
+
 def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
     """Guess the triad without temperature: by its ellipsoid, or where that is not seen, a norm."""
     means = position_means(windows.data)
-    gravity = options.gravity
+    gravity = sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):
         raise FitError('an axis is exactly zero at rest: is it dead, is it the right topic?')
     if len(distinct_directions(means / norms[:, None])) >= POSITIONS_NEEDED:
-        return constant_calibration(means, gravity, with_misalignment=False)
-    scale = float(np.median(norms)) / gravity
+        known = options.gravity if windows.data.forces is None else gravity
+        return constant_calibration(means, known, with_misalignment=False)
+    scale = float(np.median(norms / gravity))
     if options.input == 'm/s^2':
         if abs(scale - 1.0) > 0.2:
             raise FitError(
-                f'the samples at rest have norm {scale * gravity:.3g}, expected {gravity:.3g} '
-                'm/s^2: is the unit right?'
+                f'the samples at rest have norm {scale * options.gravity:.3g}, expected '
+                f'{options.gravity:.3g} m/s^2: is the unit right?'
             )
         scale = 1.0
     return ConstantCalibration(np.zeros(3), np.full(3, scale), np.eye(3))

@@ -89,7 +89,9 @@ def _places(layout: Layout, wider: Layout) -> Ints:
     is_used = layout.weights >= 0
     places[layout.axis[:, :2]] = wider.axis[:, :2]
     places[layout.weights[is_used]] = wider.weights[is_used]
-    places[layout.misalignment] = wider.misalignment
+    places[layout.shared] = wider.shared
+    is_used = layout.nonlinear >= 0
+    places[layout.nonlinear[is_used]] = wider.nonlinear[is_used]
     return places
 
 

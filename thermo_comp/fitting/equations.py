@@ -9,10 +9,11 @@ Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
     a = (A u_p)_i g,  A = M^-1,  l_p across u_p: tilt of the support
 
 B and S are columns of one table (`unit.columns`), each divided by its RMS. With g = 0 this is the
-equation of an angular rate: b, B beta and o_p remain. Everything is a combination of a few base
-series (one, columns, their derivatives by the start states, temperatures of the support, the
-measured values), so the products of the whitened base series of each position and section hold
-all that the regression asks of the windows.
+equation of an angular rate: b, B beta and o_p remain. Where |f| of the positions differs it takes
+the place of g, and ``kappa sum_j (k_j + k'_j t) n_j(a)`` is added: nonlinear terms (`forces`).
+Everything is a combination of a few base series (one, columns, their derivatives by the start
+states, t, temperatures of the support, the measured values), so the products of the whitened base
+series of each position and section hold all that the regression asks of the windows.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from functools import cached_property
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
+from .forces import Forces
 from .noise import Whitener
 from .unknowns import Layout, Noise, Prior, State, Windows, lay_out
 
@@ -74,7 +76,8 @@ class Tangent:
     measured minus predicted, both as combinations of the base series: shapes
     (n_positions, 3, n_base, n_unknowns) and (n_positions, 3, n_base).
 
-    The unknowns of an axis: kappa, bias, weights, misalignment (3), up (2), offset, tilts, starts.
+    The unknowns of an axis: kappa, bias, weights, nonlinear coefficients, radius, misalignment
+    (3), up (2), stretch, offset, tilts, starts.
     """
 
     derivatives: Floats
@@ -93,6 +96,10 @@ class Equations:
     def __init__(self, windows: Windows, gravity: float, nominal_scale: Floats) -> None:
         self.windows = windows
         self.gravity = gravity
+        self.forces = windows.forces if gravity else None
+        self._t = np.zeros((len(windows.time), 0))
+        if self.forces is not None:
+            self._t = self.forces.t[:, None]
         self.nominal_scale = nominal_scale
         self.measured = windows.mean / nominal_scale
         self.rms = np.sqrt(np.mean(windows.columns**2, axis=0))
@@ -127,7 +134,25 @@ class Equations:
             offset=np.zeros((len(up), 3)),
             tilt=np.zeros((len(up), self.windows.tilt.shape[1], 2)),
             start=np.zeros((self.n_bags, self.start_root.shape[1])),
+            nonlinear=np.zeros((3, 2 * len(self.forces.kinds) if self.forces else 0)),
+            radius=np.zeros(1),
+            stretch=np.zeros((len(up), 1)),
         )
+
+    def norms(self, state: State) -> Floats:
+        """Return |f| of each position, with the error of a radius, shape (n_positions,)."""
+        if self.forces is None:
+            return np.full(self.windows.n_positions, self.gravity)
+        return self.forces.norms(state.radius, np.zeros_like(state.stretch))
+
+    def along_axes(self, state: State) -> Floats:
+        """Return the specific force along each axis in each position, shape (n_positions, 3)."""
+        return np.asarray(self._norm(state) * state.up @ state.inverse.T)
+
+    def _norm(self, state: State) -> float | Floats:
+        if self.forces is None:
+            return self.gravity
+        return np.asarray(self.forces.norms(state.radius, state.stretch)[:, None])
 
     def reweigh(self, weight: Floats) -> None:
         """Take other weights of the windows, shape (n,)."""
@@ -135,14 +160,21 @@ class Equations:
         self.noise: Noise | None = None
         self._products: tuple[Bools, Products] | None = None
 
-    def layout(self, used: Bools) -> Layout:
-        """Give every unknown its place; `used`: columns of bias and scale, shape (2, m)."""
+    def layout(self, used: Bools, bends: Bools | None = None) -> Layout:
+        """
+        Give every unknown its place; `used`: columns of bias and scale, shape (2, m), `bends`:
+        nonlinear coefficients, shape (2 k,); None for all.
+        """
+        if bends is None or self.forces is None:
+            bends = np.ones(2 * len(self.forces.kinds) if self.forces else 0, dtype=bool)
         moved = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
         return lay_out(
             used,
             self.bag_of_position,
             self.windows.tilt.shape[1],
             self.start_root.shape[1] if moved else 0,
+            bends,
+            self.forces,
         )
 
     def whiten(self, noise: Noise) -> None:
@@ -152,7 +184,8 @@ class Equations:
         gains = self.whitener.gains(self.weight, noise)
         self.noise, self._products = noise, None
         self.noise_determinant = self.whitener.log_determinant(gains)
-        others = np.hstack((np.ones((len(self.weight), 1)), self.windows.tilt, self._centred))
+        one = np.ones((len(self.weight), 1))
+        others = np.hstack((one, self._t, self.windows.tilt, self._centred))
         self._filtered_columns = self.whitener.filter(self.columns, gains)
         self._filtered_starts = self.whitener.filter(self._starts, gains)
         self._filtered_others = self.whitener.filter(others, gains)
@@ -182,6 +215,7 @@ class Equations:
                 np.ones((len(base), 1)),
                 self.columns[:, columns],
                 self._starts[:, at_start],
+                self._t,
                 self.windows.tilt,
                 self._centred,
             )
@@ -221,7 +255,7 @@ class Equations:
         n_positions, n_columns = self.windows.n_positions, len(columns)
         n_tilts, n_starts = self.windows.tilt.shape[1], layout.start.shape[1]
         n_base = products.cells.shape[1]
-        force = self.gravity * state.up @ state.inverse.T
+        force = self.along_axes(state)
         effect = self._effect(state, products)
         behind = 1 + n_columns + np.arange(len(products.moved))
         on_bias, on_scale = state.weights[:, :, columns]
@@ -231,36 +265,83 @@ class Equations:
         first_tilt = n_base - 3 - n_tilts
         across = self._across(state)
         in_bias, in_scale = (np.flatnonzero(one[columns]) for one in used)
-        n_own = 2 + len(in_bias) + len(in_scale)
-        n_all = n_own + 6 + 2 * n_tilts + n_starts
+        n_linear = 2 + len(in_bias) + len(in_scale)
+        n_own = layout.axis.shape[1]
+        at, n_stretches = n_own + layout.radius.size, layout.stretch.shape[1]
+        behind_up = at + 5 + n_stretches
+        n_all = behind_up + 1 + 2 * n_tilts + n_starts
         T = np.zeros((n_positions, 3, n_base, n_all))
         T[..., 0] = force[:, :, None] * scaled
         T[:, :, 0, 1] = 1.0
         T[..., 2 : 2 + len(in_bias)] = effect[:, None, :, in_bias]
-        times = (state.kappa * force)[:, :, None, None]
-        T[..., 2 + len(in_bias) : n_own] = times * effect[:, None, :, in_scale]
+        times = (state.kappa * (force + self._bends(state, 0)))[:, :, None, None]
+        T[..., 2 + len(in_bias) : n_linear] = times * effect[:, None, :, in_scale]
+        # How the reading answers to the force along its axis.
+        answers = scaled
+        if self.forces is not None:
+            answers = self._bend(self.forces, state, layout, scaled, T)
+            along = (state.kappa * force)[:, :, None] * answers
+            T[..., at + 5 : behind_up] = along[..., None]
+            if layout.radius.size:
+                T[..., n_own] = self.forces.by_radius(state.radius)[:, None, None] * along
         for k, (row, source) in enumerate(MISALIGNMENT_ROWS):
-            turned = self.gravity * state.kappa[row] * state.up[:, source]
-            T[:, row, :, n_own + k] = turned[:, None] * scaled[:, row]
-        T[..., n_own + 3 : n_own + 5] = across[:, :, None, :] * scaled[..., None]
-        T[:, :, 0, n_own + 5] = 1.0
+            turned = (self._norm(state) * state.kappa[row] * state.up)[:, source]
+            T[:, row, :, at + k] = turned[:, None] * answers[:, row]
+        T[..., at + 3 : at + 5] = across[:, :, None, :] * answers[..., None]
+        T[:, :, 0, behind_up] = 1.0
         for k in range(n_tilts):
-            at = slice(n_own + 6 + 2 * k, n_own + 8 + 2 * k)
-            T[:, :, first_tilt + k, at] = across
+            first = behind_up + 1 + 2 * k
+            T[:, :, first_tilt + k, first : first + 2] = across
         if n_starts:
             weight = on_bias + times[..., 0] * on_scale
             moved = weight[:, :, products.moved, None] * self.start_root[products.lag]
             T[:, :, behind, n_all - n_starts :] = moved
         return Tangent(T, self.misfit(state, products))
 
+    def _bend(
+        self, forces: Forces, state: State, layout: Layout, scaled: Floats, T: Floats
+    ) -> Floats:
+        """
+        Differentiate by the nonlinear coefficients, the last of each axis, in T; add the slope of
+        their terms to how the readings answer to force (`scaled`).
+        """
+        value, slope = forces.terms(self.along_axes(state))
+        # The scale acts on terms at the reference; of their changes its own is next to nothing.
+        over_t = np.zeros_like(scaled)
+        over_t[:, :, -4 - self.windows.tilt.shape[1]] = 1.0
+        each = np.concatenate((value, value), axis=2)
+        result: Floats = scaled.copy()
+        k = len(forces.kinds)
+        for term, places in enumerate(layout.nonlinear.T):
+            base = scaled if term < k else over_t
+            of_axis = state.nonlinear[:, term]
+            result += (slope[..., term % k] * of_axis)[:, :, None] * base
+            T[..., 0] += (each[..., term] * of_axis)[:, :, None] * base
+            if places[0] >= 0:
+                column = np.flatnonzero(layout.axis[0] == places[0])[0]
+                T[..., column] = (state.kappa * each[..., term])[:, :, None] * base
+        return result
+
+    def _bends(self, state: State, part: int) -> Floats | float:
+        """Evaluate the nonlinear terms: at the reference (part 0), or their change per kelvin."""
+        if self.forces is None:
+            return 0.0
+        k = len(self.forces.kinds)
+        value, _ = self.forces.terms(self.along_axes(state))
+        own = state.nonlinear[:, part * k : (part + 1) * k]
+        return np.asarray(np.einsum('pik,ik->pi', value, own))
+
     def misfit(self, state: State, products: Products) -> Floats:
         """Measured minus predicted as combinations of the base, (n_positions, 3, n_base)."""
         n_base, n_tilts = products.cells.shape[1], self.windows.tilt.shape[1]
-        force = self.gravity * state.up @ state.inverse.T
+        force = self.along_axes(state)
         on_bias, on_scale = state.weights[:, :, products.columns]
-        weight = on_bias + (state.kappa * force)[:, :, None] * on_scale
+        read = state.kappa * (force + self._bends(state, 0))
+        weight = on_bias + read[:, :, None] * on_scale
         result = -weight @ np.swapaxes(self._effect(state, products), 1, 2)
-        result[:, :, 0] = self.level - (state.kappa * force + state.bias + state.offset)
+        result[:, :, 0] = self.level - (read + state.bias + state.offset)
+        if self.forces is not None:
+            result[:, :, n_base - 4 - n_tilts] = -state.kappa * self._bends(state, 1)
         tilted = np.einsum('pkt,pit->pik', state.tilt, self._across(state))
         result[:, :, n_base - 3 - n_tilts : n_base - 3] = -tilted
         result[:, [0, 1, 2], n_base - 3 + np.arange(3)] = 1.0
@@ -269,7 +350,10 @@ class Equations:
     def _across(self, state: State) -> Floats:
         """Say what a turn of each attitude does to each axis, (n_positions, 3, 2)."""
         turned = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
-        return np.asarray(self.gravity * state.kappa[:, None] * turned)
+        if self.forces is None:
+            return np.asarray(self.gravity * state.kappa[:, None] * turned)
+        sizes = self.forces.norms(state.radius, state.stretch)
+        return np.asarray(sizes[:, None, None] * (state.kappa[:, None] * turned))
 
     def _effect(self, state: State, products: Products) -> Floats:
         """
@@ -294,6 +378,7 @@ class Equations:
                 np.ones((len(self.weight), 1)),
                 self.columns[:, products.columns],
                 self._starts[:, at_start],
+                self._t,
                 self.windows.tilt,
                 self._centred,
             )
@@ -306,6 +391,8 @@ class Equations:
         columns = self.columns[rows]
         along = self.measured[rows] - state.bias - columns @ state.weights[0].T
         along /= state.kappa * (1.0 + columns @ state.weights[1].T)
+        if self.forces is not None:
+            along = self.forces.linearise(along, state.nonlinear, rows)
         return np.asarray(along @ np.linalg.inv(state.inverse).T)
 
     def precision(self, prior: Prior, layout: Layout) -> Floats:
@@ -313,7 +400,14 @@ class Equations:
         result = np.zeros(layout.n)
         result[layout.kappa] = prior.scale_sd**-2
         result[layout.bias] = prior.bias_sd**-2.0
-        result[layout.axis[:, 2:]] = prior.column_sd[prior.column_sd > 0.0] ** -2.0
+        columns = prior.column_sd[prior.column_sd > 0.0]
+        result[layout.axis[:, 2 : 2 + len(columns)]] = columns**-2.0
+        if self.forces is not None:
+            bends = prior.nonlinear_sd[prior.nonlinear_sd > 0.0]
+            result[layout.axis[:, 2 + len(columns) :]] = bends**-2.0
+            result[layout.stretch] = self.forces.stretch_sd[:, None] ** -2.0
+            if layout.radius.size:
+                result[layout.radius] = self.forces.radius_sd**-2.0
         result[layout.misalignment] = prior.misalignment_sd**-2
         if prior.informative is not None:
             result[: layout.n_unit] = 0.0
@@ -336,13 +430,20 @@ class Equations:
 
 
 #: Unknowns that a step is added to; attitudes move in their tangent planes.
-_ADDED = ('kappa', 'bias', 'weights', 'misalignment', 'offset', 'tilt', 'start')
+_ADDED = (
+    *('kappa', 'bias', 'weights', 'misalignment', 'offset', 'tilt'),
+    *('start', 'nonlinear', 'radius', 'stretch'),
+)
+
+
+def _added(layout: Layout) -> list[str]:
+    return [name for name in _ADDED if getattr(layout, name).size]
 
 
 def as_vector(state: State, layout: Layout) -> Floats:
     """Give the unknowns as a vector; attitudes as 0, they move in the tangent plane."""
     result = np.zeros(layout.n + 1)
-    for name in _ADDED if layout.start.size else _ADDED[:-1]:
+    for name in _added(layout):
         result[getattr(layout, name)] = getattr(state, name)
     return result[:-1]
 
@@ -351,9 +452,7 @@ def moved_by(state: State, step: Floats, layout: Layout) -> State:
     """Add a step to a state; what takes no part is 0."""
     padded = np.append(step, 0.0)
     up = state.up + np.einsum('pij,pj->pi', state.tangents, padded[layout.up])
-    moved = {
-        name: getattr(state, name) + padded[getattr(layout, name)]
-        for name in (_ADDED if layout.start.size else _ADDED[:-1])
-    }
-    moved['weights'] = np.where(layout.weights >= 0, moved['weights'], 0.0)
+    moved = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}
+    for name in moved.keys() & {'weights', 'nonlinear'}:
+        moved[name] = np.where(getattr(layout, name) >= 0, moved[name], 0.0)
     return replace(state, up=up / np.linalg.norm(up, axis=1, keepdims=True), **moved)

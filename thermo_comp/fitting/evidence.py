@@ -76,8 +76,9 @@ def residual_rows(
     steps = [regression.force(replace(state, weights=np.zeros_like(state.weights)))]
     rungs = (_with_only(regression, selected, groups) for groups in ((CURVE,), (CURVE, SET)))
     steps += [regression.force(step) for step in (*rungs, state)]
-    residuals = [norm_residual(force, regression.gravity) for force in steps]
-    left_out = left_out_error(selected.score, regression.gravity)
+    sizes = regression.norms(state)[regression.windows.position]
+    residuals = [norm_residual(force, sizes) for force in steps]
+    left_out = left_out_error(selected.score, sizes)
     is_dynamic = windows.weight > 0.5
     known = np.isfinite(left_out)
     tables = [statistics_by_regime(r, is_dynamic) for r in residuals]
@@ -91,7 +92,7 @@ def residual_rows(
     return rows, left_out
 
 
-def left_out_error(score: Score, gravity: float) -> Floats:
+def left_out_error(score: Score, gravity: float | Floats) -> Floats:
     """
     Say how far off each left-out window is [m/s^2], shape (n,): ``|f| - g`` where the other
     positions determine the norm, else the drift, RMS of the axes.
@@ -121,7 +122,8 @@ def position_reports(
 ) -> tuple[PositionReport, ...]:
     """List the positions with what the fit, and what the others (`left_out`), left on each."""
     state = selected.posterior.state
-    residual = norm_residual(regression.force(state), regression.gravity)
+    sizes = regression.norms(state)[regression.windows.position]
+    residual = norm_residual(regression.force(state), sizes)
     result = []
     for number, (bag, interval) in enumerate(windows.rests):
         rows = windows.data.position == number

@@ -23,6 +23,7 @@ from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
 from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
+from ..unit.nonlinearity import NonlinearTerm
 from . import data_checks
 from .assembly import build_calibration
 from .beginning import first_guess, regress
@@ -31,6 +32,7 @@ from .coverage import LeastKnown, least_known, rough_centre
 from .data_checks import Finding, enforce
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
+from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
@@ -186,6 +188,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     bags, copies = without_copies(bags)
     findings += data_checks.judge_copies(copies)
     known = options.prior
+    terms: tuple[NonlinearTerm, ...] = ()
     detector = options.detector or (known.detector if known else learn_detector(bags))
     tell(0.55)
     sensors = known.sensors if known else sensors_of(bags)
@@ -202,7 +205,11 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
             columns = tuple(one for one in columns if not one.is_of_sensor)
     reference = options.reference_temperature
     model = Model(options.model, sets, columns, sensors, detector, reference)
-    windows = thermal_windows(bags, model)
+    windows = with_forces(thermal_windows(bags, model), bags, options)
+    if known is not None and windows.data.forces and known.nonlinearity is None:
+        known = with_blank(known, options)
+        options = replace(options, prior=known)
+        windows = with_forces(windows, bags, options)
     start = first_guess(windows, options) if known is None else constants_of(known)
     up = start.force(position_means(windows.data))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
@@ -213,10 +220,13 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     asks = has_case and known is None and options.detector is None
     if asks and _may_have_sets(selected):
         # Only the sets feel when the regime closes: with the case, or with the board too.
-        others = thermal_windows(bags, replace(model, detector=replace(detector, closes='case')))
+        closed = replace(model, detector=replace(detector, closes='case'))
+        others = with_forces(thermal_windows(bags, closed), bags, options)
         again = regress(others, start, up, options, tell)
         if is_better(selected.score, again[1].score):
             windows, (regression, selected, typical) = others, again
+    if known is None:
+        selected, terms = choose(regression, selected, options)
     claim = claim_of(regression, selected, typical, options.gravity_sd)
     residuals, left_out = residual_rows(windows, regression, selected, is_shared=sets.is_shared)
     state = selected.posterior.state
@@ -238,8 +248,11 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
             residuals,
             findings,
             known,
+            of_file(regression, terms, options),
         )
-        calibration, rates = add_gyroscope(calibration, windows, bags, options)
+        rates: tuple[RateRow, ...] = ()
+        if not is_beyond(windows):
+            calibration, rates = add_gyroscope(calibration, windows, bags, options)
     except ValueError as error:
         if 'misalignment' in str(error):
             raise FitError(
@@ -250,14 +263,14 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         raise FitError(f'these data give no calibration that can be used: {error}') from error
     least = least_known(calibration, selected.posterior.state.up)
     unseen = list(data_checks.judge_coverage(least))
-    findings += unseen
+    unseen += judge_terms(calibration)
     calibration = with_notes(calibration, [f'{one.name}: {one.message}' for one in unseen])
     return FitResult(
         calibration=calibration,
         selected=selected,
         residuals=residuals,
         positions=position_reports(windows, regression, selected, left_out),
-        findings=tuple(findings),
+        findings=(*findings, *unseen),
         least_known=least,
         windows=windows,
         bags=tuple(bags),

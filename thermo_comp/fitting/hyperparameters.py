@@ -177,7 +177,7 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     determined, layout = posterior.determined, posterior.layout
     own = determined[layout.axis].sum(axis=1) + determined[layout.offset].sum(axis=0)
     # Attitudes, tilts, misalignment and start states are determined by all three axes.
-    common = (layout.misalignment, layout.up, layout.tilt, layout.start)
+    common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     shared = sum(determined[at].sum() for at in common)
     spent = own + shared / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))

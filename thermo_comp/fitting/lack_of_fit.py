@@ -79,12 +79,12 @@ def _drift_variance(regression: Regression, selected: Selected, claim: Claim) ->
     on_bias, on_scale = (
         _drift(regression, regression.columns[:, one]) for one in (in_bias, in_scale)
     )
-    force = regression.gravity * state.up @ state.inverse.T
+    force = regression.along_axes(state)
     result = np.zeros((len(on_bias), 3))
     for axis in range(3):
         a = force[regression.windows.position, axis][:, None]
         along = np.hstack((on_bias, a * on_scale))
-        at = layout.axis[axis, 2:]
+        at = layout.axis[axis, 2 : 2 + along.shape[1]]
         result[:, axis] = np.sum((along @ claim.covariance[np.ix_(at, at)]) * along, axis=1)
     return result
 

@@ -132,6 +132,7 @@ def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Scor
     counts = np.diff(edges).astype(np.float64)
     share = regression.weight / windows.weight
     force = np.full((len(windows.time), 3), np.nan)
+    sizes = regression.norms(state)
     drift = np.full_like(force, np.nan)
     squares, norms = np.full(n_positions, np.nan), np.full(n_positions, np.nan)
     for p in range(n_positions) if n_positions > 1 else ():
@@ -148,7 +149,7 @@ def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Scor
             squares[p] = np.average(square, weights=weight)
         if _is_norm_determined(regression, posterior, prior, tangent.derivatives, covariance, p):
             force[rows] = own
-            error = np.linalg.norm(own, axis=1) - regression.gravity
+            error = np.linalg.norm(own, axis=1) - sizes[p]
             norms[p] = np.average(error**2, weights=weight)
     n_sections = windows.n_sections
     sections = [np.array([one]) for one in range(n_sections if n_sections > 1 else 0)]
@@ -198,11 +199,11 @@ def _is_drift_determined(
     some = regression.columns[rows][:: max((rows.stop - rows.start) // _DRIFT_WINDOWS, 1)]
     some = some - some.mean(axis=0)
     p = regression.windows.position[rows.start]
-    force = regression.gravity * state.inverse @ state.up[p]
+    force = regression.along_axes(state)[p]
     by_others = everything = 0.0
     for axis in range(3):
         along = np.hstack((some[:, in_bias], force[axis] * some[:, in_scale]))
-        at = layout.axis[axis, 2:]
+        at = layout.axis[axis, 2 : 2 + along.shape[1]]
         where = np.ix_(at, at)
         by_others += float(np.sum((along @ covariance[where]) * along))
         everything += float(np.sum((along @ posterior.covariance[where]) * along))
@@ -222,12 +223,12 @@ def _is_norm_determined(
     if not regression.gravity:
         return False
     state, layout = posterior.state, posterior.layout
-    own = layout.axis.shape[1] + 3
+    own = layout.axis.shape[1] + len(layout.shared)
     base = regression.products(layout.used).means[p]
     on_axes = np.linalg.inv(state.inverse).T @ state.up[p] / state.kappa
     along = np.zeros(layout.n_unit)
     for axis in range(3):
-        places = np.concatenate((layout.axis[axis], layout.misalignment))
+        places = np.concatenate((layout.axis[axis], layout.shared))
         along[places] += on_axes[axis] * (base @ derivatives[p, axis, :, :own])
     everything = along @ posterior.covariance @ along + prior.offset_sd**2
     return bool(along @ covariance @ along < _DETERMINED * everything)

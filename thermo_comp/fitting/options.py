@@ -27,6 +27,7 @@ from ..thermal.settings import DetectorSettings
 from ..unit.calibration import Calibration
 from ..unit.functions import CubicSpline, Exponential, Polynomial, TemperatureFunction
 from ..unit.gravity import STANDARD_GRAVITY
+from ..unit.nonlinearity import Kind
 from .reduction import ReducedBag
 from .windows import Sets
 
@@ -47,6 +48,9 @@ GROUPS = (
     'curve', 'set', 'gradient', 'board', 'gradient_lag', 'product', 'gradient_x_temperature',
     'square', 'gradient_even', 'gradient_even_about_rest', 'play', 'bend',
 )  # fmt: skip
+# Prior sd of the nonlinear terms, above the limits of quartz pendulums (some 20 .. 60 ug/g^2 and
+# some ug/g^3): [g/g^2] and [g/g^3].
+_K2_SD, _K3_SD = 1e-4, 1e-5
 _ORDERS = {'linear': 1, 'quadratic': 2, 'cubic': 3}
 _SPLINE_PIECES = 4
 # Knots nearer to the reference than this part of their distance fall on it.
@@ -79,6 +83,8 @@ class FitOptions:
         what the bags show
     mounting_sd: how well mounting and turn-on repeat, sd of the bias [m/s^2]; None: not known
     gravity_sd: standard deviation of `gravity` [m/s^2]
+    k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], as of a data sheet;
+        None: 100 ug/g^2 and 10 ug/g^3, where positions are not at 1 g, else no such terms
     serial: unit serial; None takes the sources'
     input: unit of the samples
     full_scale: magnitude of a saturated sample; None takes 32767 for counts, and for m/s^2 the
@@ -102,6 +108,8 @@ class FitOptions:
     ageing_scale: float = 0.0
     mounting_sd: float | None = None
     gravity_sd: float = 0.0
+    k2_sd: float | None = None
+    k3_sd: float | None = None
     serial: str | None = None
     input: Literal['counts', 'm/s^2'] = 'counts'
     full_scale: float | None = None
@@ -118,7 +126,7 @@ class FitOptions:
             raise FitError(
                 f'local gravity {self.gravity:g} m/s^2 is not found on Earth ({low}..{high} m/s^2)'
             )
-        for name in ('min_rest_s', 'still_sd', 'full_scale', 'mounting_sd'):
+        for name in ('min_rest_s', 'still_sd', 'full_scale', 'mounting_sd', 'k2_sd', 'k3_sd'):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise ValueError(f'`{name}` must be positive, got {value}')
@@ -135,6 +143,12 @@ class FitOptions:
             for word in given if isinstance(given, tuple) else (given,):
                 if word is not None and word not in words:
                     raise ValueError(f'`{name}` must be of {", ".join(words)}, got {word!r}')
+
+    def nonlinear_sd(self, kind: Kind) -> float:
+        """Prior sd of the coefficients of a nonlinear term."""
+        if kind == 'cube':
+            return _K3_SD if self.k3_sd is None else self.k3_sd
+        return _K2_SD if self.k2_sd is None else self.k2_sd
 
     @property
     def saturated_at(self) -> float | None:

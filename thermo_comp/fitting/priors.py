@@ -25,6 +25,7 @@ from ..unit.columns import Column
 from ..unit.provenance import Provenance, Source
 from .assembly import blank_terms, file_parameters, parameters_of, union, with_parameters
 from .equations import as_vector
+from .nonlinear import without_terms
 from .options import FitOptions
 from .regression import Regression
 from .start import ConstantCalibration
@@ -122,7 +123,9 @@ def informative_priors(
     # The fit only begins with the last: noise must not take what a narrow one leaves.
     tried.append((tried[-1][0], _MORE_ALONE[-1]))
     layout = regression.layout(regression.windows.parts)
-    to_file = file_parameters(regression, layout, state, sets, range(len(calibration.response)))
+    kinds = regression.forces.kinds if regression.forces else ()
+    used = range(len(calibration.response))
+    to_file = file_parameters(regression, layout, state, sets, used, kinds)
     mean = as_vector(state, layout)[: layout.n_unit]
     result = []
     for known, more in tried:
@@ -143,6 +146,8 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """Make the prior of a type of unit from some; FitError if they are too few or not alike."""
     if len(calibrations) < UNITS_NEEDED:
         raise FitError(f'{len(calibrations)} calibrations, need {UNITS_NEEDED} for a population')
+    # Units of a type need not share a nonlinearity, which takes a centrifuge to see.
+    calibrations = [without_terms(one) if one.nonlinearity else one for one in calibrations]
     first = calibrations[0]
     serials = {one.unit.serial for one in calibrations}
     if len(serials) < len(calibrations):

@@ -168,7 +168,13 @@ def reduce_source(
         if n > sum(len(one.value) for one in readings[name]):
             raise FitError(f'{source.name}: {n} readings of {name} are beyond {HOTTEST:g} degC')
     found, reader = cells.finish(), source.reader()
-    ranges = _rests(found, min_rest_s, still_sd)
+    if source.force is not None:
+        # At another |f| the norms of the rests do not show which thresholds are best.
+        found = stillness.without_rotation(found)
+        shortest = min_rest_s or _MIN_RESTS_S[0]
+        ranges = stillness.still_intervals(found, shortest, still_sd)
+    else:
+        ranges = _rests(found, min_rest_s, still_sd)
     per_window = max(1, round(window_s / found.cell_s)) if found.cell_s else 1
     n_still = sum(upper - lower for lower, upper in ranges)
     if least > _FEW_SAMPLES and found.cell_s > _SLOW_CELL_S and 2 * n_still < len(found.count):

@@ -167,8 +167,9 @@ class Regression(Equations):
     ) -> Reduced:
         """Eliminate what belongs to each bag alone; `without`: a position that is left out."""
         n, own = layout.n_unit, layout.axis.shape[1]
+        both = own + len(layout.shared)
         of_axis = [slice(int(one[0]), int(one[0]) + own) for one in layout.axis]
-        shared = slice(n - 3, n)
+        shared = slice(n - len(layout.shared), n)
         precision = self.precision(prior, layout)
         away = as_vector(state, layout)
         bags = np.arange(self.n_bags) if bags is None else bags
@@ -187,15 +188,15 @@ class Regression(Equations):
                     matrix, vector = normal.hessian[p, axis], normal.gradient[p, axis]
                     at = of_axis[axis]
                     A[at, at] += matrix[:own, :own]
-                    A[at, shared] += matrix[:own, own : own + 3]
-                    A[shared, at] += matrix[own : own + 3, :own]
-                    A[shared, shared] += matrix[own : own + 3, own : own + 3]
+                    A[at, shared] += matrix[:own, own:both]
+                    A[shared, at] += matrix[own:both, :own]
+                    A[shared, shared] += matrix[own:both, own:both]
                     a[at] += vector[:own]
-                    a[shared] += vector[own : own + 3]
-                    H[local[:, None], local] += matrix[own + 3 :, own + 3 :]
-                    cross[local, at] += matrix[own + 3 :, :own]
-                    cross[local, shared] += matrix[own + 3 :, own : own + 3]
-                    g[local] += vector[own + 3 :]
+                    a[shared] += vector[own:both]
+                    H[local[:, None], local] += matrix[both:, both:]
+                    cross[local, at] += matrix[both:, :own]
+                    cross[local, shared] += matrix[both:, own:both]
+                    g[local] += vector[both:]
             H[np.diag_indices(size)] += precision[block]
             g -= precision[block] * away[block]
             # Attitudes of which nothing is seen stay where they are.
@@ -243,6 +244,7 @@ class Regression(Equations):
         return np.concatenate(
             (
                 layout.up[p],
+                layout.stretch[p],
                 layout.offset[p, axis : axis + 1],
                 layout.tilt[p].ravel(),
                 layout.start[self.bag_of_position[p]],
@@ -286,7 +288,8 @@ class Regression(Equations):
             own, n_starts = layout.axis.shape[1], layout.start.shape[1]
             diagonal = np.einsum('...ii->...i', normal.hessian)
             k = diagonal.shape[-1]
-            diagonal[..., [0, *range(own, own + 5), *range(k - n_starts, k)]] *= _HELD
+            turns = own + len(layout.shared) + 2 + layout.stretch.shape[1]
+            diagonal[..., [0, *range(own, turns), *range(k - n_starts, k)]] *= _HELD
         reduced = self.reduce(normal, prior, layout, state)
         whole, factor = self.unit_step(*reduced.whole, prior, layout, state)
         step = np.zeros(layout.n)
@@ -327,7 +330,7 @@ class Regression(Equations):
     def solve(self, state: State, prior: Prior, n_steps: int = 6) -> Posterior:
         """Find the mode under a prior in so many steps at most; with none, stay where it is."""
         self.whiten(prior.noise)
-        layout = self.layout(prior.column_sd > 0.0)
+        layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).whole
         state = moved_by(state, np.zeros(layout.n), layout)
         energy = self.energy(state, prior, layout, grams)
@@ -361,7 +364,7 @@ class Regression(Equations):
         if reached <= energy:
             return found, reached
         bends = np.zeros(layout.n, dtype=bool)
-        for places in (layout.kappa, layout.misalignment, layout.up, layout.start):
+        for places in (layout.kappa, layout.shared, layout.up, layout.stretch, layout.start):
             bends[places] = True
         for share in _SHARES:
             turned = moved_by(state, np.where(bends, share * step, 0.0), layout)
@@ -415,12 +418,13 @@ class Regression(Equations):
         normal = self.normal(tangent, products.whole, prior)
         reduced = self.reduce(normal, prior, layout, state)
         own = layout.axis.shape[1]
-        of_unit = np.hstack((layout.axis, np.tile(layout.misalignment, (3, 1))))
+        of_unit = np.hstack((layout.axis, np.tile(layout.shared, (3, 1))))
+        of_others = own + len(layout.shared)
         S: Floats = np.zeros((2, k, 3, 2, k, 3))
         Q: Floats = np.zeros((2, k, 3))
         cross: Floats = np.zeros((n, 2, k, 3))
         local = [np.zeros((one.stop - one.start, 2, k, 3)) for one in layout.blocks]
-        force = self.gravity * state.up @ state.inverse.T
+        force = self.along_axes(state)
         for p, bag in enumerate(self.bag_of_position.tolist()):
             among, beside = self.absent_products(columns, used, p)
             for axis in range(3):
@@ -432,9 +436,9 @@ class Regression(Equations):
                 Q[:, :, axis] += np.outer(acts, seen)
                 with_all = beside @ tangent.derivatives[p, axis] / variance
                 each = np.multiply.outer(acts, with_all).transpose(2, 0, 1)
-                cross[of_unit[axis], :, :, axis] += each[: own + 3]
+                cross[of_unit[axis], :, :, axis] += each[:of_others]
                 at = self._local(layout, p, axis) - layout.blocks[bag].start
-                local[bag][at, :, :, axis] += each[own + 3 :]
+                local[bag][at, :, :, axis] += each[of_others:]
         size = 2 * k * 3
         S, Q, cross = (
             one.reshape(shape)

@@ -19,6 +19,7 @@ from ..recording.blocks import Block, Input, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics, is_called, shown
 from ..typing import Floats
+from .known_force import USUAL_FORCE, AskedForce, KnownForce, known_force
 
 _SAMPLES: tuple[Role, ...] = ('accel',)
 
@@ -44,11 +45,12 @@ class FitSource:
     blocks: Callable[[], Iterable[Block]]
     sha256: str | None = None
     serial: str | None = None
+    force: KnownForce | None = None  # None: at rest |f| is gravity
     reader: Callable[[], RecordingReader | None] = lambda: None
 
 
 def fit_sources(
-    paths: Sequence[str | Path], topics: Topics | None = None
+    paths: Sequence[str | Path], topics: Topics | None = None, force: AskedForce = USUAL_FORCE
 ) -> tuple[list[FitSource], Input]:
     """
     Prepare recordings for a fit; each is opened once now, and streamed when the fit asks.
@@ -60,7 +62,7 @@ def fit_sources(
     kinds: dict[str, str] = {}
     names: dict[str, str] = {}
     for path in map(Path, paths):
-        source, info = recording_source(path, topics)
+        source, info = recording_source(path, topics, force=force)
         kinds[info.input or 'counts'] = str(path)
         sources.append(replace(source, sha256=digest(path)))
         twin = names.setdefault(str(sources[-1].sha256), str(path))
@@ -80,8 +82,12 @@ def recording_source(
     *,
     require: Collection[Role] = _SAMPLES,
     progress: Callable[[float], None] | None = None,
+    force: AskedForce = USUAL_FORCE,
 ) -> tuple[FitSource, RecordingInfo]:
-    """Make a source of a recording: looked at now, and opened anew for each pass."""
+    """
+    Make a source of a recording: looked at now, and opened anew for each pass. `force`: what the
+    user says of |f|, in place of the bag's metadata.
+    """
     path = Path(path)
     with open_recording(path, topics, require=require) as reader:
         info, topic = reader.info, reader.topics.get('accel')
@@ -102,7 +108,8 @@ def recording_source(
     if topic and not any(is_called(topic, one) for one in (wanted.counts, wanted.imu)):
         name += f' ({shown(topic)})'  # every message then says which topic was taken
     serial = info.metadata.get('serial')
-    return FitSource(name, blocks, serial=serial, reader=lambda: latest), info
+    known = known_force(path, info, force)
+    return FitSource(name, blocks, serial=serial, force=known, reader=lambda: latest), info
 
 
 def digest(path: Path) -> str:

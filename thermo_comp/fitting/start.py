@@ -36,9 +36,18 @@ class ConstantCalibration:
 
 
 def constant_calibration(
-    means: Floats, gravity: float, with_misalignment: bool
+    means: Floats, gravity: float | Floats, with_misalignment: bool
 ) -> ConstantCalibration:
-    """Fit the triad to position means, shape (n, 3); FitError if they lie on no ellipsoid."""
+    """
+    Fit the triad to position means, shape (n, 3); FitError if they lie on no ellipsoid. Where |f|
+    of the positions differs, `gravity` is that of each, shape (n,).
+    """
+    if isinstance(gravity, np.ndarray):
+        scale = np.full(3, float(np.median(np.linalg.norm(means, axis=1) / gravity)))
+        found, rms = _refine(means, gravity, np.zeros(3), scale, with_misalignment)
+        if not np.all(found.scale > 0.0) or not rms < _LARGEST_RMS * float(np.median(gravity)):
+            raise FitError('the readings do not follow |f| as stated: are its values right?')
+        return found
     bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
     half = 0.5 * (means.max(axis=0) - means.min(axis=0))
     if not np.all(half > 0.0):
@@ -60,9 +69,9 @@ def constant_calibration(
 
 
 def _refine(
-    means: Floats, gravity: float, bias: Floats, scale: Floats, with_misalignment: bool
+    means: Floats, gravity: float | Floats, bias: Floats, scale: Floats, with_misalignment: bool
 ) -> tuple[ConstantCalibration, float]:
-    unit = scale * gravity
+    unit = scale * float(np.median(gravity))
 
     def unpack(parameters: Floats) -> ConstantCalibration:
         matrix = np.eye(3)
@@ -82,7 +91,8 @@ def _refine(
         f_scale=0.01,
         x_scale=0.1,
     )
-    return unpack(found.x), gravity * float(np.sqrt(np.mean(residual(found.x) ** 2)))
+    rms = float(np.sqrt(np.mean(residual(found.x) ** 2)))
+    return unpack(found.x), float(np.median(gravity)) * rms
 
 
 def position_means(windows: Windows) -> Floats:

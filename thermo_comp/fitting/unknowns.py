@@ -5,13 +5,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
+from .forces import Forces
 
 #: Standard deviation of the bias of a unit whose data were not seen [m/s^2]: 100 mg.
 BIAS_SD = 1.0
@@ -41,6 +42,8 @@ class Windows:
     start_covariance: prior of the start states [K^2], shape (n_lags, n_lags)
     in_scale: which columns the scale may have as well as the bias, shape (m,)
     tilt: temperatures that a support may tilt with, relative to their RMS, shape (n, k)
+    forces: what is known of |f| where it is not gravity in all positions, and the nonlinear terms;
+        None otherwise
     """
 
     position: Ints
@@ -57,6 +60,7 @@ class Windows:
     start_covariance: Floats
     in_scale: Bools
     tilt: Floats
+    forces: Forces | None = None
 
     @property
     def n_positions(self) -> int:
@@ -132,6 +136,8 @@ class Prior:
     offset_scale: scale of the half-Student prior of offset_sd [m/s^2]; 0 keeps offset_sd
     tilt_sd: of a support's tilt [rad per RMS of a temperature that it follows]
     start_share: variance of the start states over that of the run-time prior
+    nonlinear_sd: of the coefficients of the nonlinear terms, then of their changes per kelvin; 0
+        for what takes no part, shape (2 k,)
     informative: takes the place of all the above for the unit's own parameters; column_sd then
         only says which columns take part
     """
@@ -147,6 +153,7 @@ class Prior:
     offset_scale: float = 0.0
     tilt_sd: float = 1e-7
     start_share: float = 1.0
+    nonlinear_sd: Floats = field(default_factory=lambda: np.zeros(0))
     informative: InformativePrior | None = None
 
 
@@ -156,7 +163,9 @@ class State:
     The unknowns: scale ratio kappa and bias, shape (3,); weights of columns in units of their RMS,
     in bias and scale, shape (2, 3, m); misalignment of the inverse of M, shape (3,); attitudes
     (n_positions, 3); offsets (n_positions, 3); support tilts along each attitude's tangents
-    (n_positions, k, 2); start states of each bag, in units of their sd (n_bags, r).
+    (n_positions, k, 2); start states of each bag, in units of their sd (n_bags, r). Nonlinear
+    coefficients (3, 2 k) as in `Forces`; relative errors of a radius, shape (1,) or (0,), and of
+    the known |f| of each position (n_positions, 1) or (n_positions, 0).
     """
 
     kappa: Floats
@@ -167,6 +176,9 @@ class State:
     offset: Floats
     tilt: Floats
     start: Floats
+    nonlinear: Floats = field(default_factory=lambda: np.zeros((3, 0)))
+    radius: Floats = field(default_factory=lambda: np.zeros(0))
+    stretch: Floats = field(default_factory=lambda: np.zeros((0, 0)))
 
     @cached_property
     def inverse(self) -> Floats:
@@ -184,8 +196,8 @@ class Layout:
     """
     Places of the unknowns in the vector of parameters, those of the unit first.
 
-    axis: kappa, bias and weights of each axis, shape (3, k)
-    weights: shape (2, 3, m); -1 for columns that take no part
+    axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
+    weights: shape (2, 3, m); nonlinear: shape (3, 2 k); -1 for what takes no part
     blocks: those of each bag
     """
 
@@ -196,6 +208,9 @@ class Layout:
     offset: Ints
     tilt: Ints
     start: Ints
+    nonlinear: Ints
+    radius: Ints
+    stretch: Ints
     n_unit: int
     blocks: tuple[slice, ...]
     n: int
@@ -211,13 +226,28 @@ class Layout:
         return self.axis[:, 1]
 
     @property
+    def shared(self) -> Ints:
+        """Places of the unit's unknowns that no axis has alone, the last of the unit's."""
+        return np.concatenate((self.radius, self.misalignment))
+
+    @property
     def used(self) -> Bools:
         """Which columns of bias and scale take part, shape (2, m)."""
         return np.asarray(self.weights[:, 0] >= 0)
 
 
-def lay_out(used: Bools, bag_of_position: Ints, n_tilts: int, n_starts: int) -> Layout:
-    """Give every unknown its place; `used`: columns of bias and scale, shape (2, m)."""
+def lay_out(
+    used: Bools,
+    bag_of_position: Ints,
+    n_tilts: int,
+    n_starts: int,
+    bends: Bools,
+    forces: Forces | None = None,
+) -> Layout:
+    """
+    Give every unknown its place; `used`: columns of bias and scale, shape (2, m), `bends`:
+    nonlinear coefficients, shape (2 k,).
+    """
     n = 0
 
     def take(*shape: int) -> Ints:
@@ -226,24 +256,34 @@ def lay_out(used: Bools, bag_of_position: Ints, n_tilts: int, n_starts: int) -> 
         n += size
         return np.arange(n - size, n).reshape(shape)
 
-    axis = take(3, 2 + int(used.sum()))
+    n_linear = 2 + int(used.sum())
+    axis = take(3, n_linear + int(bends.sum()))
     weights = np.full((2, 3, used.shape[1]), -1)
-    weights.transpose(1, 0, 2)[:, used] = axis[:, 2:]
+    weights.transpose(1, 0, 2)[:, used] = axis[:, 2:n_linear]
+    nonlinear = np.full((3, len(bends)), -1)
+    nonlinear[:, bends] = axis[:, n_linear:]
+    radius = take(int(forces is not None and forces.radius_sd > 0.0))
     misalignment = take(3)
     n_unit = n
     n_positions, n_bags = len(bag_of_position), int(bag_of_position.max()) + 1
     up = np.empty((n_positions, 2), dtype=np.int64)
     offset = np.empty((n_positions, 3), dtype=np.int64)
     tilt = np.empty((n_positions, n_tilts, 2), dtype=np.int64)
+    n_stretches = int(forces is not None and bool(forces.sd.any()))
+    stretch = np.empty((n_positions, n_stretches), dtype=np.int64)
     start = np.empty((n_bags, n_starts), dtype=np.int64)
     blocks = []
     for bag in range(n_bags):
         first = n
         for p in np.flatnonzero(bag_of_position == bag):
-            up[p], offset[p], tilt[p] = take(2), take(3), take(n_tilts, 2)
+            up[p], stretch[p] = take(2), take(n_stretches)
+            offset[p], tilt[p] = take(3), take(n_tilts, 2)
         start[bag] = take(n_starts)
         blocks.append(slice(first, n))
-    return Layout(axis, weights, misalignment, up, offset, tilt, start, n_unit, tuple(blocks), n)
+    return Layout(
+        *(axis, weights, misalignment, up, offset, tilt, start),
+        *(nonlinear, radius, stretch, n_unit, tuple(blocks), n),
+    )
 
 
 def tangent_basis(up: Floats) -> Floats:

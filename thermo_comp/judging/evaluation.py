@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
+from ..fitting.known_force import USUAL_FORCE, AskedForce
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sources import digest, recording_source
@@ -49,6 +50,7 @@ def open_bags(
     *,
     topics: Topics | None = None,
     window_s: float = WINDOW_S,
+    force: AskedForce = USUAL_FORCE,
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
     """
@@ -70,7 +72,9 @@ def open_bags(
         def report(part: float) -> None:
             progress((len(bags) + part) / len(paths))
 
-        source, info = recording_source(path, topics, require=require, progress=report)
+        source, info = recording_source(
+            path, topics, require=require, progress=report, force=force
+        )
         usual = {'full_scale': None if info.input == 'imu' else COUNTS_FULL_SCALE}
         source = replace(source, sha256=digest(Path(path)))
         for other, twin in zip(bags, paths, strict=False):
@@ -107,20 +111,23 @@ def evaluate(
     tolerance: float | None = None,
     topics: Topics | None = None,
     serial: str | None = None,
+    force: AskedForce = USUAL_FORCE,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Evaluation:
     """
     Judge calibrations of a unit, given with their names, on its recordings.
 
     Local gravity and topics default to those of the first calibration; `tolerance` is the largest
-    accepted RMS [m/s^2]; for `serial` see `replay.check_unit`.
+    accepted RMS [m/s^2]; for `serial` see `replay.check_unit`; `force`: |f| where it is not g.
 
     Raises RecordingError if a recording cannot be read, or none has a window at rest;
     CalibrationError if a calibration is for another unit.
     """
     models = [model for _, model in calibrations]
     gravity = models[0].gravity_m_s2 if gravity is None else gravity
-    bags = open_bags(paths, models, topics=topics, window_s=window_s, progress=progress)
+    bags = open_bags(
+        paths, models, topics=topics, window_s=window_s, force=force, progress=progress
+    )
     for bag in bags:
         for model in models:
             check_unit(model, bag.info, serial)

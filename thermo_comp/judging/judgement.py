@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -63,6 +63,7 @@ class Judgement:
     n_positions: int
     windows: Windows
     rate: verdicts.RateJudgement | None
+    by_force: dict[float, Section] = field(default_factory=dict)
 
     @property
     def is_valid(self) -> bool:
@@ -106,6 +107,9 @@ class Judgement:
             'n_positions': self.n_positions,
             'moved': self.moved,
             'shifts': self.shifts,
+            'by_force_m_s2': [
+                {'size': size, **asdict(one)} for size, one in self.by_force.items()
+            ],
             'axis_rms_m_s2': self.axis_rms,
             'angular_rate': None if self.rate is None else self.rate.facts(),
         }
@@ -125,7 +129,8 @@ def judge(
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)
     sections = verdicts.sections_of(windows, windows.raw_residual, windows.residual, claimed)
-    shifts = axis_shifts(windows.select(windows.is_inside), calibration.misalignment_sd)
+    at_1_g = windows.select(windows.is_inside & windows.is_usual)
+    shifts = axis_shifts(at_1_g, calibration.misalignment_sd)
     found = Judgement(
         kind=Verdict.OUTSIDE,
         reason='',
@@ -137,7 +142,8 @@ def judge(
         axis_rms=rms_by_axis(windows),
         n_positions=distinct_positions(windows),
         windows=windows,
-        rate=verdicts.judge_rates(windows, calibration),
+        rate=verdicts.judge_rates(windows.select(windows.is_usual), calibration),
+        by_force=verdicts.by_force(windows, claimed),
     )
     kind, reason = _verdict(found, claims, calibration.needs_temperature)
     return replace(found, kind=kind, reason=reason)

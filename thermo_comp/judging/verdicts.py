@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..typing import Floats
+from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration
 from ..unit.correction import Correction
 from ..unit.metrics import residual_statistics
@@ -25,6 +25,8 @@ LARGEST_RATIO = 2.0
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST = 6
+# Known |f| in rising order belong to one level up to this ratio of neighbours.
+_NEXT_LEVEL = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
 
@@ -93,14 +95,27 @@ def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats
     found = Sections()
     rows_of = (inside & ~dynamic, inside & dynamic, inside, ~inside)
     for name, rows in zip(SECTIONS, rows_of, strict=True):
-        before, after, claim = (
-            residual_statistics(one[rows].ravel()) for one in (raw, residual, claimed)
-        )
-        n = after.n // max(1, residual[:1].size)
-        found[name] = Section(
-            n, before.rms, before.peak, after.rms, after.mean, after.peak, claim.rms
-        )
+        found[name] = _section(raw, residual, claimed, rows)
     return found
+
+
+def by_force(windows: Windows, claimed: Floats) -> dict[float, Section]:
+    """Summarise the residuals by known |f| [m/s^2]; empty if it is gravity in all windows."""
+    if windows.is_usual.all():
+        return {}
+    order = np.argsort(windows.size, kind='stable')
+    steps = np.flatnonzero(windows.size[order][1:] > _NEXT_LEVEL * windows.size[order][:-1]) + 1
+    values = windows.raw_residual, windows.residual, claimed
+    levels = np.split(order, steps)
+    return {float(windows.size[rows].mean()): _section(*values, rows) for rows in levels}
+
+
+def _section(raw: Floats, residual: Floats, claimed: Floats, rows: Bools | Ints) -> Section:
+    before, after, claim = (
+        residual_statistics(one[rows].ravel()) for one in (raw, residual, claimed)
+    )
+    n = after.n // max(1, residual[:1].size)
+    return Section(n, before.rms, before.peak, after.rms, after.mean, after.peak, claim.rms)
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,8 @@ from ..unit.metrics import norm_residual
 WINDOW_S = 60.0
 # Distance outside a calibrated range that still counts as inside, in half ranges: noise.
 _EDGE = 0.02
+# |f| that differs from gravity by a smaller part than this is gravity.
+_USUAL = 0.01
 # Smallest number of samples of a partial sum / median number.
 _LEAST_FILLED = 0.9
 
@@ -45,8 +47,9 @@ class Windows:
     through all bags. `rate` is the board's [K/s]. `is_dynamic`: the dynamic set has more than half
     the weight; `is_inside`: entirely inside the calibrated ranges; `is_swapped`: the board leads
     the case. `raw` is the specific force by the constants at the reference temperature, `force`
-    by the calibration, shapes (n, 3). `claimed_sd` of the norm of `force`: the calibration's error
-    and the white noise of the mean; `noise_sd`: the white noise alone. Rows of `gyro`: angular
+    by the calibration, shapes (n, 3). `size`: |f| as known, gravity unless the bag states another.
+    `claimed_sd` of the norm of `force`: the calibration's error, that of `size`, and the white
+    noise of the mean; `noise_sd`: the white noise alone. Rows of `gyro`: angular
     rate raw and corrected, its claimed variances, the thermal state; empty without a gyroscope.
     """
 
@@ -65,6 +68,7 @@ class Windows:
     is_swapped: Bools
     raw: Floats
     force: Floats
+    size: Floats
     claimed_sd: Floats
     noise_sd: Floats
     gyro: Floats
@@ -80,13 +84,18 @@ class Windows:
 
     @cached_property
     def raw_residual(self) -> Floats:
-        """``|f| - g`` by the constants alone, shape (n,)."""
-        return norm_residual(self.raw, self.gravity)
+        """``|f| - g`` by the constants alone, or less the known |f|, shape (n,)."""
+        return norm_residual(self.raw, self.size)
 
     @cached_property
     def residual(self) -> Floats:
-        """``|f| - g`` by the calibration, shape (n,)."""
-        return norm_residual(self.force, self.gravity)
+        """``|f| - g`` by the calibration, or less the known |f|, shape (n,)."""
+        return norm_residual(self.force, self.size)
+
+    @property
+    def is_usual(self) -> Bools:
+        """Whether |f| is gravity."""
+        return np.asarray(np.abs(self.size / self.gravity - 1.0) < _USUAL)
 
 
 def sum_length(window_s: float) -> float:
@@ -111,10 +120,12 @@ def corrected_windows(
     Build the windows of bags, corrected if there is a calibration; RecordingError if the samples
     are too slow for windows of this length.
     """
-    table = _table(bags, calibration, window_s)
-    raw, claimed_sd, noise_sd = table['mean'], *np.full((2, len(table)), np.nan)
     if calibration is not None:
         gravity = calibration.gravity_m_s2 if gravity is None else gravity
+    gravity = np.nan if gravity is None else gravity
+    table = _table(bags, calibration, window_s, gravity)
+    raw, claimed_sd, noise_sd = table['mean'], *np.full((2, len(table)), np.nan)
+    if calibration is not None:
         constants, force = constants_of(calibration), table['force']
         raw = constants.force(raw)
         along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
@@ -122,18 +133,22 @@ def corrected_windows(
         # The converter carries the rounding error to the next sample, so a mean has none.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
         mean_white = white / (calibration.unit.cycle_time_s * table['count'])
-        claimed_sd = np.sqrt(np.maximum(table['variance'] - noise, 0.0) + mean_white)
+        variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
+        claimed_sd = np.sqrt(variance + table['size_sd'] ** 2)
         noise_sd = np.sqrt(mean_white)
     return Windows(
         window_s=window_s,
-        gravity=np.nan if gravity is None else gravity,
+        gravity=gravity,
         is_dynamic=table['weight'] > 0.5,
-        is_inside=table['excess'] <= _EDGE,
+        is_inside=(table['excess'] <= _EDGE) & _is_seen(calibration, table['size'], gravity),
         is_swapped=table['swapped'] > 0.0,
         raw=raw,
         claimed_sd=claimed_sd,
         noise_sd=noise_sd,
-        **{name: table[name] for name in (*_ONCE, 'time', 'board', 'rate', *_TRIPLES, 'gyro')},
+        **{
+            name: table[name]
+            for name in (*_ONCE, 'time', 'board', 'rate', 'size', *_TRIPLES, 'gyro')
+        },
     )
 
 
@@ -152,6 +167,7 @@ def columns_of(windows: Windows, bags: Sequence[str]) -> dict[str, npt.NDArray[A
         'regime': np.where(windows.is_dynamic, 'dynamic', 'static'),
         'is_inside': windows.is_inside.astype(int),
         **{f'force_{axis}_m_s2': force[k] for k, axis in enumerate(AXES)},
+        'known_force_m_s2': windows.size,
         'raw_residual_ug': windows.raw_residual / MICRO_G,
         'residual_ug': windows.residual / MICRO_G,
         'claimed_sd_ug': windows.claimed_sd / MICRO_G,
@@ -172,11 +188,22 @@ def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floa
 _Table: TypeAlias = npt.NDArray[Any]
 # Fields that a window has once; the others except `excess` are averaged over its sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
-_AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped')
+_AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')
 _TRIPLES = ('mean', 'force')
 
 
-def _table(bags: Sequence[ReducedBag], calibration: Calibration | None, window_s: float) -> _Table:
+def _is_seen(calibration: Calibration | None, size: Floats, gravity: float) -> Bools:
+    """Whether the calibration holds at each |f|."""
+    if calibration is None:
+        return np.ones(len(size), dtype=bool)
+    known = calibration.nonlinearity
+    most = known.force_range_m_s2[1] if known else (1.0 + _USUAL) * gravity
+    return np.asarray(size <= most)
+
+
+def _table(
+    bags: Sequence[ReducedBag], calibration: Calibration | None, window_s: float, gravity: float
+) -> _Table:
     """Combine the partial sums of bags into windows, one per row."""
     n_gyro = 0
     if calibration is not None and calibration.gyroscope is not None:
@@ -206,6 +233,12 @@ def _table(bags: Sequence[ReducedBag], calibration: Calibration | None, window_s
             own['start_ns'] = bag.start_ns + np.rint(begin_s * 1e9).astype(np.int64)
             own['count'], own['time'], own['mean'] = one.count[:n], one.time[:n], one.mean[:n]
             own['gyro'] = np.nan
+            own['size'] = gravity
+            if (known := bag.source.force) is not None:
+                first_ns = bag.start_ns - round(bag.since_s * 1e9)
+                size = known.of(one.start_ns, one.end_ns, first_ns)
+                own['size'] = size.norm(gravity)
+                own['size_sd'] = np.hypot(size.sd, known.radius_part(size, gravity))
             if n_gyro and one.angular_rate is not None:
                 own['gyro'][:, :3] = one.angular_rate[:n]
             sums.append(own)

@@ -30,6 +30,8 @@ STILL_SD = 0.05
 # its level [rad/s]; the level drifts with temperature and is averaged over this time [s].
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
+# In a rotation the rate is compared with its median over this time [s].
+_ROTATION_S = 10.0
 # Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
 _STEP_SDS = 8.0
 # Number of steps whose median is the drift, and the largest drift [g/s].
@@ -280,6 +282,19 @@ def still_intervals(
         for start, stop in zip(edges[::2], edges[1::2], strict=True)
         if stop - start >= min_cells
     ]
+
+
+def without_rotation(cells: Cells) -> Cells:
+    """
+    Take from the angular rate of each cell the median of the last cells: in a constant rotation a
+    unit rests, while its rate changes it does not.
+    """
+    n = max(1, round(_ROTATION_S / cells.cell_s)) if cells.cell_s else 1
+    if len(cells.rate) <= n or not cells.rate.any():
+        return cells
+    around = np.concatenate((np.repeat(cells.rate[:1], n - 1, axis=0), cells.rate))
+    level = np.median(sliding_window_view(around, n, axis=0), axis=-1)
+    return replace(cells, rate=cells.rate - level)
 
 
 def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:

@@ -13,7 +13,7 @@ from ..judging.verdicts import Verdict
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G
-from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states
+from ..unit.prediction import bias_and_scale, in_a_soak, nonlinear_coefficients, ramp_states
 from .evidence import Evidence
 from .html import minus, number, rounded
 from .statements import CertificateInfo
@@ -150,6 +150,11 @@ def results(
         for name, (parts, values, sds, of) in said.items()
         for part, value, sd in zip(parts, values, sds, strict=True)
     ]
+    for term in nonlinear_coefficients(calibration):
+        found += [
+            Result(f'{term.name} {axis}', *rounded(value, known * sd), term.unit)
+            for axis, value, sd in zip(AXES, term.value.tolist(), term.sd.tolist(), strict=True)
+        ]
     if contributions and evidence.judgement is not None:
         expanded_ug = COVERAGE * combined(contributions) / MICRO_G
         for name in ('static', 'dynamic'):

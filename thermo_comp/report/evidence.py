@@ -141,9 +141,10 @@ class Evidence:
     @cached_property
     def residuals(self) -> dict[str, Floats]:
         """``|f| - g`` of each of `forces` [m/s^2]; empty without gravity."""
-        if self.gravity is None:
+        if self.gravity is None or self.windows is None:
             return {}
-        return {name: norm_residual(force, self.gravity) for name, force in self.forces.items()}
+        sizes = self.windows.size
+        return {name: norm_residual(force, sizes) for name, force in self.forces.items()}
 
     @cached_property
     def least_known(self) -> LeastKnown | None:
@@ -189,7 +190,8 @@ class Evidence:
         if windows is None or self.gravity is None or not self.positions:
             return {}
         _, place = np.unique(windows.position, return_inverse=True)
-        true = np.array([position.up for position in self.positions])[place] * self.gravity
+        true = np.array([position.up for position in self.positions])[place]
+        true *= windows.size[:, np.newaxis]
         return {name: force - true for name, force in self.forces.items()}
 
 

@@ -1,0 +1,237 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the statement of |f| for a bag that is not at 1 g: one value, a table of sections, or a
+rotation rate with a radius; given by the user, or in the bag's metadata.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import FitError, ThermoCompError
+from ..files import read_bounded
+from ..recording.blocks import NO_STAMP_NS, RecordingInfo
+from ..recording.fields import Field, definitions_of
+from ..recording.reader import open_recording
+from ..recording.topics import is_called, split_field
+from ..typing import Floats, Ints
+from ..unit.gravity import parse_acceleration
+
+#: Keys of a bag's metadata.
+MAGNITUDE, ROTATION = 'specific_force_magnitude_m_s2', 'rotation_topic'
+RADIUS, RADIUS_SD = 'rotation_radius_m', 'rotation_radius_sd_m'
+#: Largest table of sections [bytes].
+_LARGEST_TABLE = 1 << 20
+#: Largest believable |f| [m/s^2]: a gun.
+_LARGEST = 1e7
+#: Smallest number of rate readings in a rest.
+_FEWEST_RATES = 3
+_EVER_S = math.inf
+
+
+class Section(NamedTuple):
+    """A part of a bag, in seconds since its first sample, with |f| and its sd [m/s^2]."""
+
+    begin_s: float
+    end_s: float
+    size: float
+    sd: float
+
+
+class Magnitude(NamedTuple):
+    """
+    |f| of a rest: that without rotation (None: gravity), w^2 r at the radius as given, and the sd
+    of |f| without that of the radius [m/s^2].
+    """
+
+    still: float | None
+    spin: float = 0.0
+    sd: float = 0.0
+
+    def norm(self, gravity: float) -> float:
+        """Return |f| at the radius as given [m/s^2]."""
+        return math.hypot(gravity if self.still is None else self.still, self.spin)
+
+
+@dataclass(frozen=True)
+class KnownForce:
+    """
+    |f| of a bag over time; outside the sections the unit is at 1 g.
+
+    stamp_ns, rate: readings of the rotation rate [rad/s], about a vertical axis
+    radius, radius_sd: distance of the unit from the axis [m]; a sd above 0: the fit estimates it
+    """
+
+    name: str
+    sections: tuple[Section, ...] = ()
+    stamp_ns: Ints | None = None
+    rate: Floats | None = None
+    radius: float = 0.0
+    radius_sd: float = 0.0
+
+    def radius_part(self, size: Magnitude, gravity: float) -> float:
+        """Return the sd of |f| that comes from the radius [m/s^2]."""
+        if not self.radius:
+            return 0.0
+        return size.spin**2 / size.norm(gravity) * self.radius_sd / self.radius
+
+    def of(self, start_ns: int, end_ns: int, first_ns: int) -> Magnitude:
+        """Return |f| of a rest, from its stamps and that of the bag's first sample."""
+        if self.stamp_ns is None or self.rate is None:
+            middle_s = (0.5 * (start_ns + end_ns) - first_ns) * 1e-9
+            for one in self.sections:
+                if one.begin_s <= middle_s < one.end_s:
+                    return Magnitude(one.size, sd=one.sd)
+            return Magnitude(None)
+        inside = (self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns)
+        n = int(inside.sum())
+        if n < _FEWEST_RATES:
+            since_s = (start_ns - first_ns) * 1e-9
+            raise FitError(
+                f'{self.name}: {n} readings of the rotation rate in the rest that begins at '
+                f'{since_s:.1f} s, need {_FEWEST_RATES}'
+            )
+        spin = self.rate[inside] ** 2 * self.radius
+        mean, sd = float(spin.mean()), float(spin.std(ddof=1)) / math.sqrt(len(spin))
+        # |f|^2 = g^2 + spin^2; near 1 g the error of the rate matters less.
+        return Magnitude(None, mean, sd * mean / math.hypot(mean, 9.8))
+
+
+@dataclass(frozen=True)
+class AskedForce:
+    """
+    What the user says of |f|: `magnitude` a value with unit or the path of a table, `rotation` the
+    topic of the rate, as TOPIC or TOPIC:FIELD, with the radius and its sd [m].
+    """
+
+    magnitude: str | None = None
+    rotation: str | None = None
+    radius: float | None = None
+    radius_sd: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.rotation is not None and (self.radius is None or self.magnitude is not None):
+            raise ValueError('a rotation topic needs a radius, and no other specific force')
+
+
+#: Nothing beside the bags' metadata.
+USUAL_FORCE = AskedForce()
+
+
+def known_force(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForce | None:
+    """
+    Find what is known of |f| in a bag, from the user or else from its metadata; None: gravity.
+
+    Raises FitError if it cannot be understood, or the topic of the rate has no messages.
+    """
+    said = info.metadata
+    try:
+        if asked.magnitude is not None:
+            sections = _asked_sections(asked.magnitude, path)
+            return KnownForce(str(path), sections) if sections else None
+        if asked.rotation is not None:
+            return _rotating(path, info, asked)
+        if ROTATION in said:
+            radius, sd = float(said.get(RADIUS, 'nan')), float(said.get(RADIUS_SD, '0'))
+            if not (0.0 < radius < math.inf and 0.0 <= sd < math.inf):
+                raise ValueError(f'metadata with {ROTATION} need a positive {RADIUS}')
+            return _rotating(path, info, AskedForce(None, said[ROTATION], radius, sd))
+        if MAGNITUDE in said:
+            return KnownForce(str(path), parse_sections(said[MAGNITUDE]))
+    except ValueError as mistake:
+        raise FitError(f'{path}: {mistake}') from mistake
+    return None
+
+
+def parse_sections(text: str) -> tuple[Section, ...]:
+    """
+    Read a magnitude [m/s^2], or lines of ``BEGIN END MAGNITUDE [SD]``, in seconds since the first
+    sample and m/s^2. A semicolon ends a line, too; what follows a # is a comment.
+    """
+    lines = [
+        one.split('#')[0].replace(',', ' ').split() for one in text.replace(';', '\n').split('\n')
+    ]
+    rows = [_numbers(line) for line in lines if line]
+    if len(rows) == 1 and len(rows[0]) < 3:
+        return (_section(0.0, _EVER_S, *rows[0]),)
+    if not rows or not all(len(row) in (3, 4) for row in rows):
+        raise ValueError(
+            'the specific force must be one number in m/s^2, or lines of BEGIN END MAGNITUDE [SD] '
+            'in s and m/s^2'
+        )
+    return tuple(_section(*row) for row in rows)
+
+
+def _section(begin_s: float, end_s: float, size: float, sd: float = 0.0) -> Section:
+    if not begin_s < end_s:
+        raise ValueError(f'a section must end after its begin {begin_s:g} s, got {end_s:g} s')
+    if not (0.0 < size < _LARGEST and 0.0 <= sd < size):
+        raise ValueError(
+            f'a specific force must be above 0 with a smaller sd, got {size:g} +- {sd:g} m/s^2'
+        )
+    return Section(begin_s, end_s, size, sd)
+
+
+def _numbers(words: list[str]) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise ValueError(f'expected numbers, got {" ".join(words)[:60]!r}') from error
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f'expected finite numbers, got {" ".join(words)[:60]!r}')
+    return values
+
+
+def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
+    """Read a value with unit, or the table of a file, whose lines may begin with a bag's name."""
+    table = Path(text)
+    if not table.is_file():
+        return (_section(0.0, _EVER_S, parse_acceleration(text)),)
+    try:
+        content = read_bounded(table, _LARGEST_TABLE).decode('utf-8')
+    except (OSError, ValueError) as error:
+        raise ThermoCompError(f'cannot be read: {error}', table) from error
+    mine: list[str] = []
+    for line in content.splitlines():
+        first, _, rest = line.strip().replace(',', ' ').partition(' ')
+        is_named = bool(first) and first[0] != '#' and not first[0].isdigit() and first[0] != '.'
+        if not is_named:
+            mine.append(line)
+        elif fnmatch(path.name, first):
+            mine.append(rest)
+    if not any(one.split('#')[0].strip() for one in mine):
+        return ()
+    try:
+        return parse_sections('\n'.join(mine))
+    except ValueError as mistake:
+        raise ThermoCompError(str(mistake), table) from mistake
+
+
+def _rotating(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForce:
+    """Read the rotation rate of a bag."""
+    wanted, field = split_field(asked.rotation or '')
+    names = [name for name in info.topics if is_called(name, wanted)]
+    if len(names) != 1:
+        raise ValueError(f'{len(names)} topics are called {wanted}, expected one with the rate')
+    stamps, rates = [np.empty(0, np.int64)], [np.empty(0)]
+    with open_recording(path, require=()) as reader:
+        kind = info.topics[names[0]][0]
+        path_in = field or {'geometry_msgs/msg/Vector3Stamped': 'vector.z'}.get(kind, 'data')
+        number = Field(kind, path_in, definitions_of(kind, reader.definitions))
+        for _, messages in reader.raw([names[0]]):
+            stamp_ns, rate = number.read(messages)
+            stamps.append(np.where(stamp_ns == NO_STAMP_NS, messages.log_ns, stamp_ns))
+            rates.append(rate)
+    stamp_ns, rate = np.concatenate(stamps), np.concatenate(rates)
+    if not len(rate) or not np.isfinite(rate).all():
+        raise ValueError(f'{names[0]} has no messages, or a rate that is not finite')
+    return KnownForce(
+        *(str(path), (), stamp_ns, rate), *(asked.radius or 0.0, asked.radius_sd or 0.0)
+    )
