@@ -251,8 +251,11 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
             of_file(regression, terms, options),
         )
         rates: tuple[RateRow, ...] = ()
-        if not is_beyond(windows):
+        if known is not None or not is_beyond(windows):
             calibration, rates = add_gyroscope(calibration, windows, bags, options)
+        elif windows.angular_rate.shape[1]:
+            text = 'the unit rotated in some rests, so no gyroscope was fitted'
+            findings.append(Finding('rate', 'advice', text))
     except ValueError as error:
         if 'misalignment' in str(error):
             raise FitError(
