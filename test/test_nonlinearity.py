@@ -11,9 +11,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders import calibration, columns_from_events, rich_calibration
+from field_helpers import any_way, rests
 from test_correction import UNCHECKED, assert_same, run_of, stream
 
 from thermo_comp.errors import CalibrationError
+from thermo_comp.field.series import series_of
+from thermo_comp.fitting.assembly import parameters_of, with_parameters
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.thermal.state import BOARD, Layout
@@ -152,3 +155,20 @@ def test_a_file_keeps_the_terms_and_refuses_those_that_no_axis_has():
         assert said in str(caught.value)
     with pytest.raises(ValueError, match='each once, in this order'):
         replace(BENT, terms=(CUBE, SQUARE))
+
+
+def test_rests_in_the_field_feel_every_coefficient():
+    # The second route is a difference of two evaluations.
+    unit = with_covariance(calibration(nonlinearity=BENT), np.random.default_rng(1))
+    found = rests(unit, any_way, lambda _days: np.zeros(3), days=1, rate=0.5 / 60.0)
+    series = series_of(found, unit)
+    values, scale, step = parameters_of(unit), np.full(3, 300.0), 1e-7
+    layout, covariance = parameter_layout(unit), unit.posterior.covariance()
+    assert (series.claim > 0.0).all()
+    for k in range(layout.nonlinear, layout.misalignment):
+        moved = with_parameters(
+            unit, scale, values + step * (np.arange(len(values)) == k), covariance
+        )
+        slope = (series.miss - series_of(found, moved).miss) / step
+        # The derivative of the correction itself, 2 K2 of 1 g, is left out.
+        assert np.allclose(slope, series.by_parameter[:, k], atol=1e-3 * abs(slope).max() + 1e-7)

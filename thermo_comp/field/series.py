@@ -213,6 +213,8 @@ def series_of(
     shares, local = averaged(shares.reshape(len(rests), n_lags)), averaged(local)
     bias, scale = (one.T for one in correction.bias_scale(states.T))
     x = (mean - bias) / scale
+    if correction.of_force is not None:
+        x = correction.of_force.linearise(x, states[:, BOARD])
     M = np.array(calibration.misalignment)
     force = x @ M.T
     size = np.sqrt((force**2).sum(axis=1))
@@ -298,8 +300,12 @@ def _along(
     )
     columns = states.T
     line = correction.line(columns, columns, parts.T, np.zeros(len(states)))
-    a, b, c = np.moveaxis(line[12:].reshape(3, 3, -1), 1, 0)
-    return np.asarray((v.T**2 * (a + x.T * (b + x.T * c))).sum(axis=0))
+    a, b, c = np.moveaxis(line[12:21].reshape(3, 3, -1), 1, 0)
+    higher: Floats = np.zeros_like(x.T)
+    if correction.of_force is not None:
+        for row in np.moveaxis(line[21:].reshape(3, 7, -1)[:, 3:], 1, 0)[::-1]:
+            higher = x.T * (row + higher)
+    return np.asarray((v.T**2 * (a + x.T * (b + x.T * (c + higher)))).sum(axis=0))
 
 
 def _by_parameter(
@@ -319,6 +325,10 @@ def _by_parameter(
         blocks = (layout.bias[axis], on_bias), (layout.scale[axis], on_bias * K * x[:, [axis]])
         for k, (block, factor) in enumerate(blocks):
             result[:, block.static : block.end] = regressors[axis + 3 * k].T * factor
+    if correction.of_force is not None:
+        by_term = v[:, :, np.newaxis] * correction.of_force.regressors(x, columns[BOARD])
+        places = slice(layout.nonlinear, layout.misalignment)
+        result[:, places] = by_term.reshape(len(x), -1)
     by_tilt = (u[:, 1] * x[:, 0], u[:, 2] * x[:, 0], u[:, 2] * x[:, 1])
     result[:, layout.misalignment :] = -np.transpose(by_tilt)
     return result

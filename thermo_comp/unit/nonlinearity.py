@@ -114,11 +114,6 @@ def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     return x - x * s * d / (d * d - s * (s + r + r))
 
 
-def bent(f: Floats, k2: Floats, kq: Floats, k3: Floats) -> Floats:
-    """Evaluate the terms at specific forces: what the reading has beside f."""
-    return np.asarray(f * (k2 * f + kq * np.abs(f) + k3 * f * f))
-
-
 def corrected_nonlinear(
     line: Iterable[Real], constants: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
@@ -181,6 +176,19 @@ class ForceCorrection:
     def held(self, board: Floats) -> Floats:
         """Return board temperatures less the reference, held at the calibrated range's edges."""
         return hold(board, *self._span) - self._reference
+
+    def linearise(self, x: Floats, board: Floats) -> Floats:
+        """Take the terms from readings of the axes, shape (n, 3), at board temperatures (n,)."""
+        k2, kq, k3 = self._of.coefficients(self.held(board))
+        return np.asarray(linearised(x.T, k2, kq, k3).T)
+
+    def regressors(self, force: Floats, board: Floats) -> Floats:
+        """Differentiate the readings by the coefficients in the file's order, (n, 3, 2 k)."""
+        size = np.abs(force)
+        each = {'square': force**2, 'odd_square': size * force, 'cube': force**3}
+        values = [each[one.kind] / unit_of(one.kind) for one in self._of.terms]
+        both = [*values, *(self.held(board)[:, np.newaxis] * one for one in values)]
+        return np.stack(both, axis=2) if both else np.zeros((*force.shape, 0))
 
     def rows(self, board: Floats, slow: Floats) -> Floats:
         """
