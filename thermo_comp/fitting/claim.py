@@ -29,7 +29,7 @@ from .selection import LAGS, Selected
 from .unknowns import Layout, Prior
 
 # Standard deviations of the mounting over the scale of their prior: what evidence can tell apart.
-_MOUNTINGS = 10.0 ** np.arange(-3.0, 1.51, 0.25)
+_MOUNTINGS = 10.0 ** np.arange(-2.0, 1.51, 0.25)
 # Noises of a window that an unseen column may add before it counts.
 _OPEN = 4.0
 # A column stands still if it moves by less than this share of the temperature's own change.
