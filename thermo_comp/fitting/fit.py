@@ -30,6 +30,7 @@ from .beginning import first_guess, regress
 from .claim import claim_of
 from .coverage import LeastKnown, least_known, rough_centre
 from .data_checks import Finding, enforce
+from .environments import agree_better, bag_at_odds, with_doubt
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
@@ -115,10 +116,12 @@ def _fit_about_offset(
 ) -> FitResult:
     offset = find_offset(bags, options)
     if not offset.any():
-        return _fit(bags, options, progress)
+        return _fit_alike(bags, options, progress)
     note = f'no force reads {" ".join(f"{word:g}" for word in offset)}: words with an offset'
     known = options.prior and about(options.prior, -offset)
-    found = _fit([centred(bag, offset) for bag in bags], replace(options, prior=known), progress)
+    found = _fit_alike(
+        [centred(bag, offset) for bag in bags], replace(options, prior=known), progress
+    )
     return replace(
         found,
         calibration=with_notes(about(found.calibration, offset), [f'offset: {note}']),
@@ -174,6 +177,25 @@ def with_notes(calibration: Calibration, notes: Sequence[str]) -> Calibration:
     """Add notes to a calibration's provenance."""
     provenance = calibration.provenance
     return replace(calibration, provenance=replace(provenance, notes=(*provenance.notes, *notes)))
+
+
+def _fit_alike(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:
+    """Fit the bags, but for one that contradicts all others."""
+    whole = _fit(bags, options, tell)
+    at_odds = None if options.prior else bag_at_odds(whole.windows, whole.selected)
+    if at_odds is None:
+        return whole
+    rest = _fit([bag for k, bag in enumerate(bags) if k != at_odds], options, tell)
+    pair = (whole.windows, whole.selected), (rest.windows, rest.selected)
+    if not agree_better(*pair, at_odds):
+        return whole
+    calibration, finding = with_doubt(rest.calibration, *pair[1], bags[at_odds])
+    return replace(
+        rest,
+        calibration=with_notes(calibration, [f'{finding.name}: {finding.message}']),
+        findings=(*rest.findings, finding),
+        bags=tuple(bags),
+    )
 
 
 def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:

@@ -55,16 +55,16 @@ def _excess(regression: Regression, selected: Selected, claim: Claim) -> Excess:
     prior = selected.prior
     noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.ratio)
     square = selected.score.drift**2 - noise - _drift_variance(regression, selected, claim)
-    mine = _drift(regression, regression.force(selected.posterior.state))
+    mine = drift_of_positions(regression, regression.force(selected.posterior.state))
     others = np.zeros_like(mine)
     near = [one for one in selected.trials if one.is_near]
     for one in near:
-        away = _drift(regression, regression.force(one.posterior.state)) - mine
+        away = drift_of_positions(regression, regression.force(one.posterior.state)) - mine
         others = np.maximum(others, _SHARE_OF_OTHERS * away**2)
     return Excess(square, others)
 
 
-def _drift(regression: Equations, values: Floats) -> Floats:
+def drift_of_positions(regression: Equations, values: Floats) -> Floats:
     """Take the mean of its position from each window, shape (n, k)."""
     position = regression.windows.position
     first = np.searchsorted(position, np.arange(regression.windows.n_positions))
@@ -77,7 +77,7 @@ def _drift_variance(regression: Regression, selected: Selected, claim: Claim) ->
     state, layout = selected.posterior.state, claim.layout
     in_bias, in_scale = (np.flatnonzero(one) for one in layout.used)
     on_bias, on_scale = (
-        _drift(regression, regression.columns[:, one]) for one in (in_bias, in_scale)
+        drift_of_positions(regression, regression.columns[:, one]) for one in (in_bias, in_scale)
     )
     force = regression.along_axes(state)
     result = np.zeros((len(on_bias), 3))
