@@ -21,11 +21,13 @@ UPS = np.array(
 ) / 1.0  # fmt: skip
 
 
-def recording(up: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def recording(
+    up: np.ndarray, rng: np.random.Generator, slope: float | None = None
+) -> tuple[np.ndarray, ...]:
     """Simulate times, m/s^2 and board temperatures of two hours, 10 to 32 degC and back."""
     time_s = np.arange(0.0, 7200.0)
     board = np.interp(time_s, (0.0, 600.0, 3600.0, 7200.0), (10.0, 10.0, 32.0, 12.0))
-    bias = SLOPE * MICRO_G * np.maximum(board - KNEE_C, 0.0)
+    bias = (SLOPE if slope is None else slope) * MICRO_G * np.maximum(board - KNEE_C, 0.0)
     force = G * up / np.linalg.norm(up) + bias[:, None] * (1.0, -1.0, 0.5) + BIAS
     return time_s, force + NOISE * rng.standard_normal((len(time_s), 3)), board
 
@@ -82,3 +84,40 @@ def test_a_thermometer_on_two_topics_is_one() -> None:
     assert one.axes == two.axes
     assert any('temperature/case repeats' in note for note in two.provenance.notes)
     assert not any('repeats' in note for note in one.provenance.notes)
+
+
+def columns_of(slopes: list[float]) -> list[tc.Columns]:
+    """Record a position each, with the slopes given."""
+    rng = np.random.default_rng(10)
+    found = []
+    for k, (up, slope) in enumerate(zip(UPS, slopes, strict=False)):
+        time_s, force, board = recording(up, rng, slope)
+        found.append(tc.Columns(time_s, force, {'board': (time_s[::5], board[::5])}, name=f'r{k}'))
+    return found
+
+
+def sd_of_a_correction(unit: tc.Calibration) -> np.ndarray:
+    """Claimed sd of the axes at the end of a recording [ug]."""
+    time_s, force, board = recording(UPS[0], np.random.default_rng(11))
+    found = unit.correct(time_s, force, board=(time_s[::5], board[::5])).covariance[-1]
+    return np.sqrt(np.diag(found)) / MICRO_G
+
+
+def test_a_bag_of_another_environment_takes_no_part_and_is_claimed() -> None:
+    options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',), 'mounting_sd': 1e-7}
+    alone = tc.fit(columns_of([SLOPE] * 6), **options)
+    with_another = columns_of([SLOPE] * 6 + [6.0 * SLOPE])
+    joint = tc.fit(with_another, **options)
+    assert joint.axes == alone.axes
+    assert joint.static.x.bias_function == alone.static.x.bias_function
+    later = tc.fit(with_another[-1:], gravity=G, input='m/s^2', prior=alone)
+    assert later.axes == alone.axes
+    for unit in (joint, later):
+        (note,) = [one for one in unit.provenance.notes if one.startswith('environment: r6')]
+        assert 'took no part' in note
+        # The other bag is off by 5 times 20 ug/K over the 11 K above the knee, or half of it (z).
+        more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
+        assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 600.0
+    # One more bag of the same environment is no contradiction.
+    again = tc.fit(columns_of([SLOPE] * 7)[-1:], gravity=G, input='m/s^2', prior=alone)
+    assert not [one for one in again.provenance.notes if one.startswith('environment')]

@@ -21,12 +21,16 @@ from ..typing import Floats
 from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
 from .data_checks import Finding
-from .lack_of_fit import drift_of_positions
+from .lack_of_fit import drift_of_positions, drift_variance
 from .left_out import Score
+from .options import FitOptions
+from .priors import constants_of, informative_priors, prior_columns, prior_sets, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Selected
-from .windows import ThermalWindows, thermal_windows
+from .start import position_means
+from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State
+from .windows import Model, ThermalWindows, thermal_windows
 
 # Fewer bags have no majority that one of them could contradict.
 _FEWEST_BAGS = 4
@@ -35,6 +39,10 @@ _FEWEST_BAGS = 4
 _TIMES = 5.0
 # Without such a bag the mean square of the others' left-out drift falls at least by this factor.
 _LEAST_FACTOR = 2.0
+# Sd of the level of a bag [m/s^2]: 1 mg, more than a navigation sensor's turn-on.
+_LEVEL_SD = 1e-2
+# What the root of a precision is multiplied with, so that parameters stay where they are.
+_FIXED = 1e4
 
 
 def bag_at_odds(windows: ThermalWindows, selected: Selected) -> int | None:
@@ -68,20 +76,76 @@ def _square_of_bags(windows: ThermalWindows, score: Score) -> Floats:
     return np.where(total > 0.0, weighted / np.maximum(total, 1.0), np.nan)
 
 
+def bags_against(windows: ThermalWindows, known: Calibration, options: FitOptions) -> list[int]:
+    """
+    Find the bags whose drift contradicts a calibration of the same unit: with the unit's
+    parameters fixed, no start states and tilts of the bag explain it.
+    """
+    data = replace(windows.data, tilt=windows.data.tilt[:, :0])
+    constants = constants_of(known)
+    regression = Regression(data, options.gravity, constants.scale)
+    up = constants.force(position_means(data))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    state = _state_of(known, regression, up)
+    first = informative_priors(known, regression, state, windows.model.sets, options)[0]
+    # The noise of a window, as long as the calibration's typical ones.
+    window_s = windows.typical_count * known.unit.cycle_time_s
+    sigma = np.array(known.noise_density_m_s2_sqrt_hz) / np.sqrt(window_s)
+    prior = Prior(
+        bias_mean=state.bias,
+        bias_sd=np.full(3, BIAS_SD),
+        scale_sd=SCALE_SD,
+        misalignment_sd=MISALIGNMENT_SD,
+        column_sd=data.parts.astype(np.float64),
+        # The level may have moved by a turn-on or by ageing: only the drift is judged.
+        offset_sd=_LEVEL_SD,
+        sigma=np.maximum(sigma, 1e-9),
+        informative=replace(first, root=first.root * _FIXED),
+    )
+    found = regression.solve(state, prior, n_steps=4)
+
+    left = drift_of_positions(regression, regression.residual(found.state, found.layout))
+    inverse = np.linalg.inv(first.root)
+    claimed = drift_variance(regression, state, found.layout, inverse @ inverse.T)
+    lacks = [point.sd_m_s2 for one in known.regime_sets() for point in one.lack_of_fit]
+    lack = np.square(lacks).max(axis=0) if lacks else np.zeros(3)
+    share = np.sum(left**2, axis=1) / np.sum(claimed + prior.sigma**2 + lack, axis=1)
+    bag = data.bag
+    mean = np.bincount(bag, share) / np.maximum(np.bincount(bag), 1)
+    found_bags: list[int] = np.flatnonzero(mean > _TIMES**2).tolist()
+    return found_bags
+
+
+def _state_of(known: Calibration, regression: Regression, up: Floats) -> State:
+    constants = constants_of(known)
+    inverse = np.asarray(np.linalg.inv(constants.misalignment), dtype=np.float64)
+    begin = regression.initial_state(
+        constants.bias / constants.scale, inverse[[1, 2, 2], [0, 0, 1]], up
+    )
+    return with_calibration(known, regression, begin)
+
+
 def with_doubt(
-    calibration: Calibration, windows: ThermalWindows, selected: Selected, bag: ReducedBag
+    calibration: Calibration, bags: Sequence[ReducedBag], others: str
 ) -> tuple[Calibration, Finding]:
     """
-    Add the error of the correction of a bag that took no part to the lack of fit of both sets;
-    `windows` and `selected` are of the fit without it.
+    Add the error of the correction of bags that took no part to the lack of fit of both sets;
+    `others` says what the bags contradict.
     """
-    state = selected.posterior.state
-    scale = np.array([axis.scale_factor for axis in calibration.axes]) / state.kappa
-    alone = thermal_windows([bag], windows.model)
-    regression = Regression(alone.data, calibration.gravity_m_s2, scale)
-    # The weights of columns are in units of the RMS that these had in the fit.
-    rms = np.sqrt(np.mean(windows.data.columns**2, axis=0))
-    regression.columns = alone.data.columns / np.where(rms > 0.0, rms, 1.0)
+    model = Model(
+        calibration.provenance.model,
+        prior_sets(calibration),
+        prior_columns(calibration),
+        calibration.sensors,
+        calibration.detector,
+        calibration.reference_temperature_c,
+    )
+    alone = thermal_windows(bags, model)
+    constants = constants_of(calibration)
+    regression = Regression(alone.data, calibration.gravity_m_s2, constants.scale)
+    up = constants.force(position_means(alone.data))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    state = _state_of(calibration, regression, up)
     drift = drift_of_positions(regression, regression.force(state))
     is_dynamic = alone.weight > 0.5
     sets = []
@@ -89,15 +153,14 @@ def with_doubt(
         square = np.mean(drift[rows if rows.any() else slice(None)] ** 2, axis=0)
         sets.append(_doubted(one, square))
     static, dynamic = sets
-    rms_of_bag = float(np.sqrt(np.mean(drift**2)))
-    name = one_line(bag.source.name)
+    rms = float(np.sqrt(np.mean(drift**2))) / MICRO_G
+    names = ', '.join(one_line(bag.source.name) for bag in bags)
     finding = Finding(
         'environment',
         'advice',
-        f'{name} contradicts the other bags: their correction leaves a drift of '
-        f'{rms_of_bag / MICRO_G:.0f} ug in it. It took no part in the fit, and the claim '
-        'includes this error. Was it recorded in another environment, with the fan off or '
-        'mounted elsewhere? Then give that environment a calibration of its own',
+        f'{names}: the correction by {others} leaves a drift of {rms:.0f} ug. The recording took '
+        'no part in the fit, and the claim includes this error. Another environment, with the '
+        'fan off or mounted elsewhere, needs a calibration of its own',
     )
     return replace(calibration, static=static, dynamic=dynamic), finding
 

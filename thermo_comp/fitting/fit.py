@@ -30,7 +30,7 @@ from .beginning import first_guess, regress
 from .claim import claim_of
 from .coverage import LeastKnown, least_known, rough_centre
 from .data_checks import Finding, enforce
-from .environments import agree_better, bag_at_odds, with_doubt
+from .environments import agree_better, bag_at_odds, bags_against, with_doubt
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
@@ -180,16 +180,34 @@ def with_notes(calibration: Calibration, notes: Sequence[str]) -> Calibration:
 
 
 def _fit_alike(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:
-    """Fit the bags, but for one that contradicts all others."""
+    """Fit the bags, but for those of another environment: see `environments`."""
     whole = _fit(bags, options, tell)
-    at_odds = None if options.prior else bag_at_odds(whole.windows, whole.selected)
-    if at_odds is None:
+    known = options.prior
+    if known is None:
+        bag = bag_at_odds(whole.windows, whole.selected)
+        gone = [] if bag is None else [bag]
+    elif known.unit.serial == whole.calibration.unit.serial and not whole.windows.data.forces:
+        gone = bags_against(whole.windows, known, options)
+    else:
+        gone = []
+    if not gone:
         return whole
-    rest = _fit([bag for k, bag in enumerate(bags) if k != at_odds], options, tell)
-    pair = (whole.windows, whole.selected), (rest.windows, rest.selected)
-    if not agree_better(*pair, at_odds):
-        return whole
-    calibration, finding = with_doubt(rest.calibration, *pair[1], bags[at_odds])
+    kept = [bag for k, bag in enumerate(bags) if k not in gone]
+    rest = whole
+    if kept:
+        rest = _fit(kept, options, tell)
+        pair = (whole.windows, whole.selected), (rest.windows, rest.selected)
+        if known is None and not agree_better(*pair, gone[0]):
+            return whole
+    elif known is not None:
+        # Nothing is left that could update the prior.
+        provenance = whole.calibration.provenance
+        rest = replace(whole, calibration=replace(known, provenance=provenance))
+    calibration, finding = with_doubt(
+        rest.calibration,
+        [bags[k] for k in gone],
+        'the other bags' if known is None else 'the prior',
+    )
     return replace(
         rest,
         calibration=with_notes(calibration, [f'{finding.name}: {finding.message}']),

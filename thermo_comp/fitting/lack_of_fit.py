@@ -20,6 +20,7 @@ from .claim import Claim
 from .equations import Equations
 from .regression import Regression
 from .selection import Selected
+from .unknowns import Layout, State
 from .windows import ThermalWindows
 
 # Temperatures at which the lack of fit of a regime is told, at most.
@@ -54,7 +55,8 @@ def lack_of_fit(
 def _excess(regression: Regression, selected: Selected, claim: Claim) -> Excess:
     prior = selected.prior
     noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.ratio)
-    square = selected.score.drift**2 - noise - _drift_variance(regression, selected, claim)
+    claimed = drift_variance(regression, selected.posterior.state, claim.layout, claim.covariance)
+    square = selected.score.drift**2 - noise - claimed
     mine = drift_of_positions(regression, regression.force(selected.posterior.state))
     others = np.zeros_like(mine)
     near = [one for one in selected.trials if one.is_near]
@@ -72,9 +74,10 @@ def drift_of_positions(regression: Equations, values: Floats) -> Floats:
     return np.asarray(values - (np.add.reduceat(values, first, axis=0) / count)[position])
 
 
-def _drift_variance(regression: Regression, selected: Selected, claim: Claim) -> Floats:
+def drift_variance(
+    regression: Regression, state: State, layout: Layout, covariance: Floats
+) -> Floats:
     """Variance that the unit's covariance claims of the drift of each window, shape (n, 3)."""
-    state, layout = selected.posterior.state, claim.layout
     in_bias, in_scale = (np.flatnonzero(one) for one in layout.used)
     on_bias, on_scale = (
         drift_of_positions(regression, regression.columns[:, one]) for one in (in_bias, in_scale)
@@ -85,7 +88,7 @@ def _drift_variance(regression: Regression, selected: Selected, claim: Claim) ->
         a = force[regression.windows.position, axis][:, None]
         along = np.hstack((on_bias, a * on_scale))
         at = layout.axis[axis, 2 : 2 + along.shape[1]]
-        result[:, axis] = np.sum((along @ claim.covariance[np.ix_(at, at)]) * along, axis=1)
+        result[:, axis] = np.sum((along @ covariance[np.ix_(at, at)]) * along, axis=1)
     return result
 
 
