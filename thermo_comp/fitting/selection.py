@@ -49,6 +49,8 @@ _NOISE_STEP, _NOISE_ROUNDS = 3.0, 2
 _LEAST_GAIN = 1.0
 # Logarithms of mean squares that differ by less than this are equal: 5 % of an RMS.
 _EQUAL = 0.1
+# The RMS error of the two halves may rise by this factor: two folds scatter by a quarter.
+_MOST_BY_HALVES = 1.25
 # Norms of left-out positions alone decide for a group if they gain so many standard errors.
 _SURE_ERRORS = 2.0
 
@@ -360,8 +362,8 @@ def _gain(before: Score, after: Score) -> float:
     """
     positions, sections, norms = _gains(before, after)
     drift = [one for one in (positions, sections) if one]
-    halves = before.halves.gain_of(after.halves)
-    if (norms and norms[0] < -norms[1]) or (halves and halves[0] < 0.0):
+    is_worse_by_halves = after.halves.rms > _MOST_BY_HALVES * before.halves.rms
+    if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
         return 0.0
     total = sum(gain for gain, _ in drift)
     if total > _EQUAL * len(drift) and all(gain > error for gain, error in drift):
