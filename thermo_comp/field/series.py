@@ -161,7 +161,9 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
 
     The begin is the last rest of an update, else the date of the file, or -inf without a date.
     """
-    names = [one.name for one in calibration.provenance.sources if one.name.startswith(_UNTIL)]
+    names = [
+        source.name for source in calibration.provenance.sources if source.name.startswith(_UNTIL)
+    ]
     text = names[-1].removeprefix(_UNTIL) if names else calibration.provenance.created
     date, _, aged = text.partition(_AGED)
     try:

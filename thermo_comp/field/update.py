@@ -135,7 +135,7 @@ def update(
     # Parameters that are not updated have the omitted shift as an additional error.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
-    axis_determined = [one.is_determined for one in moved]
+    axis_determined = [change.is_determined for change in moved]
     new = _shifted(calibration, shift, covariance)
     residuals = ResidualSummary(
         f'left-out {judged.over}',
@@ -296,7 +296,7 @@ def what_moved(result: Update) -> list[str]:
         else:
             day = np.datetime64(int(change.time * 86400.0), 's')
             lines.append(f'a jump before {day}: a shock, not ageing')
-    undetermined = [one.axis for one in result.moved if not one.is_determined]
+    undetermined = [change.axis for change in result.moved if not change.is_determined]
     if undetermined:
         lines.append(
             f'the rests do not determine {", ".join(undetermined)}: these axes keep their values, '

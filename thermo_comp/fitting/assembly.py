@@ -69,7 +69,7 @@ def build_calibration(
     layout = claim.layout
     taken = (layout.weights[:, 0, len(model.sets.levels()) :] >= 0).any(axis=0)
     used = np.flatnonzero(taken).tolist()
-    kinds = tuple(one.kind for one in nonlinearity.terms) if nonlinearity else ()
+    kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_parameters(regression, layout, state, model.sets, used, kinds)
     values = to_file @ as_vector(state, layout)[: layout.n_unit]
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
@@ -189,8 +189,8 @@ def parameters_of(calibration: Calibration) -> Floats:
         values += [term.scale[axis] for term in calibration.response]
     terms = calibration.nonlinearity.terms if calibration.nonlinearity else ()
     for axis in range(3):
-        values += [one.coefficient[axis] for one in terms]
-        values += [one.per_kelvin[axis] for one in terms]
+        values += [term.coefficient[axis] for term in terms]
+        values += [term.per_kelvin[axis] for term in terms]
     M = calibration.misalignment
     return np.array([*values, M[1][0], M[2][0], M[2][1]])
 

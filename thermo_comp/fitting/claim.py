@@ -135,7 +135,7 @@ def _over_mountings(
     ]
     # Density per step of the logarithm: flat below the scale, with a Student's tail above it.
     density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(_MOUNTING_GRID**2 / STUDENT_NU)
-    weight = np.array([one.log_evidence for one in fits]) + density
+    weight = np.array([fit.log_evidence for fit in fits]) + density
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit

@@ -65,10 +65,10 @@ def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
-    tells = norm_columns(_SPHERE)
-    moved = tells @ covariance
+    columns_of_norm = norm_columns(_SPHERE)
+    moved = columns_of_norm @ covariance
     gain = np.einsum('ij,jk,ik->i', moved, weight, moved)
-    gain /= np.einsum('ij,ij->i', moved, tells) + sd * sd
+    gain /= np.einsum('ij,ij->i', moved, columns_of_norm) + sd * sd
     gain[np.max(_SPHERE @ seen.T, axis=1, initial=-1.0) > math.cos(math.radians(20.0))] = 0.0
     good = gain >= max(0.5 * gain.max(), 1e-300)
     tier = next(tier for tier in _TIERS if good[tier].any())

@@ -264,7 +264,7 @@ class Equations:
         scaled[:, :, 0] = 1.0
         first_tilt = n_base - 3 - n_tilts
         across = self._across(state)
-        in_bias, in_scale = (np.flatnonzero(one[columns]) for one in used)
+        in_bias, in_scale = (np.flatnonzero(mask[columns]) for mask in used)
         n_linear = 2 + len(in_bias) + len(in_scale)
         n_own = layout.axis.shape[1]
         at, n_stretches = n_own + layout.radius.size, layout.stretch.shape[1]

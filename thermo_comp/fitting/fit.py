@@ -151,7 +151,7 @@ def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
         for block in blocks():
             yield replace(cast(Any, block), accel=block.accel - offset)
 
-    intervals = tuple(replace(one, mean=one.mean - offset) for one in bag.intervals)
+    intervals = tuple(replace(interval, mean=interval.mean - offset) for interval in bag.intervals)
     return replace(bag, source=replace(bag.source, blocks=moved), intervals=intervals)
 
 

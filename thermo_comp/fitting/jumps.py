@@ -63,7 +63,9 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     Two rests are compared if the gap between them is at most 30 s and their directions differ by
     less than 10 degrees.
     """
-    means = [np.average(one.mean, axis=0, weights=one.count) for one in bag.intervals]
+    means = [
+        np.average(interval.mean, axis=0, weights=interval.count) for interval in bag.intervals
+    ]
     ups = [mean / np.linalg.norm(mean) for mean in means]
     gaps = [
         ((before.end_ns - bag.start_ns) * 1e-9, (after.start_ns - bag.start_ns) * 1e-9)

@@ -54,7 +54,7 @@ def _excess(regression: Regression, selected: Selected, claim: Claim) -> Excess:
     square = selected.score.drift**2 - noise - claimed
     mine = drift_of_positions(regression, regression.force(selected.posterior.state))
     others = np.zeros_like(mine)
-    near = [one for one in selected.trials if one.is_near]
+    near = [trial for trial in selected.trials if trial.is_near]
     for one in near:
         away = drift_of_positions(regression, regression.force(one.posterior.state)) - mine
         others = np.maximum(others, 0.5 * away**2)
@@ -73,7 +73,7 @@ def drift_variance(
     regression: Regression, state: State, layout: Layout, covariance: Floats
 ) -> Floats:
     """Return the variance of the drift of each window by a covariance of the unit, (n, 3)."""
-    in_bias, in_scale = (np.flatnonzero(one) for one in layout.used)
+    in_bias, in_scale = (np.flatnonzero(mask) for mask in layout.used)
     on_bias, on_scale = (
         drift_of_positions(regression, regression.columns[:, one]) for one in (in_bias, in_scale)
     )

@@ -124,8 +124,8 @@ class Whitener:
 
     def _deviances(self, residual: Floats, weight: Floats, noises: Sequence[Noise]) -> Floats:
         """Return -2 times the profile log likelihood of each noise, shape (n_noises,)."""
-        ratio = np.array([one.ratio for one in noises])[:, None]
-        time_s = np.array([one.time_s for one in noises])[:, None]
+        ratio = np.array([noise.ratio for noise in noises])[:, None]
+        time_s = np.array([noise.time_s for noise in noises])[:, None]
         shape = len(noises), self._row.shape[1]
         level, variance = np.zeros((*shape, 3)), np.broadcast_to(ratio, shape)
         square, size = np.zeros((len(noises), 3)), np.zeros(len(noises))

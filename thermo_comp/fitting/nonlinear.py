@@ -61,14 +61,14 @@ def with_forces(
     is_usual = np.ptp([*np.hypot(still, spin), options.gravity]) < 1e-3 * options.gravity
     if is_usual and prior is None and options.k2_sd is None and options.k3_sd is None:
         return windows
-    rotating = [one.source.force for one in bags if one.source.force and one.source.force.radius]
+    rotating = [bag.source.force for bag in bags if bag.source.force and bag.source.force.radius]
     radii = {(one.radius, one.radius_sd) for one in rotating}
     if len(radii) > 1:
         raise FitError(f'the bags state different radii: {sorted(radii)}')
     radius, radius_sd = next(iter(radii), (1.0, 0.0))
     if radius_sd and options.prior is not None:
         raise FitError('a fit with a prior takes the radius as given: leave out --radius-sd')
-    kinds = tuple(POWERS) if prior is None else tuple(one.kind for one in prior.terms)
+    kinds = tuple(POWERS) if prior is None else tuple(term.kind for term in prior.terms)
     t = windows.temperature - windows.model.reference_temperature
     forces = Forces(kinds, t, still, spin, sd, radius_sd / radius)
     return replace(windows, data=replace(windows.data, forces=forces))
@@ -148,7 +148,9 @@ def choose(
             used = used - {k + at}
     posterior, prior = fitted(used)
     fit: dict[str, Any] = {'score': score(used), 'posterior': posterior, 'prior': prior}
-    trials = tuple(replace(one, **fit) if one.is_chosen else one for one in selected.trials)
+    trials = tuple(
+        replace(trial, **fit) if trial.is_chosen else trial for trial in selected.trials
+    )
     terms = []
     for at, evidence in found.items():
         places = posterior.layout.nonlinear[:, [at, k + at]]
@@ -186,7 +188,7 @@ def with_terms(state: State, calibration: Calibration) -> State:
     if calibration.nonlinearity is None:
         return state
     terms = calibration.nonlinearity.terms
-    each = [one.coefficient for one in terms] + [one.per_kelvin for one in terms]
+    each = [term.coefficient for term in terms] + [term.per_kelvin for term in terms]
     return replace(state, nonlinear=np.reshape(each, (-1, 3)).T.copy())
 
 

@@ -149,9 +149,12 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     if len(calibrations) < UNITS_NEEDED:
         raise FitError(f'{len(calibrations)} calibrations, need {UNITS_NEEDED} for a population')
     # Nonlinear terms are left out: most units have none, since they need a centrifuge.
-    calibrations = [without_terms(one) if one.nonlinearity else one for one in calibrations]
+    calibrations = [
+        without_terms(calibration) if calibration.nonlinearity else calibration
+        for calibration in calibrations
+    ]
     first = calibrations[0]
-    serials = {one.unit.serial for one in calibrations}
+    serials = {calibration.unit.serial for calibration in calibrations}
     if len(serials) < len(calibrations):
         raise FitError('two of the calibrations are of one unit: a population needs one of each')
     for one in calibrations:
@@ -179,9 +182,9 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
         for key, own in keys.items()
     ]
     like = _like(calibrations, columns)
-    K = np.array([constants_of(one).scale for one in calibrations])
+    K = np.array([constants_of(calibration).scale for calibration in calibrations])
     mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
-    units = [_relative_to(one, like, mean_K) for one in calibrations]
+    units = [_relative_to(calibration, like, mean_K) for calibration in calibrations]
     vectors = np.array([vector for vector, _ in units])
     mean = vectors.mean(axis=0)
     away = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
@@ -241,7 +244,7 @@ def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Cal
     slow = [[axis.residual_sd_m_s2 for axis in one.static.axes()] for one in calibrations]
     regimes = []
     for k, regime in enumerate(first.regime_sets()):
-        each = [one.regime_sets()[k] for one in calibrations]
+        each = [calibration.regime_sets()[k] for calibration in calibrations]
         x, y, z = (
             replace(own, residual_sd_m_s2=float(sd))
             for own, sd in zip(regime.axes(), np.median(slow, axis=0), strict=True)
@@ -258,7 +261,7 @@ def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Cal
         provenance=Provenance(
             tool_version=__version__,
             model=POPULATION,
-            sources=tuple(Source(one.unit.serial) for one in calibrations),
+            sources=tuple(Source(calibration.unit.serial) for calibration in calibrations),
         ),
         evidence=(),
         posterior=None,

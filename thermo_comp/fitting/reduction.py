@@ -190,7 +190,9 @@ def reduce_source(
             fewest_windows=fewest_windows,
             least=_FEW_SAMPLES,
         )
-        means = np.array([one.mean.mean(axis=0) for one in closer.intervals]).reshape(-1, 3)
+        means = np.array([interval.mean.mean(axis=0) for interval in closer.intervals]).reshape(
+            -1, 3
+        )
         if len(distinct_directions(directions(means, rough_centre(means)))) >= 6:
             return closer
     return ReducedBag(

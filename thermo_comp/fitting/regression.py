@@ -170,7 +170,7 @@ class Regression(Equations):
         """Eliminate the unknowns of each bag; `without`: a position that is left out."""
         n, own = layout.n_unit, layout.axis.shape[1]
         both = own + len(layout.shared)
-        of_axis = [slice(int(one[0]), int(one[0]) + own) for one in layout.axis]
+        of_axis = [slice(int(places[0]), int(places[0]) + own) for places in layout.axis]
         shared = slice(n - len(layout.shared), n)
         precision = self.precision(prior, layout)
         away = as_vector(state, layout)
@@ -425,7 +425,7 @@ class Regression(Equations):
         S: Floats = np.zeros((2, k, 3, 2, k, 3))
         Q: Floats = np.zeros((2, k, 3))
         cross: Floats = np.zeros((n, 2, k, 3))
-        local = [np.zeros((one.stop - one.start, 2, k, 3)) for one in layout.blocks]
+        local = [np.zeros((block.stop - block.start, 2, k, 3)) for block in layout.blocks]
         force = self.along_axes(state)
         for p, bag in enumerate(self.bag_of_position.tolist()):
             among, beside = self.absent_products(columns, used, p)

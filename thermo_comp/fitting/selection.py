@@ -165,8 +165,8 @@ def fit_all(
     posterior, prior = _settle(regression, posterior.state, prior, candidates)
     if informative:
         tried = [
-            regression.solve(posterior.state, replace(prior, informative=one), n_steps=3)
-            for one in informative
+            regression.solve(posterior.state, replace(prior, informative=candidate), n_steps=3)
+            for candidate in informative
         ]
         best = int(np.argmax([one.log_evidence for one in tried]))
         prior = replace(prior, informative=informative[best])

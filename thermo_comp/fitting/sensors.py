@@ -75,10 +75,10 @@ def learn_thermometer(
     # At least 0.1 mK: below it the recursion would follow rounding errors.
     noise = max(_noise_of(long, quantum), 1e-4)
     courses = _courses(recorded, noise, quantum)
-    clear = [one for one in courses if one.fastest > _CLEAR * one.rate_sd]
+    clear = [course for course in courses if course.fastest > _CLEAR * course.rate_sd]
     if not clear:
         return replace(base, noise_sd_c=noise, quantum_c=quantum)
-    fastest = max(one.fastest for one in clear)
+    fastest = max(course.fastest for course in clear)
     # At the beginning of a ramp the lagged temperature has the second derivative ramp / lag. It is
     # estimated from the difference of two rates one minute apart.
     lags = []
@@ -162,11 +162,11 @@ def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
 
 def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
     """Return the amplitude of the ambient ripple in soaks [K], from rates and lag."""
-    rates = [one.rate[one.is_resting] for one in courses]
+    rates = [course.rate[course.is_resting] for course in courses]
     resting = np.concatenate(rates) if rates else np.zeros(0)
     if len(resting) < 60 or not courses:
         return usual
-    noise = float(np.median([one.rate_sd for one in courses]))
+    noise = float(np.median([course.rate_sd for course in courses]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
     clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
     # A ripple below the noise of the rates is not detected: assume the default at most.

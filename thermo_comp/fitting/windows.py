@@ -167,7 +167,10 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     position, bag_of = (np.concatenate(part) for part in zip(*numbers, strict=True))
     k, m = len(columns), len(groups) + len(columns)
     moved_at, end = 4 + k + m, 4 + k + m + len(columns)
-    lag = [spec.lags.index(one.lag) if one.lag and one.kind != 'play' else -1 for one in columns]
+    lag = [
+        spec.lags.index(column.lag) if column.lag and column.kind != 'play' else -1
+        for column in columns
+    ]
     t, gradient = rows[:, 0] - reference, rows[:, 3]
     # A support tilts with board and case temperature, linearly and with the square of the latter.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
