@@ -41,7 +41,8 @@ class _Second:
         return np.asarray(self.origin + self.total / self.n)
 
 
-#: Returns the present thermal state and start shares; None while there is no temperature.
+#: A function that returns the thermal state and the remaining shares of the unknown initial lag
+#: states; None before the first temperature reading.
 StateNow = Callable[[], tuple[Sequence[float], Sequence[float]] | None]
 
 

@@ -96,8 +96,9 @@ def read_rests(
     is_for_update: bool = True,
 ) -> tuple[list[tuple[Start, Rest]], Source, list[str]]:
     """
-    Read rest logs of a calibration's unit: its rests, the logs as a source of an update that is
-    aged `ahead` days, and notes.
+    Read the rest logs of a calibration's unit.
+
+    Returns the rests, the provenance of an update aged `ahead` days, and notes for the user.
 
     Rests before the calibration are left out, unless all are; for an update those of an earlier
     one always are. Raises RecordingError if no rest of the unit is left.

@@ -443,7 +443,7 @@ def _added(layout: Layout) -> list[str]:
 
 
 def as_vector(state: State, layout: Layout) -> Floats:
-    """Return the unknowns as a vector; attitudes are 0, as steps in the tangent plane."""
+    """Return the unknowns as a vector; its elements for attitudes, tangent steps, are 0."""
     result = np.zeros(layout.n + 1)
     for name in _added(layout):
         result[getattr(layout, name)] = getattr(state, name)

@@ -341,9 +341,10 @@ def _unusable(error: ValueError) -> FitError:
 
 def _may_have_sets(selected: Selected) -> bool:
     """
-    Whether the model has two sets, or a model with two sets is similarly good.
+    Whether the chosen model has two sets, or a model with two sets is similarly good.
 
-    The latter must be within one standard error on left-out data, with a noise below 80 %.
+    Similarly good: within one standard error of the chosen model on left-out data, with less than
+    80 % of its noise.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.prior.sigma

@@ -19,8 +19,8 @@ class Forces:
     """
     The known magnitude ``|f|^2 = still^2 + spin^2`` of each position, (n_positions,) [m/s^2].
 
-    kinds: the k nonlinear terms that may take part, in the order of a file; the coefficients are
-        those of a file: each kind at the reference, then each per kelvin
+    kinds: the k nonlinear terms that may take part, in the order of a file; the order of the
+        coefficients is all kinds at the reference temperature, then all kinds per kelvin
     t: board temperature of each window less the reference, shape (n,) [K]
     still: |f| without rotation; gravity if the unit rotates
     spin: centripetal acceleration w^2 r at the stated radius; 0 without rotation

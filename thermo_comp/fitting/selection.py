@@ -244,7 +244,7 @@ def _with_slow_noise(
         return fitted, trial
 
     # The parameters absorb a part of the noise, so residuals underestimate it; the log evidence
-    # does not. Search with a factor of 3, then of its square root, and so on.
+    # does not. Search ratio and time in steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
     refined, found = with_noise(best)
     step = 3.0
     while step > 3.0**0.2:

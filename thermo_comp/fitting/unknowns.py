@@ -73,7 +73,7 @@ class Windows:
 
     @property
     def parts(self) -> Bools:
-        """Columns that bias and scale may have, shape (2, m)."""
+        """Masks of the columns that may act on the bias and on the scale, shape (2, m)."""
         return np.stack((np.ones_like(self.in_scale), self.in_scale))
 
     @property

@@ -226,7 +226,7 @@ def _kelvins(
 ) -> Floats:
     """
     Return the temperature change that corresponds to the RMS of each column [K], shape (m,): the
-    RMS over the largest slope of the column in these data. It is 0 for a constant column.
+    RMS over the largest slope of the column in these data; 0 for a column that is constant.
     """
     farthest = float(np.abs(t).max(initial=0.0))
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
@@ -246,7 +246,8 @@ def _kelvins(
 def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[Floats, Floats, Bools]:
     """Return a time grid [s], the states of the tracker on it, and which of them are known."""
     if not len(bag.board.value):
-        # Without a thermometer the unit is taken to be at the reference since 1e9 s: no lag.
+        # Without a thermometer assume that the unit has been at the reference temperature for
+        # 1e9 s, so that all lags are 0.
         still = np.zeros((2, Layout(spec).width))
         still[:, BOARD] = model.reference_temperature
         ends: Floats = np.array([-1e9, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
