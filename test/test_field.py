@@ -164,7 +164,7 @@ def test_axes_that_no_rest_shows_keep_their_bits() -> None:
     unit = known()
     found = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     new = found.calibration
-    assert [one.is_told for one in found.moved] == [False, False, True]
+    assert [one.is_determined for one in found.moved] == [False, False, True]
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
@@ -276,8 +276,8 @@ def test_update_by_the_command_line(tmp_path: Path, unit_file: Path, cli: Cli) -
     found = rests(unit, upright, jump_of(300.0, 10.0))
     log, new = write_log(tmp_path / 'rests', found), tmp_path / 'new.yaml'
     said = cli('update', unit_file, log, '-o', new)
-    assert 'the rests cannot tell x, y' in said.stdout
-    assert 'a shock, no ageing' in said.stdout
+    assert 'the rests do not determine x, y' in said.stdout
+    assert 'a shock, not ageing' in said.stdout
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
@@ -321,7 +321,7 @@ def test_mistakes_end_in_one_sentence(tmp_path: Path, unit_file: Path, cli: Cli)
     save_calibration(rich_calibration(), rich)
     log = write_log(tmp_path / 'own', rests(unit, upright, no_error, days=2))
     said = cli('update', rich, log, *new, code=1).stderr
-    assert 'logged with a calibration of other columns' in said
+    assert 'logged with a calibration that has other columns' in said
 
 
 def test_the_newest_of_many_starts_are_used(monkeypatch: pytest.MonkeyPatch) -> None:

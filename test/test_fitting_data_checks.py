@@ -87,7 +87,7 @@ def test_no_ramp_and_one_direction_are_seen(good: tuple[ThermalWindows, np.ndarr
     windows, up = good
     assert 'no ramp' in findings_of(replace(windows, rate=0.0 * windows.rate), up)['ramps'].message
     heating = findings_of(replace(windows, rate=np.abs(windows.rate)), up)
-    assert 'only heating was seen' in heating['directions'].message
+    assert 'only heating was recorded' in heating['directions'].message
     always = findings_of(replace(windows, weight=np.ones_like(windows.weight)), up)
     assert 'only 0 % of the windows are static' in always['soak'].message
 

@@ -70,7 +70,7 @@ def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declar
     np.testing.assert_allclose(scale, K, rtol=3e-4)
     np.testing.assert_allclose(found.calibration.misalignment, M, atol=3e-4)
     assert any(one.name == 'offset' for one in found.findings)
-    assert 'no force reads' in found.calibration.provenance.notes[-1]
+    assert 'zero force reads' in found.calibration.provenance.notes[-1]
     assert not any(one.name == 'offset' for one in plain.findings)
 
 

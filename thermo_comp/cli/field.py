@@ -57,7 +57,7 @@ def update(
                 *(micro(1e6 * one.scale), micro(1e6 * one.scale_sd)),
                 *(micro_g(one.curve), micro_g(one.curve_sd)),
                 *(micro_g(one.reading), micro_g(one.reading_sd)),
-                f'{one.reading / one.reading_sd:+.1f}' if one.is_told else 'not told',
+                f'{one.reading / one.reading_sd:+.1f}' if one.is_determined else 'not told',
             )
             for one in result.moved
         ],
@@ -66,7 +66,7 @@ def update(
     )
     out.points(what_moved(result))
     out.line(str(result.judged))
-    is_better = result.judged.is_better and any(one.is_told for one in result.moved)
+    is_better = result.judged.is_better and any(one.is_determined for one in result.moved)
     if is_better:
         save_calibration(result.calibration, output, overwrite=force)
         out.line(f'{output}: written')

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns how a unit ages between its rests: the Gaussian model, and its variances by evidence.
+Owns the ageing model of a unit: a Gaussian model of its rests, with variances by evidence.
 
 ``|f| - g`` of rest i at time t_i, of start k, is ``H_i delta + B_i b(t_i) + S_i s(t_i) + B_i o_k
 + lack + e_i``: delta is the error of the calibration (its posterior), b and s are random walks of
-bias and scale since the calibration, o is a bias that each start has anew, e is independent.
-Jumps of the levels, and a change of the curve, are added one by one while the evidence asks for
-them. The variances maximise the marginal likelihood, with wide priors about their usual size.
+bias and scale since the calibration, o_k is a bias offset of start k, e is independent noise.
+Jumps of the levels, and a change of the curve, are added one at a time while the log Bayes factor
+is high enough. The variances maximise the marginal likelihood, with wide priors.
 """
 
 from __future__ import annotations
@@ -24,31 +24,30 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import Series
 
-#: Centres of the priors in parts of the turn-on: walk of the bias, and of the scale times g, per
-#: root day, and scatter of a rest; sd of their logarithms: a factor of 5 either way.
+#: Centres of the priors relative to the turn-on offset: random walk of the bias, and of the scale
+#: times g, per root day; scatter of a rest. Sd of their logarithms: a factor of 5 either way.
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
-#: Smallest centre of the prior of the turn-on [m/s^2].
+#: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
-#: Prior sd of a jump [m/s^2], and of a change of a curve's slope [m/s^2 per K], looked at.
+#: Candidates of the prior sd of a jump [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
-#: A shock moves proof mass and electrodes: the scale times g by a tenth of what the bias moves.
+#: Relative sizes of a jump in the biases and in the scales times g, which a shock changes less.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
+#: Candidates of the prior sd of a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
-#: Log Bayes factor from which a jump or a change of the curve is believed, and largest number.
-_BELIEVED, _MOST_CHANGES = 5.0, 4
-#: Distance of temperatures over which a lack of fit is the same [K].
-_LACK_K = 10.0
-#: Rows of a start that the solution, and the search of the variances, use; rows of the search.
+#: Largest number of rows of a start in the solution, and in the search of the variances; largest
+#: number of rows in the search, whose time grows with its cube.
 _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
-#: A rest is left out if it misses what the others predict by more than this number of sd.
-_OUTLIER = 5.0
 
 
 @dataclass(frozen=True)
 class Ageing:
     """
-    Standard deviations [m/s^2]: random walk of the bias and of the scale times g per root day,
-    bias of a start, scatter of a rest.
+    Standard deviations of the ageing model [m/s^2].
+
+    bias, scale: random walk of the bias, and of the scale times g, per root day
+    turn_on: bias offset of a start
+    rest: scatter of a rest
     """
 
     bias: float
@@ -59,7 +58,7 @@ class Ageing:
 
 @dataclass(frozen=True)
 class Change:
-    """A jump of the levels before a start, at `time` [days since 1970]; a bent curve has none."""
+    """A jump of the levels at `time` [days since 1970]; None for a change of the curve."""
 
     time: float | None
     sd: float
@@ -76,10 +75,12 @@ class Change:
 @dataclass(frozen=True)
 class Rows:
     """
-    Equations of the rests, in order of time, at most `_ROWS` of a start: orthogonal sums that hold
-    what its rests say of the six levels. `noise`, `scatter`: variance of the noise, and share of
-    the rests' scatter; `rank`: number of the row in its start; `warmth`: temperature less the
-    reference [K].
+    Equations of the rests, in order of time, at most `_ROWS` of a start: orthogonal sums with all
+    information of its rests about the six levels.
+
+    noise, scatter: variance of the noise, and factor of the variance of the rests' scatter
+    rank: number of the row in its start
+    warmth: temperature less the reference [K]
     """
 
     time: Floats
@@ -99,7 +100,7 @@ class Rows:
 
 
 def rows_of(series: Series, scatter: float) -> Rows:
-    """Sum the rests of each start, weighted by their noise and a first guess of their scatter."""
+    """Sum the rests of each start, weighted by their noise and an initial scatter [m/s^2]."""
     parts: list[tuple[Floats, ...]] = []
     variance = series.noise + scatter**2
     for start in np.unique(series.start):
@@ -108,7 +109,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # A sum of n equal rests would be sqrt(n) times one.
+        # With this normalisation the sum of n equal rests is sqrt(n) times one of them.
         Q = Q * weight[:, np.newaxis]
         mean = np.full(Q.shape[1], series.temperature[at].mean() - series.reference_temperature)
         parts.append(
@@ -129,12 +130,12 @@ def rows_of(series: Series, scatter: float) -> Rows:
     searched = rows.start[rows.rank < _SEARCH_ROWS]
     if len(searched) <= _MOST_ROWS:
         return rows
-    # Older starts say little of today; the time of the search grows with the cube of the rows.
+    # Older starts have little information about the present state.
     return rows.at(rows.start > searched[-_MOST_ROWS])
 
 
 class Model:
-    """The covariance of the rows, by the variances and the changes."""
+    """The covariance of the rows as a function of the variances, with given changes."""
 
     def __init__(
         self, rows: Rows, calibration: Calibration, since: float, changes: Sequence[Change] = ()
@@ -154,7 +155,8 @@ class Model:
             np.where(is_same, along, 0.0),
             np.diag(rows.scatter),
         ]
-        near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / _LACK_K) ** 2)
+        # The lack of fit is correlated between temperatures over 10 K.
+        near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
         for change in changes:
@@ -185,8 +187,8 @@ class Model:
             ]
             return float(value), np.array(slope) + away / _LOG_SD
 
-        # Small variances have no gradient, so the search begins twice: all scatter is of the
-        # starts, or all of it is a walk.
+        # Small variances have almost no gradient, so the search has two initial points: all
+        # scatter is due to the starts, or all of it to the random walks.
         steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
         step = max(float(np.median(steps)), centre.rest)
         bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD
@@ -210,7 +212,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the centre of the priors: the turn-on is like the residual, or the noise in 1 Hz."""
+    """Return the centre of the priors; its turn-on sd is the residual or the noise in 1 Hz."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -219,9 +221,11 @@ def usual(calibration: Calibration) -> Ageing:
 
 def learn(series: Series, calibration: Calibration, since: float) -> tuple[Ageing, Model, Series]:
     """
-    Find variances and changes by evidence; leave out rests that contradict all others.
+    Estimate variances and changes by evidence, without starts that contradict all others.
 
-    Returns the variances, the model of all rows, and the rests that were used.
+    At most four changes are added, each with a log Bayes factor of at least 5. A start is left out
+    if one of its rows is more than 5 sd from the prediction by all other rows. Returns the
+    variances, the model of all rows, and the rests used.
     """
     centre = usual(calibration)
     is_used = np.ones(len(series), dtype=np.bool_)
@@ -236,7 +240,7 @@ def learn(series: Series, calibration: Calibration, since: float) -> tuple[Agein
             best = max(
                 _candidates(model, inverse), key=lambda one: one.log_bayes_factor, default=None
             )
-            if best is None or best.log_bayes_factor < _BELIEVED or len(changes) == _MOST_CHANGES:
+            if best is None or best.log_bayes_factor < 5.0 or len(changes) == 4:
                 break
             changes += (best,)
         everything = Model(rows, calibration, since, changes)
@@ -244,10 +248,10 @@ def learn(series: Series, calibration: Calibration, since: float) -> tuple[Agein
             cho_factor(everything.covariance(ageing), lower=True), np.eye(len(rows.y))
         )
         left_out = (inverse @ rows.y) / np.sqrt(np.diag(inverse))
-        bad = rows.start[np.abs(left_out) > _OUTLIER]
+        bad = rows.start[np.abs(left_out) > 5.0]
         at = np.flatnonzero(is_used)
         is_bad = np.isin(used.start, bad)
-        # Starts that are off together are no outliers but what the model does not know.
+        # If more than 10 % of the rests are affected they are a model error, not outliers.
         if not len(bad) or is_bad.sum() > 0.1 * len(used):
             break
         is_used[at[is_bad]] = False
@@ -266,7 +270,7 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
         for i in range(6):
             precision[:, :, i, j] = np.add.reduceat(by_level[:, [i]] * half, first, axis=0)
     pull = np.add.reduceat(by_level * alpha[:, np.newaxis], first, axis=0)
-    # A jump before a start moves it and all later ones.
+    # A jump before a start also shifts all later starts.
     after = np.cumsum(np.cumsum(precision[::-1, ::-1], axis=0), axis=1)[::-1, ::-1]
     pull = np.cumsum(pull[::-1], axis=0)[::-1]
     known = {change.time for change in model.changes}
@@ -293,8 +297,12 @@ def _log_bayes_factor(precision: Floats, pull: Floats, sd: float) -> float:
 @dataclass(frozen=True)
 class Solution:
     """
-    Change of the file's parameters by the rests; their covariance before and after at the last
-    rest, and what a time of use after it adds. Estimates by fewer rows are sums over `gains`.
+    Change of the file's parameters by the rests, and their covariances at the last rest.
+
+    shift: change of the parameters
+    prior, posterior: covariances before and after the rests
+    future: covariance that is added during the time of use after the last rest
+    gains, innovations: factors of the shift; estimates by fewer rows are partial sums
     """
 
     shift: Floats
@@ -305,7 +313,7 @@ class Solution:
     innovations: Floats
 
     def before(self, row: int) -> Floats:
-        """Return the shift by the rows before one."""
+        """Return the shift by the first rows only."""
         return np.asarray(self.gains[:row].T @ self.innovations[:row])
 
 

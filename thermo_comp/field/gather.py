@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way from samples to rests: windows of 10 s in which the unit stood still.
+Owns the detection of rests in a stream of samples: windows of 10 s without motion.
 
-Samples are summed by whole seconds of their stamps. A second is still if its scatter is that of
-the noise and its mean that of the second before (the thresholds of `online.checks.GravityCheck`);
-ten still seconds in a row are a window. In a rest that lasts, windows are kept less often: all of
-the first ten minutes, one a minute up to the hour, then one in five minutes.
+Samples are summed by whole seconds of their stamps. A second is still if its standard deviation is
+that of the noise and its mean agrees with that of the second before (the thresholds of
+`online.checks.GravityCheck`). Ten still seconds in a row are a window. In a long rest all windows
+of the first ten minutes are kept, one per minute up to an hour, then one in five minutes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .rest import Rest
 
 SECONDS = 10  # length of a window [s]
 _SECOND_NS = 1_000_000_000
-#: Of a rest that lasts every n-th window is kept from the given window on.
+#: Number of a window in its rest, and n: from this window on every n-th window is kept.
 _SPACING = ((360, 30), (60, 6), (0, 1))
 
 
@@ -41,7 +41,8 @@ class _Second:
         return np.asarray(self.origin + self.total / self.n)
 
 
-#: Returns the present thermal state and start shares; None while there is no temperature.
+#: A function that returns the thermal state and the remaining shares of the unknown initial lag
+#: states; None before the first temperature reading.
 StateNow = Callable[[], tuple[Sequence[float], Sequence[float]] | None]
 
 
@@ -90,7 +91,7 @@ class RestFinder:
             if self._n_windows % every == 0:
                 rests.append(self._window())
             self._n_windows += 1
-            # The next window compares itself with the last second of this one.
+            # The first second of the next window is compared with the last second of this one.
             self._run, self._states = [], []
             self._last = [second]
         if following != second.number + 1:
@@ -107,7 +108,7 @@ class RestFinder:
         if np.abs(second.mean[:3]).max() >= self._full_scale:
             return False
         scatter = (second.squares - second.total[:3] ** 2 / n) / (n - 1) / self._scale**2
-        # Equal samples throughout are a converter that stands still, not a unit.
+        # Constant samples are a fault of the converter, not a rest.
         if not 0.0 < scatter.sum() <= SCATTER_FACTOR**2 * self._noise:
             return False
         change = LARGEST_CHANGE + 4.0 * np.sqrt(2.0 * self._noise / (3.0 * n))

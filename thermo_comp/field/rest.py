@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the record of a rest, one line of text with a checksum, and how such lines are thinned.
+Owns the record of a rest, one line of text with a checksum, and the thinning of such lines.
 
-A rest log is a folder of files, one per day (UTC). A file holds two kinds of lines, each a CRC-32
-in hexadecimal, a blank, and JSON: an object describes a start of the node, a list is a window at
-rest since that start. A line whose checksum is wrong is skipped: a process that is killed, a power
-failure or a full disk can damage only the line that was being written.
+A rest log is a folder of files, one per day (UTC). Each line is a CRC-32 in hexadecimal, a blank,
+and JSON: an object describes a start of the node, a list is a window at rest since that start.
+Lines with a wrong checksum are skipped: a killed process, a power failure or a full disk damages
+only the line that is being written.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from ..thermal.state import Layout
 
 #: Ending of the files of a log; their names are the days, 2026-11-25.rests.
 SUFFIX = '.rests'
-#: Bound of every number, far above any sample; last stamp, in the year 2262 [ns].
-_LARGEST, _LATEST_NS = 1e12, 1 << 63
+
 #: First bytes after the checksum of a start and of a rest.
 _OF_START, _OF_REST = b' {', b' ['
 
@@ -64,7 +63,7 @@ def encode(one: Start | Rest) -> bytes:
         memory = [one.memory.sensors, one.memory.lags, one.memory.plays]
         data: Any = {**vars(one), 'memory': memory}
     else:
-        # Nine digits resolve a thousandth of a count of 24 bits.
+        # Nine digits: a resolution of 0.001 counts for a converter of 24 bits.
         data = [
             [float(f'{value:.9g}') for value in part] if isinstance(part, tuple) else part
             for part in astuple(one)
@@ -90,7 +89,7 @@ def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
             elif start is not None:
                 found.append((start, _rest(data, start.memory)))
         except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
-            # Whoever writes a checksum can write anything behind it.
+            # A valid checksum does not imply valid content.
             n_damaged += 1
     return found, n_damaged
 
@@ -119,13 +118,15 @@ def _rest(data: list[Any], memory: MemorySpec) -> Rest:
 
 
 def _number(value: float) -> float:
-    if not abs(value) < _LARGEST:
+    # The bound is far above any sample.
+    if not abs(value) < 1e12:
         raise ValueError(value)
     return float(value)
 
 
 def _whole(value: int) -> int:
-    if type(value) is not int or not 0 < value < _LATEST_NS:
+    # Stamps [ns] are 64-bit integers.
+    if type(value) is not int or not 0 < value < 1 << 63:
         raise ValueError(value)
     return value
 

@@ -32,16 +32,9 @@ from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
 
 _DAY_NS = 86_400e9
-#: Name of the source of an update: time of its last rest, days by which its claim was aged.
+#: Parts of the name of an update's source, before the time of its last rest, and before the days
+#: by which its covariance was aged.
 _UNTIL, _AGED = 'rests until ', ', claim aged '
-_LONGEST_DAYS = 36525.0  # a century
-#: Largest file of a log that is read [bytes]: a day of the node has at most 320 kB.
-_LARGEST = 1 << 26
-#: Windows of one start are averaged while the direction of f [rad] and the temperature [K] differ
-#: by less from the first: means of vectors are shorter than vectors by half the squared angle.
-_SAME_DIRECTION, _SAME_TEMPERATURE = 1e-3, 1.0
-#: ... and up to this number of windows.
-_LONGEST_GROUP = 60
 
 
 @dataclass(frozen=True)
@@ -103,8 +96,9 @@ def read_rests(
     is_for_update: bool = True,
 ) -> tuple[list[tuple[Start, Rest]], Source, list[str]]:
     """
-    Read rest logs of a calibration's unit: its rests, the logs as a source of an update that is
-    aged `ahead` days, and notes.
+    Read the rest logs of a calibration's unit.
+
+    Returns the rests, the provenance of an update aged `ahead` days, and notes for the user.
 
     Rests before the calibration are left out, unless all are; for an update those of an earlier
     one always are. Raises RecordingError if no rest of the unit is left.
@@ -125,7 +119,8 @@ def read_rests(
         return is_own
 
     try:
-        contents = [read_bounded(file, _LARGEST) for file in files]
+        # A day of the node has at most 320 kB; the bound is 64 MB.
+        contents = [read_bounded(file, 1 << 26) for file in files]
     except (OSError, ValueError) as error:
         reason = getattr(error, 'strerror', None) or str(error)
         raise RecordingError(f'cannot be read: {reason}', str(paths[0])) from error
@@ -138,7 +133,7 @@ def read_rests(
     if not rests:
         raise RecordingError(f'no rest of unit {unit.serial}', ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
-    # The end is stated to the second.
+    # The time in the source's name is rounded down to a second.
     first_ns = begin * _DAY_NS + 1e9 * is_update
     later = [(start, rest) for start, rest in rests if rest.stamp_ns > first_ns]
     if is_update and not is_for_update:
@@ -162,11 +157,14 @@ def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0
 
 def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     """
-    Return from when a calibration holds [days since 1970], until when its claim has been aged, and
-    whether this is by an update, from its last rest on; else it is the date of the file, or minus
-    infinity without a date.
+    Return the begin of a calibration's validity [days since 1970], the time up to which its
+    covariance is aged, and whether it is an update.
+
+    The begin is the last rest of an update, else the date of the file, or -inf without a date.
     """
-    names = [one.name for one in calibration.provenance.sources if one.name.startswith(_UNTIL)]
+    names = [
+        source.name for source in calibration.provenance.sources if source.name.startswith(_UNTIL)
+    ]
     text = names[-1].removeprefix(_UNTIL) if names else calibration.provenance.created
     date, _, aged = text.partition(_AGED)
     try:
@@ -174,7 +172,8 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
         ahead = float(aged.removesuffix(' d') or 0.0)
     except ValueError:
         return -np.inf, -np.inf, False
-    if np.isnat(moment) or not 0.0 <= ahead < _LONGEST_DAYS:
+    # An ageing of a century or more is an invalid file.
+    if np.isnat(moment) or not 0.0 <= ahead < 36525.0:
         return -np.inf, -np.inf, False
     begin = int(moment.astype(np.int64)) / _DAY_NS
     return begin, begin + ahead, bool(names)
@@ -228,10 +227,10 @@ def series_of(
     unexplained = np.broadcast_to(unexplained, x.shape)
     residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
     of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
-    doubt, claim = (
+    slow, claim = (
         _along(correction, states, shares, one, v, x) - of_one_sample for one in (bare, whole)
     )
-    doubt -= (v**2 * unexplained).sum(axis=1)
+    slow -= (v**2 * unexplained).sum(axis=1)
     return Series(
         time=averaged(stamps / _DAY_NS),
         start=np.unique(beginnings[first], return_inverse=True)[1],
@@ -242,7 +241,7 @@ def series_of(
         miss=size - local,
         by_parameter=_by_parameter(calibration, correction, states, u, v, x, scale),
         by_level=np.hstack((v * K / scale, v * x / calibration.gravity_m_s2)),
-        noise=noise + np.maximum(doubt, 0.0),
+        noise=noise + np.maximum(slow, 0.0),
         lack=v * np.sqrt(np.maximum(unexplained - residual, 0.0)),
         claim=np.sqrt(np.maximum(claim, 0.0) + noise),
         n_windows=sizes,
@@ -251,7 +250,7 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the places of the wanted state, and of the shares of its lags, in a log's."""
+    """Return the places of a state's elements, and of its lags' shares, in the log's state."""
     layout, target = Layout(memory), Layout(wanted)
     places = np.arange(target.width)
     try:
@@ -264,22 +263,28 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
         return places, np.array([memory.lags.index(lag) for lag in wanted.lags], np.int64)
     except (KeyError, ValueError) as error:
         raise RecordingError(
-            'the rests were logged with a calibration of other columns, and hold no thermal state '
-            'for this one'
+            'the rests were logged with a calibration that has other columns; their thermal state '
+            'does not contain the lags of this calibration'
         ) from error
 
 
 def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
-    """Assign the windows to groups: consecutive, of one start, direction and temperature."""
+    """
+    Assign windows to groups of consecutive windows that are averaged, at most 60.
+
+    The windows of a group have the same start. Their direction differs by less than 1e-3 rad and
+    their temperature by less than 1 K from the first; the norm of a mean of vectors is smaller by
+    half the squared angle.
+    """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)
     first = 0
     for k in range(1, len(start)):
         is_same = (
             start[k] == start[first]
-            and abs(temperature[k] - temperature[first]) < _SAME_TEMPERATURE
-            and np.abs(direction[k] - direction[first]).max() < _SAME_DIRECTION
-            and k - first < _LONGEST_GROUP
+            and abs(temperature[k] - temperature[first]) < 1.0
+            and np.abs(direction[k] - direction[first]).max() < 1e-3
+            and k - first < 60
         )
         first = first if is_same else k
         group[k] = group[k - 1] + (not is_same)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the update of a calibration from rests in the field, and its judgement on rests left out.
+Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
-A rest shows the error along gravity alone. Which axes the rests determine is a matter of the
-attitudes: an axis is moved only if they reduce the uncertainty of some reading of it to `_TOLD`;
-the other axes keep their values, and their claim has aged.
+A rest determines the error along gravity alone, so the attitudes decide which axes are determined.
+An axis is updated only if the rests reduce the sd of some reading of it to 0.6 of its prior sd;
+the other axes keep their values, with an increased covariance.
 """
 
 from __future__ import annotations
@@ -28,24 +28,23 @@ from ..unit.provenance import ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import Series, valid_since
 
-#: An axis is moved if the sd of its best known reading falls to this part.
-_TOLD = 0.6
-#: Days after the last rest for which the claim is aged, unless stated.
+#: Default time after the last rest for which the covariance is aged [days].
 AHEAD_DAYS = 1.0
-#: Fewest days that are judged as such; with less, starts are.
-_FEWEST = 5
 
 
 @dataclass(frozen=True)
 class Moved:
     """
-    Change of one axis, each with the sd that remains: bias at the temperature of the rests
-    [m/s^2], scale [relative], bias over the temperatures of the rests [m/s^2]; a change that
-    follows from no rest is 0. `reading`: change of bias plus scale at the rests' mean force.
+    Changes of one axis, each with its posterior sd; 0 if the rests do not determine the axis.
+
+    bias: at the temperature of the rests [m/s^2]
+    scale: relative
+    curve: of the bias over the temperatures of the rests [m/s^2]
+    reading: of bias plus scale at the mean force of the rests [m/s^2]
     """
 
     axis: str
-    is_told: bool
+    is_determined: bool
     bias: float
     bias_sd: float
     scale: float
@@ -59,9 +58,13 @@ class Moved:
 @dataclass(frozen=True)
 class Judged:
     """
-    RMS of ``|f| - g`` over the rests of days (or starts) left out [m/s^2], by the calibration and
-    by an update from the earlier ones; `gain` and `gain_sd`: mean over them of the difference of
-    the mean squares, and its standard error [m^2/s^4].
+    Score of an update on left-out rests.
+
+    over, n: kind of the folds, days or starts, and their number
+    before, after: RMS of ``|f| - g`` over each fold with the calibration, and with an update from
+        the earlier folds [m/s^2]
+    gain, gain_sd: mean over the folds of the difference of the mean squares, and its standard
+        error [m^2/s^4]
     """
 
     over: str
@@ -87,7 +90,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class Update:
-    """An updated calibration, and what led to it."""
+    """An updated calibration with the results of the ageing model."""
 
     calibration: Calibration
     moved: tuple[Moved, ...]
@@ -108,31 +111,31 @@ def update(
     ahead: float = AHEAD_DAYS,
 ) -> Update:
     """
-    Update a calibration by rests; `source` and `created` are for the new file's provenance, and
-    the claim is aged for `ahead` days after the last rest.
+    Update a calibration by rests.
 
-    Raises FitError if there are too few starts to leave some out.
+    `source`, `created`: for the new file's provenance; `ahead`: time after the last rest for which
+    the covariance is aged [days]. Raises FitError if there are fewer than three starts.
     """
     n_starts = int(series.start[-1]) + 1
     if n_starts < 3:
         raise FitError(
-            f'rests of {counted(n_starts, "start")}, need 3 at least: each start has a bias of '
-            'its own, and the update is judged on starts left out'
+            f'rests of {counted(n_starts, "start")}, need 3 at least: each start has a bias '
+            'offset, and the update is judged on left-out starts'
         )
     _, aged, is_update = valid_since(calibration)
     first, last = float(series.time[0]), float(series.time[-1])
-    # The walk begins where the claim's ageing ends, or at the first rest if no date is before it.
+    # The random walk begins at the end of the aged covariance, or at the first rest without one.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since)
     to_file, bend = _levels(calibration), _slopes(calibration)
     solution = solve(model, ageing, to_file, bend, ahead)
-    told, moved = _moved(used, calibration, solution)
-    judged = _judged(used, model, solution, told)
-    shift, kept = solution.shift * told, solution.shift * ~told
-    # What stays as it was is off by the shift that was not made.
+    determined, moved = _moved(used, calibration, solution)
+    judged = _judged(used, model, solution, determined)
+    shift, kept = solution.shift * determined, solution.shift * ~determined
+    # Parameters that are not updated have the omitted shift as an additional error.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
-    axis_told = [one.is_told for one in moved]
+    axis_determined = [change.is_determined for change in moved]
     new = _shifted(calibration, shift, covariance)
     residuals = ResidualSummary(
         f'left-out {judged.over}',
@@ -149,8 +152,8 @@ def update(
     )
     new = replace(
         new,
-        static=_with_residual(new.static, turn_on, axis_told),
-        dynamic=_with_residual(new.dynamic, turn_on, axis_told),
+        static=_with_residual(new.static, turn_on, axis_determined),
+        dynamic=_with_residual(new.dynamic, turn_on, axis_determined),
         provenance=replace(
             provenance,
             created=created or provenance.created,
@@ -199,7 +202,7 @@ def _moved(
     coolest, warmest = np.argsort(series.temperature)[[len(series) // 10, -1 - len(series) // 10]]
     states = np.array([series.state.mean(axis=0), series.state[coolest], series.state[warmest]]).T
     regressors = correction.curves.regressors(states, correction.table.values(states))
-    told = np.zeros(layout.n_parameters, dtype=np.bool_)
+    determined = np.zeros(layout.n_parameters, dtype=np.bool_)
     gravity, found = calibration.gravity_m_s2, []
     weights = series.n_windows / series.n_windows.sum()
     for axis, name in enumerate(AXES):
@@ -211,29 +214,33 @@ def _moved(
         rows[2, bias.static : bias.end] = (regressors[axis] @ [0.0, -1.0, 1.0]) / K
         rows[3] = rows[0] + rows[1] * float(weights @ series.force[:, axis]) / gravity
         prior, posterior = (rows @ one @ rows.T for one in (solution.prior, solution.posterior))
-        least = 1e-12 * np.trace(prior[:2, :2]) * np.eye(2) + 1e-30 * np.eye(2)
-        ratio = eigh(posterior[:2, :2], prior[:2, :2] + least, eigvals_only=True)[0]
-        is_told = bool(ratio <= _TOLD**2)
-        told[bias.static : scale.end] = is_told
-        change = rows @ solution.shift * is_told
-        sd = np.sqrt(np.maximum(np.diag(posterior if is_told else prior), 0.0))
+        jitter = 1e-12 * np.trace(prior[:2, :2]) * np.eye(2) + 1e-30 * np.eye(2)
+        ratio = eigh(posterior[:2, :2], prior[:2, :2] + jitter, eigvals_only=True)[0]
+        is_determined = bool(ratio <= 0.6**2)
+        determined[bias.static : scale.end] = is_determined
+        change = rows @ solution.shift * is_determined
+        sd = np.sqrt(np.maximum(np.diag(posterior if is_determined else prior), 0.0))
         of_scale = change[1] / gravity, sd[1] / gravity
         values = (change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3])
-        found.append(Moved(name, is_told, *map(float, values)))
-    told[layout.misalignment :] = all(one.is_told for one in found)
-    return told, tuple(found)
+        found.append(Moved(name, is_determined, *map(float, values)))
+    determined[layout.misalignment :] = all(one.is_determined for one in found)
+    return determined, tuple(found)
 
 
-def _judged(series: Series, model: Model, solution: Solution, told: Bools) -> Judged:
-    """Judge updates by earlier rests on each day (or start), against the calibration."""
+def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:
+    """
+    Score updates by the earlier rests on each day, against the calibration.
+
+    With fewer than five days the folds are starts.
+    """
     over, labels = 'days', series.day
-    if len(np.unique(labels)) < _FEWEST:
+    if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
     rows, squares = model.rows, []
     for label in np.unique(labels)[1:]:
         at = labels == label
         earlier = int(np.searchsorted(rows.start, series.start[at].min()))
-        shift = np.where(told, solution.before(earlier), 0.0)
+        shift = np.where(determined, solution.before(earlier), 0.0)
         left = series.miss[at] - series.by_parameter[at] @ shift
         share = series.n_windows[at] / series.n_windows[at].sum()
         squares.append((float(share @ series.miss[at] ** 2), float(share @ left**2)))
@@ -263,19 +270,20 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
     )
 
 
-def _with_residual(part: RegimeSet, turn_on: float, told: Sequence[bool]) -> RegimeSet:
-    """Replace the slow error of each axis by that of the starts; untold axes keep a larger one."""
+def _with_residual(part: RegimeSet, turn_on: float, determined: Sequence[bool]) -> RegimeSet:
+    """Replace the slow error of each axis by that of the starts, or keep a larger one."""
     axes: dict[str, Any] = {
         name: replace(
-            axis, residual_sd_m_s2=turn_on if is_told else max(turn_on, axis.residual_sd_m_s2)
+            axis,
+            residual_sd_m_s2=turn_on if is_determined else max(turn_on, axis.residual_sd_m_s2),
         )
-        for name, axis, is_told in zip(AXES, part.axes(), told, strict=True)
+        for name, axis, is_determined in zip(AXES, part.axes(), determined, strict=True)
     }
     return replace(part, **axes)
 
 
 def what_moved(result: Update) -> list[str]:
-    """Say in sentences what has changed, and what the rests do not tell."""
+    """Describe the ageing, the changes, and the axes that the rests do not determine."""
     ageing = result.ageing
     lines = [
         f'bias walks {spoken(ageing.bias)} and scale '
@@ -287,12 +295,12 @@ def what_moved(result: Update) -> list[str]:
             lines.append('the curves of the bias have changed')
         else:
             day = np.datetime64(int(change.time * 86400.0), 's')
-            lines.append(f'a jump before {day}: a shock, no ageing')
-    untold = [one.axis for one in result.moved if not one.is_told]
-    if untold:
+            lines.append(f'a jump before {day}: a shock, not ageing')
+    undetermined = [change.axis for change in result.moved if not change.is_determined]
+    if undetermined:
         lines.append(
-            f'the rests cannot tell {", ".join(untold)}: these axes keep their values, their '
-            'claim has aged; rests in other attitudes would tell'
+            f'the rests do not determine {", ".join(undetermined)}: these axes keep their values, '
+            'with an aged uncertainty; rests in other attitudes would determine them'
         )
     if result.n_outliers:
         lines.append(f'{result.n_outliers} rests contradict all others and are left out')

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the drift watch: ``|f| - g`` of a rest log against the claim, and when the claim will end.
+Owns the drift watch: ``|f| - g`` of a rest log against the claimed sd, and a forecast.
 
-The claim holds while the error along gravity is within `LIMIT` claimed standard deviations. The
-error is taken to walk at random from what the rests show today, with the variance that the
-evidence of the log gives; the forecast is the distribution of its first passage of either bound.
+The claim is valid while the error along gravity is within `LIMIT` claimed standard deviations. The
+forecast assumes a random walk of the error from its present estimate, with the variance estimated
+from the log: it is the distribution of the first passage of either bound.
 """
 
 from __future__ import annotations
@@ -25,8 +25,6 @@ from .update import update
 LIMIT = 2.0
 #: Probabilities of the forecast, and its horizon [days].
 _QUANTILES, _HORIZON = (0.1, 0.5, 0.9), 3650.0
-#: Number of terms of the series of the first passage: enough from a thousandth of the median on.
-_TERMS = 60
 #: Width of a class of temperature [K], and largest number of periods.
 _CLASS_K, _PERIODS = 10.0, 30
 
@@ -52,11 +50,13 @@ class Row:
 @dataclass(frozen=True)
 class Watch:
     """
-    The rests of a log against the claim, by day, by periods (at most 30) and by temperature.
+    The rests of a log against the claim.
 
-    `left`: day from which the unit was outside its claim until the end; `forecast`: days from the
-    last rest until it leaves the claim, with probabilities of 10, 50 and 90 %; `interval`: the
-    same of a unit that has just been updated. Infinite: later than ten years.
+    days, periods, temperatures: by day, by period (at most 30), by class of temperature
+    left: first day of the last time outside the claim; None while the unit is within it
+    forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit leaves its
+        claim [days]; infinite: later than ten years
+    interval: the same for a unit that has just been updated
     """
 
     days: tuple[Row, ...]
@@ -107,7 +107,7 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
     classes = [f'{one:g} .. {one + _CLASS_K:g} degC' for one in lower]
     warmer = [f'{one:g} .. {one + _CLASS_K:g} degC' for one in np.unique(lower)]
     is_out = [not row.is_within for row in days]
-    # Two days in a row: one may be a place that was not at rest.
+    # Two days in a row are required, because a single day may be a disturbed place.
     n_out = ([*is_out[::-1], False]).index(False)
     left = days[-n_out].name if n_out >= min(2, len(days)) and n_out else None
     last, ageing = days[-1].name, None
@@ -155,7 +155,8 @@ def passage(error: float, sd: float, rate: float, bound: float) -> tuple[float, 
     being inside (-c, c) until t is ``sum_k 4 / (k pi) sin(k pi (x + c) / 2 c) exp(-(k pi)^2 rate t
     / 8 c^2)`` over odd k.
     """
-    k = np.arange(1, 2 * _TERMS, 2) * np.pi
+    # 60 terms are sufficient from a thousandth of the median on.
+    k = np.arange(1, 120, 2) * np.pi
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     inside = np.abs(x := error + sd * nodes) < bound
     waves = 4.0 / k * np.sin(np.outer((x + bound) / (2.0 * bound), k))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the way from a posterior to the Calibration that the compensator applies, and its covariance.
+Owns the conversion of a posterior into the Calibration that the compensator applies.
 """
 
 from __future__ import annotations
@@ -42,17 +42,10 @@ from .selection import Selected
 from .unknowns import Layout, Prior, State
 from .windows import Sets, ThermalWindows
 
-# Edges are widened by this part of the span, so that the run that was fitted is inside them.
-_EDGE_MARGIN = 0.02
-# The response of a unit to heat flowing through it is linear: a ramp twice as fast as the
-# chamber's has twice the terms. A curve over temperature has no such law: it ends where the data
-# end.
-_LINEAR_REACH = 2.0
-# A test at one temperature holds about it [K], within such rates [K/min].
-_MARGIN_C, _RATE_MARGIN = 0.5, 0.01
-# Without any thermometer the curve is flat, and what it leaves open grows from the reference on.
-_UNSEEN_MARGIN_C, _UNSEEN_RATE = 50.0, 3.0
-_NIL = (0.0, 0.0, 0.0)
+# Ratio of the valid range of rates and of linear columns to the range in the data. The response
+# to a heat flow is linear, so a ramp twice as fast has columns twice as large. Curves over
+# temperature have no such law and are valid only over the temperatures of the data.
+_LINEAR_RANGE = 2.0
 
 
 def build_calibration(
@@ -67,23 +60,28 @@ def build_calibration(
     known: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
-    """Write a posterior as a calibration; it holds where a prior did, too, `known`."""
+    """
+    Make a calibration from a posterior.
+
+    `known`: the calibration that was the prior; the valid ranges include its ranges.
+    """
     model, prior, state = windows.model, selected.prior, selected.posterior.state
     layout = claim.layout
     taken = (layout.weights[:, 0, len(model.sets.levels()) :] >= 0).any(axis=0)
     used = np.flatnonzero(taken).tolist()
-    kinds = tuple(one.kind for one in nonlinearity.terms) if nonlinearity else ()
+    kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_parameters(regression, layout, state, model.sets, used, kinds)
     values = to_file @ as_vector(state, layout)[: layout.n_unit]
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
     is_seen = windows.was_measured
-    temperatures = _range(windows.temperature, _MARGIN_C if is_seen else _UNSEEN_MARGIN_C)
-    rate_margin = _RATE_MARGIN if is_seen else _UNSEEN_RATE
-    rates = _widened(windows.rate * 60.0, _LINEAR_REACH, rate_margin)
+    # Margins of the valid ranges [K], [K/min]. A test at one temperature is valid near it. Without
+    # a thermometer the range is wide, and the covariance of the slope covers the unknown curve.
+    temperatures = _range(windows.temperature, 0.5 if is_seen else 50.0)
+    rates = _widened(windows.rate * 60.0, _LINEAR_RANGE, 0.01 if is_seen else 3.0)
     slow = _slow_error(prior, claim).tolist()
     earlier = (None, None) if known is None else known.regime_sets()
     lacks = lack_of_fit(windows, regression, selected, claim) if regression.gravity else ((), ())
-    # Of some positions only the drift is judged: that is no ``|f| - g`` to state in the file.
+    # The file states ``|f| - g`` of left-out positions only if all positions have a left-out norm.
     is_norm = bool(np.isfinite(selected.score.norms.square).all())
     regimes = []
     for family, one, lack in zip(model.sets.families, earlier, lacks, strict=True):
@@ -98,7 +96,7 @@ def build_calibration(
         )
     static, dynamic = regimes
     seen = [_column_range(model.columns[k], windows.raw[:, k]) for k in used]
-    # A column that only the covariance has says its error by itself, however far it moves.
+    # A column with zero weight contributes only to the covariance, which is valid at any value.
     span = temperatures[1] - temperatures[0]
     n_curves = len(model.sets.levels())
     for at, k in enumerate(used):
@@ -166,19 +164,20 @@ def build_calibration(
 
 
 def _blank(family: TemperatureFunction, slow: float) -> AxisSet:
-    """Make the curves of one axis in one regime, of no temperature effect."""
+    """Return the curves of one axis in one regime with all coefficients 0."""
     nothing = (0.0,) * family.n_free
     bias, scale = (family.with_free(nothing, reference) for reference in (0.0, 1.0))
     return AxisSet(bias, scale, residual_sd_m_s2=slow)
 
 
 def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
-    """Make a response of no weights."""
-    return tuple(ResponseTerm(**vars(one), bias=_NIL, scale=_NIL) for one in columns)
+    """Return the response terms of some columns with all weights 0."""
+    zero = (0.0, 0.0, 0.0)
+    return tuple(ResponseTerm(**vars(column), bias=zero, scale=zero) for column in columns)
 
 
 def parameters_of(calibration: Calibration) -> Floats:
-    """Return the parameters in the order of the posterior; levels of the scale are 0."""
+    """Return the parameters in the order of the posterior; the level of each scale is 0."""
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):
@@ -190,8 +189,8 @@ def parameters_of(calibration: Calibration) -> Floats:
         values += [term.scale[axis] for term in calibration.response]
     terms = calibration.nonlinearity.terms if calibration.nonlinearity else ()
     for axis in range(3):
-        values += [one.coefficient[axis] for one in terms]
-        values += [one.per_kelvin[axis] for one in terms]
+        values += [term.coefficient[axis] for term in terms]
+        values += [term.per_kelvin[axis] for term in terms]
     M = calibration.misalignment
     return np.array([*values, M[1][0], M[2][0], M[2][1]])
 
@@ -199,7 +198,11 @@ def parameters_of(calibration: Calibration) -> Floats:
 def with_parameters(
     calibration: Calibration, scale_factor: Floats, values: Floats, covariance: Floats
 ) -> Calibration:
-    """Give a calibration K, and parameters in the order of its posterior but for its levels."""
+    """
+    Replace K and the parameters of a calibration.
+
+    `values`: parameters in the order of the posterior; the levels of the scale are not used
+    """
     layout = parameter_layout(calibration)
     regimes = []
     for k, regime in enumerate(calibration.regime_sets()):
@@ -259,11 +262,12 @@ def file_parameters(
     kinds: Sequence[Kind] = (),
 ) -> Floats:
     """
-    Differentiate the file's parameters, in its order, by the regression's; `kinds`: its nonlinear
-    terms.
+    Return the derivatives of the file's parameters by the regression's, both in their own order.
+
+    `used`: response columns in the file; `kinds`: nonlinear terms in the file
     """
     n, m = sets.static.n_free, sets.dynamic.n_free
-    # Place -1 is that of nothing.
+    # The last row is zero: place -1 marks a parameter that is not estimated.
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)
     rows: list[Floats] = []
     for axis, K in enumerate(regression.nominal_scale):
@@ -291,7 +295,7 @@ def file_parameters(
 
 
 def _board_lag(windows: ThermalWindows) -> float:
-    """Time constant of the board behind the case: slope of the gradient over its rate [s]."""
+    """Return the lag of the board behind the case: slope of the gradient over the rate [s]."""
     rate = windows.rate - np.mean(windows.rate)
     power = float(rate @ rate)
     lag = float(rate @ windows.gradient) / power if power > 0.0 else np.nan
@@ -299,7 +303,7 @@ def _board_lag(windows: ThermalWindows) -> float:
 
 
 def _slow_error(prior: Prior, claim: Claim) -> Floats:
-    """Sd of what the bias does of itself: anew in each mounting, and slow noise [m/s^2], (3,)."""
+    """Return the sd of mounting offset plus slow noise of each axis, shape (3,) [m/s^2]."""
     return np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.ratio)
 
 
@@ -315,21 +319,22 @@ def _triple(values: Floats) -> tuple[float, float, float]:
 def _column_range(column: Column, values: Floats) -> tuple[float, float]:
     if column.kind == 'gradient_even':
         return column.range
-    return _widened(values, _LINEAR_REACH**column.order, 0.01)
+    return _widened(values, _LINEAR_RANGE**column.order, 0.01)
 
 
 def union(ranges: Iterable[tuple[float, float]]) -> tuple[float, float]:
-    """Return the range from the lowest to the highest of some."""
+    """Return the smallest range that contains all ranges."""
     lower, upper = zip(*ranges, strict=True)
     return min(lower), max(upper)
 
 
-def _widened(values: Floats, reach: float, margin: float) -> tuple[float, float]:
+def _widened(values: Floats, ratio: float, margin: float) -> tuple[float, float]:
     lower, upper = _range(values, margin)
-    return min(lower, reach * lower), max(upper, reach * upper)
+    return min(lower, ratio * lower), max(upper, ratio * upper)
 
 
 def _range(values: Floats, smallest_margin: float) -> tuple[float, float]:
     lower, upper = float(np.min(values)), float(np.max(values))
-    margin = max(_EDGE_MARGIN * (upper - lower), smallest_margin)
+    # 2 % of the span: thermometer noise shall not put the fitted data outside their own range.
+    margin = max(0.02 * (upper - lower), smallest_margin)
     return lower - margin, upper + margin

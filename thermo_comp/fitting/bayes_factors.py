@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what a fit says of its groups of columns: what each explains, spends and gains in evidence.
+Owns the log Bayes factors of columns, and the contribution of each group of columns to a fit.
 
 References
 ----------
@@ -25,8 +25,9 @@ from .unknowns import Prior
 
 def log_bayes_factors(mode: Floats, covariance: Floats, places: Ints, prior_sd: Floats) -> Floats:
     """
-    Fall of the log evidence when some weights are held at 0 (Savage-Dickey ratio, [1]_), of each
-    row of places, shape (n, k); `prior_sd` has shape (n,) or (n, k).
+    Return the loss of log evidence if some weights are set to 0 (Savage-Dickey ratio, [1]_).
+
+    `places`: places of the weights of each of n cases, shape (n, k); `prior_sd`: (n,) or (n, k)
     """
     means = mode[places]
     blocks = covariance[places[:, :, None], places[:, None, :]]
@@ -43,7 +44,7 @@ def log_bayes_factors(mode: Floats, covariance: Floats, places: Ints, prior_sd: 
 def group_evidence(
     regression: Regression, posterior: Posterior, prior: Prior
 ) -> tuple[GroupEvidence, ...]:
-    """Say what each group of columns in use explains, spends and gains."""
+    """Return RMS contribution, effective parameters and log Bayes factor of each group in use."""
     names = np.array(regression.windows.groups)
     state, layout = posterior.state, posterior.layout
     mode = as_vector(state, layout)[: layout.n_unit]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns how the regression begins: a first guess, and what is known of any unit or of this one.
+Owns the initial state and the prior of the regression, with or without a prior calibration.
 """
 
 from __future__ import annotations
@@ -24,26 +24,14 @@ from .start import ConstantCalibration, constant_calibration, position_means, wi
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior
 from .windows import CURVE, ThermalWindows
 
-#: Nothing is steeper than a cheap sensor's data sheet: bias [m/s^2 per K] (500 ug/K), relative
-#: scale factor [1/K] (200 ppm/K), as of consumer MEMS triads.
+#: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
+#: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
-# The flattest typical slope of the bias [m/s^2 per K]: 0.1 ug/K, better than navigation grade.
+# Smallest typical slope of the bias [m/s^2 per K]: 0.1 ug/K, better than navigation grade; also
+# the smallest scale of mounting offsets [m/s^2].
 _FLATTEST = 1e-6
-# Widths of the paper's sets, which stay whatever they gain, over the steepest: as good as free.
-_FREE = 10.0
-# Few attitudes leave a line of constants open, along which what a model misses would drag them
-# far: there they stay within some times of how far the norms are off, but for a part of the prior.
-_NORM_ERRORS, _LEAST_HELD = 5.0, 0.05
-# P attitudes show 3 P drifts; a unit has 6, bias and scale of each axis, a support 2 P: with fewer
-# attitudes than 6 a tilt could be any drift of the unit.
-_DIRECTIONS_FOR_TILTS = 6
-# The noise begins with the drift, of which constants explain nothing, but for this [m/s^2].
-_SIGMA = 1e-5
-# Mounting and turn-on repeat to some times the noise in 1 Hz: 20 .. 50 ug for a navigation sensor,
-# some tenths of a mg of MEMS.
-_MOUNTING_OVER_NOISE = 3.0
-# The largest scale of that [m/s^2]: 0.5 mg, as of consumer MEMS. Student's tail allows for more.
-_LARGEST_MOUNTING = 5e-3
+# Initial sd of mounting offsets, and smallest initial noise [m/s^2]: 1 ug.
+_INITIAL_SIGMA = 1e-5
 
 
 def regress(
@@ -54,28 +42,32 @@ def regress(
     progress: Callable[[float], None],
 ) -> tuple[Regression, Selected, Floats | None]:
     """
-    Fit the windows, with or without a prior calibration: the regression, the chosen model, and
-    the typical widths of all columns that could have taken part, (2, m), None where all did.
+    Fit the windows, with or without a prior calibration.
+
+    Returns the regression, the chosen model, and the typical prior sd of all columns that could
+    have taken part, shape (2, m); None if the model has no choice of columns.
     """
     data = windows.data
-    has_one_direction = len(distinct_directions(up)) == 1
-    if options.model == 'golovach' or len(distinct_directions(up)) < _DIRECTIONS_FOR_TILTS:
-        # What the sets alone leave is no tilt of the supports.
+    n_directions = len(distinct_directions(up))
+    if options.model == 'golovach' or n_directions < POSITIONS_NEEDED:
+        # P attitudes show 3 P drifts. A unit has 6 of them (bias and scale of each axis), supports
+        # have 2 P, so below 6 attitudes a tilt cannot be distinguished from a drift of the unit.
+        # The paper's model has no tilts: they would take the errors that its two sets leave.
         data = replace(data, tilt=data.tilt[:, :0])
     regression = Regression(data, options.gravity, start.scale)
     inverse = np.asarray(np.linalg.inv(start.misalignment), dtype=np.float64)
     misalignment = inverse[[1, 2, 2], [0, 0, 1]]
     state = regression.initial_state(start.bias / start.scale, misalignment, up)
-    candidates = _candidates(windows, start, options, has_one_direction=has_one_direction)
+    candidates = _candidates(windows, start, options, has_one_direction=n_directions == 1)
     drift = within_positions(data.mean / start.scale, data.position)
-    sigma = max(float(np.sqrt(np.mean(drift**2))), _SIGMA)
+    sigma = max(float(np.sqrt(np.mean(drift**2))), _INITIAL_SIGMA)
     prior = Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, BIAS_SD),
         scale_sd=SCALE_SD,
         misalignment_sd=MISALIGNMENT_SD,
         column_sd=np.zeros_like(candidates.typical),
-        offset_sd=_SIGMA,
+        offset_sd=_INITIAL_SIGMA,
         sigma=np.full(3, sigma),
         offset_scale=_mounting_scale(windows, start),
     )
@@ -98,24 +90,30 @@ def regress(
     if options.model == 'golovach':
         prior = replace(prior, column_sd=candidates.typical)
         return regression, fit_all(regression, state, prior, candidates), None
-    is_open = len(distinct_directions(up)) < POSITIONS_NEEDED
-    held = prior
-    if is_open:
+    narrow = prior
+    if n_directions < POSITIONS_NEEDED:
+        # Few attitudes do not determine all constants, and the errors of an incomplete model would
+        # move them far. During the selection their prior sd is therefore five times the largest
+        # error of a norm, at least 5 % and at most 100 % of the prior's sd.
         norms = np.linalg.norm(position_means(data) / start.scale, axis=1)
-        off = _NORM_ERRORS * float(np.abs(norms - regression.norms(state)).max())
+        off = 5.0 * float(np.abs(norms - regression.norms(state)).max())
         bias, scale = (
-            float(np.clip(most, _LEAST_HELD, 1.0))
-            for most in (off / BIAS_SD, off / options.gravity / SCALE_SD)
+            float(np.clip(ratio, 0.05, 1.0))
+            for ratio in (off / BIAS_SD, off / options.gravity / SCALE_SD)
         )
-        held = replace(prior, bias_sd=bias * prior.bias_sd, scale_sd=scale * prior.scale_sd)
-    selected = select(regression, state, held, candidates, tell)
+        narrow = replace(prior, bias_sd=bias * prior.bias_sd, scale_sd=scale * prior.scale_sd)
+    selected = select(regression, state, narrow, candidates, tell)
     wide = replace(selected.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     return regression, replace(selected, prior=wide), candidates.typical
 
 
 def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> float:
-    """Say how well mountings of such a sensor repeat [m/s^2], from its white noise."""
-    # Second differences of neighbouring windows are free of drift.
+    """
+    Return the scale of the prior of mounting offsets [m/s^2], three times the noise in 1 Hz.
+
+    This is 20 .. 50 ug for a navigation sensor and some tenths of a mg for MEMS.
+    """
+    # A linear drift has no second difference, so these show the white noise alone.
     data = windows.data
     same = (data.position[2:] == data.position[:-2]).nonzero()[0]
     if not len(same):
@@ -123,7 +121,8 @@ def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> floa
     bend = np.diff(data.mean / start.scale, n=2, axis=0)[same]
     sigma = float(np.median(np.abs(bend))) / (0.6745 * np.sqrt(6.0))
     density = sigma * np.sqrt(float(np.median(np.diff(data.time)[same])))
-    return float(np.clip(_MOUNTING_OVER_NOISE * density, _FLATTEST, _LARGEST_MOUNTING))
+    # At most 0.5 mg, as of consumer MEMS; the tail of the Student prior allows for more.
+    return float(np.clip(3.0 * density, _FLATTEST, 5e-3))
 
 
 def _candidates(
@@ -133,7 +132,7 @@ def _candidates(
     *,
     has_one_direction: bool,
 ) -> Candidates:
-    """Say which columns may take part, and how large their weights may be."""
+    """Return the columns that may take part, with the typical and largest sd of their weights."""
     data = windows.data
     groups = np.array(data.groups)
     asked = {*data.groups} if options.groups is None else {*options.groups, *options.forced}
@@ -143,12 +142,12 @@ def _candidates(
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
     if data.n_positions >= POSITIONS_NEEDED:
-        # Rests at one temperature each drift from one to the other.
+        # Rests of one temperature each show the drift as differences between their norms.
         force = (position_means(data) - start.bias) / start.scale
         sizes = sizes_of(windows, options)
         off = np.linalg.norm(force, axis=1) - sizes
         if np.ptp(sizes) > 0.0:
-            # What is nonlinear in |f| is no drift.
+            # Nonlinearity over |f| is not a thermal drift: subtract a cubic of |f|.
             smooth = np.vander(sizes / sizes.max(), 4)
             off -= smooth @ np.linalg.lstsq(smooth, off, rcond=None)[0]
         drift = max(drift, float(np.std(off)))
@@ -157,23 +156,23 @@ def _candidates(
     slopes = np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])
     fixed = np.zeros(parts.shape, dtype=bool)
     if has_one_direction:
-        # One attitude does not tell the scale from the bias: its curve stays at its prior.
+        # One attitude cannot separate scale and bias: the curve of the scale keeps its prior.
         parts[1] &= groups == CURVE
         fixed[1] = parts[1]
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
-        # The paper's sets stay whatever they gain: their prior says nothing.
-        slopes, forced, fixed = _FREE * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
+        # The paper's sets are not selected: their prior, ten times the largest sd, is flat.
+        slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
     typical, largest = (np.outer(one, data.kelvins) * parts for one in (slopes, STEEPEST))
     if not windows.was_measured:
-        # No thermometer was there: the slope over temperature is claimed, whatever it may be.
+        # Without a thermometer the slope is unknown: its whole prior goes into the covariance.
         typical[:, 0] = largest[:, 0] = STEEPEST
         forced[0] = fixed[:, 0] = True
     return Candidates(typical, largest, forced, fixed)
 
 
 def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
-    """Return |f| of each position as stated, shape (n_positions,)."""
+    """Return the known |f| of each position, shape (n_positions,) [m/s^2]."""
     forces = windows.data.forces
     if forces is None:
         return np.full(windows.data.n_positions, options.gravity)
@@ -181,7 +180,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Guess the triad without temperature: by its ellipsoid, or where that is not seen, a norm."""
+    """Estimate the triad without temperature: from the ellipsoid, or from the norms alone."""
     means = position_means(windows.data)
     gravity = sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)

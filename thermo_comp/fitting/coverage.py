@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what directions of rest are worth: how many there are, what they will leave, the next one.
+Owns the design of positions: their directions, the covariance that they give, the next direction.
 
-At rest |f| = g is known, so each position tells one number about the nine constants of a triad:
+At rest |f| = g is known, so each position gives one equation for the nine constants of a triad:
 bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. Linearised about
-an ideal triad, and with the fit's own prior, their covariance follows from the directions alone.
+an ideal triad, and with the fit's prior, their covariance follows from the directions alone.
 """
 
 from __future__ import annotations
@@ -22,23 +22,10 @@ from ..unit.gravity import STANDARD_GRAVITY
 from .start import constant_calibration
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD
 
+#: Prior sd of the nine constants: bias [g], relative scale, misalignment [rad].
 PRIOR_SD = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, MISALIGNMENT_SD], 3)
-# What is easily held is proposed if it is worth this part of the best there is ...
-_NEARLY = 0.5
-# ... and what is nearer than 20 degrees to a position never.
-_NEAR = math.cos(math.radians(20.0))
-
-#: Directions closer than this are one position measured twice.
+#: Largest angle between two rests of the same position [deg].
 SAME_DIRECTION_DEG = 5.0
-# About their centre readings have one norm: elsewhere it differs by this part of their spread, and
-# about a good centre by less than this part of its own.
-_OFF_CENTRE, _ON_CENTRE = 0.3, 0.1
-# Readings that lie this flat have no centre across.
-_FLAT = 0.02
-# What a scan expects of a rest before it sees any: an error in parts of g, as if so many had shown
-# it, else few rests that agree by luck would win; and what it takes for better.
-_EXPECTED_ERROR, _EXPECTED_N, _BETTER = 1e-3, 4, 1.02
-_FEWEST, _FEWEST_FOR_MISALIGNMENT = 6, 12
 
 
 def force_columns(up: Floats) -> Floats:
@@ -57,7 +44,7 @@ def norm_columns(up: Floats) -> Floats:
 
 
 def constants_covariance(up: Floats, sd: Floats) -> Floats:
-    """Covariance of the nine after positions `up` (n, 3), each known to `sd` (n,) [g]."""
+    """Return the covariance of the constants for positions `up` (n, 3) of noise `sd` (n,) [g]."""
     seen = norm_columns(up) / sd[:, None]
     return np.asarray(np.linalg.inv(np.diag(PRIOR_SD**-2) + seen.T @ seen))
 
@@ -72,19 +59,20 @@ def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
     """
     Find the direction where a position of noise `sd` [g] lowers the mean variance the most.
 
-    Faces of a cube are preferred where they are nearly as good, then its edges, then its corners;
-    what is near a direction of `seen` (n, 3) is not proposed.
+    Faces of a cube, which are the easiest to hold, are preferred if their gain is at least half of
+    the largest, then edges, then corners. Directions closer than 20 degrees to one of `seen`,
+    shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
-    tells = norm_columns(_SPHERE)
-    moved = tells @ covariance
+    columns_of_norm = norm_columns(_SPHERE)
+    moved = columns_of_norm @ covariance
     gain = np.einsum('ij,jk,ik->i', moved, weight, moved)
-    gain /= np.einsum('ij,ij->i', moved, tells) + sd * sd
-    gain[np.max(_SPHERE @ seen.T, axis=1, initial=-1.0) > _NEAR] = 0.0
-    good = gain >= max(_NEARLY * gain.max(), 1e-300)
+    gain /= np.einsum('ij,ij->i', moved, columns_of_norm) + sd * sd
+    gain[np.max(_SPHERE @ seen.T, axis=1, initial=-1.0) > math.cos(math.radians(20.0))] = 0.0
+    good = gain >= max(0.5 * gain.max(), 1e-300)
     tier = next(tier for tier in _TIERS if good[tier].any())
-    # Of those that are worth the same, the first one.
+    # Among directions of equal gain take the first.
     return np.asarray(_SPHERE[tier][np.argmax(gain[tier] >= 0.99 * gain[tier].max())])
 
 
@@ -96,7 +84,7 @@ def farthest(up: Floats) -> tuple[Floats, float]:
 
 
 def distinct_directions(up: Floats) -> Floats:
-    """Drop unit vectors, shape (n, 3), that repeat another."""
+    """Return the unit vectors, shape (n, 3), without those close to an earlier one."""
     kept: list[Floats] = []
     limit = np.cos(np.radians(SAME_DIRECTION_DEG))
     for direction in up:
@@ -106,38 +94,41 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """Make unit vectors of mean readings (n, 3) about a centre; NaN where there is none."""
+    """Return unit vectors of mean readings (n, 3) about a centre; NaN for a reading at it."""
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
 
 def rough_centre(means: Floats) -> Floats:
     """
-    Find the reading of no force: zeros, where they will do, else the centre of a sphere.
+    Return the reading at zero force: 0 if the norms of the readings agree, else a sphere's centre.
 
-    Angles between raw vectors mean nothing where the zero of the words is far away, as in offset
-    binary. `means` has shape (n, 3); too few, or flat ones, have no centre but zero.
+    With offset binary codes the angles between raw vectors are meaningless. `means` has shape
+    (n, 3); if they are fewer than four, or in a plane, the result is 0.
     """
     zero = np.zeros(3)
     if len(means) < 4:
         return zero
     arms = means - means.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    if np.std(np.linalg.norm(means, axis=1)) < _OFF_CENTRE * spread:
+    # The origin is accepted as the centre if the norms about it vary by less than 30 % of spread.
+    if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
-    if values[0] < _FLAT * values[2]:
+    # Points with less than 2 % of their variance across a plane do not determine a centre.
+    if values[0] < 0.02 * values[2]:
         return zero
-    # |m|^2 = 2 c m + const, of the arms, where numbers are small.
+    # A sphere about c satisfies |m|^2 = 2 c m + const; `arms` are centred for small numbers.
     columns = np.column_stack((2.0 * arms, np.ones(len(arms))))
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
-    is_sphere = np.std(radii) < _ON_CENTRE * np.mean(radii)
+    # The sphere is accepted if its radii vary by less than 10 %.
+    is_sphere = np.std(radii) < 0.1 * np.mean(radii)
     return np.asarray(means.mean(axis=0) + centre) if is_sphere else zero
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Worst sd of bias, scale and misalignment per unit of norm noise, of directions (n, 3)."""
+    """Return the largest sd of a constant per unit of norm noise, for directions (n, 3)."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -147,25 +138,26 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
 
 def best_rests(candidates: list[Floats]) -> int:
     """
-    Choose among sets of rests, the strictest first: mean readings, shape (n, 3) each.
+    Return the best of several sets of rests, each given as mean readings of shape (n, 3).
 
-    The one that tells bias and scale best: by what its rests leave of |f| - g, and how they are
-    spread. The first, unless another is clearly better, or where no set has enough attitudes.
+    The best set has the smallest sd of the constants, from the residuals of |f| and the directions
+    of its rests. The first set, which has the strictest thresholds, is taken unless another is
+    better by 2 %, or if no set has six attitudes.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
     enough = [len(distinct_directions(one)) for one in ups]
     n_most = max(enough, default=0)
     costs = np.full(len(candidates), np.inf)
     for number, means in enumerate(candidates):
-        if enough[number] >= _FEWEST:
-            costs[number] = _cost(means, n_most >= _FEWEST_FOR_MISALIGNMENT)
+        if enough[number] >= 6:
+            costs[number] = _cost(means, n_most >= 12)
     if not np.isfinite(costs).any():
         return 0
-    return int(np.argmax(costs <= _BETTER * np.min(costs)))
+    return int(np.argmax(costs <= 1.02 * np.min(costs)))
 
 
 def _cost(means: Floats, with_misalignment: bool) -> float:
-    """Worst standard deviation of the constants by the scatter that is left, in parts of g."""
+    """Return the largest sd of a constant at the scatter of the rests, in units of g."""
     n_free = len(means) - (9 if with_misalignment else 6)
     if n_free < 0:
         return np.inf
@@ -174,17 +166,20 @@ def _cost(means: Floats, with_misalignment: bool) -> float:
     except FitError:
         return np.inf
     norms = np.linalg.norm(force, axis=1)
-    left = float(np.sum((norms - 1.0) ** 2)) + _EXPECTED_N * _EXPECTED_ERROR**2
-    scatter = float(np.sqrt(left / (n_free + _EXPECTED_N)))
+    # Prior of the scatter: an error of 1e-3 g, weighted as four rests, so that a set of few rests
+    # that agree by chance does not win.
+    left = float(np.sum((norms - 1.0) ** 2)) + 4 * 1e-3**2
+    scatter = float(np.sqrt(left / (n_free + 4)))
     return geometry(force / norms[:, None], with_misalignment) * scatter
 
 
 @dataclass(frozen=True)
 class LeastKnown:
     """
-    The attitude of which a calibration knows least, at its reference temperature and at rest.
+    The attitude with the largest sd of |f|, at rest and at the reference temperature.
 
-    Beside its angle to the nearest position stand the sd of |f| there and its median in them.
+    away_deg: its angle to the nearest position [deg]
+    sd_m_s2, seen_sd_m_s2: sd of |f| in this attitude, and its median over the positions [m/s^2]
     """
 
     up: tuple[float, float, float]
@@ -194,13 +189,13 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """Find what positions at unit vectors (n, 3) left unseen; None where nothing is claimed."""
+    """Find the least known attitude for positions (n, 3); None without a covariance."""
     if calibration.posterior is None:
         return None
     layout, axes = parameter_layout(calibration), calibration.axes
     levels = [block.static for block in (*layout.bias, *layout.scale)]
     places = [*levels, *range(layout.misalignment, layout.misalignment + 3)]
-    # What a bias or a scale has too much, the force has too little.
+    # A bias or scale that is too large makes the corrected force too small.
     unit = np.array([-1.0 / axis.scale_factor for axis in (axes.x, axes.y, axes.z)])
     unit = np.concatenate((unit, np.repeat((-1.0, 1.0), 3) * calibration.gravity_m_s2))
     covariance = calibration.posterior.covariance()[np.ix_(places, places)] * np.outer(unit, unit)
@@ -220,7 +215,7 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
 
 
 def spoken_direction(up: Floats) -> str:
-    """Say which way a user is to hold the sensor: the axes that point up, and what they read."""
+    """Describe an attitude for a user: the axes that point up, and the readings in g."""
     signs = [f'{"-" if value < 0.0 else "+"}{name}' for name, value in zip('xyz', up, strict=True)]
     size = np.abs(up)
     axes = [sign for sign, one in zip(signs, size, strict=True) if one > 0.1]
@@ -246,7 +241,7 @@ def _spiral(n: int) -> Floats:
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
 
-_CUBE = _cube()
-_SPHERE = np.concatenate([_CUBE, _spiral(500)])
-# Faces, edges, corners, anything.
+# Unit vectors: the 26 of a cube, then 500 that cover the sphere evenly (8 degrees apart).
+_SPHERE = np.concatenate([_cube(), _spiral(500)])
+# Slices of `_SPHERE`: faces, edges and corners of a cube, then all other directions.
 _TIERS = (slice(0, 6), slice(6, 18), slice(18, 26), slice(26, None))

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the checks of the data: whether the bags can carry a calibration, with numbers and advice.
+Owns the checks of the data before and after a fit, with numbers and advice.
 
-Only contradictions are refused: of what is missing the posterior says what it costs. A refusal
+Only contradictory data are refused; missing data increase the posterior uncertainty. A refusal
 stops the fit unless the user allows it by name; advice goes into the result.
 """
 
@@ -32,24 +32,11 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
 
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_ADVISED = 6, 9, 18
-# Largest standard deviation, in units of the noise of one position, that a parameter may have: 18
-# spread positions give 1, nine 3, the six faces each done three times by hand 4.5 to 8.
-_WORST_GEOMETRY = 6.0
-_SATURATED_NEEDED, _SATURATED_ADVISED = 0.05, 0.001
-# A direction is unseen whose |f| is known so many times less than in the positions.
-_UNSEEN = 3.0
-# An axis that is alive differs from itself within so many samples.
-_DEAD_SAMPLES = 1000
-# No triad is built with nine constants as small as the first, in parts of one, and moves |f| by
-# less than the second over so many kelvins: what reads like this has been compensated.
-_COMPENSATED, _COMPENSATED_DRIFT, _COMPENSATED_K = 1e-4, 2e-5, 20.0
-# What has a prior leaves no more than this many times what curves without one do.
-_CONTRADICTED = 1.5
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What the fit noticed: a name, which overrides a refusal, and a line with numbers."""
+    """A finding of the checks: its name, with which a user allows a refusal, and its message."""
 
     name: str
     level: Literal['refusal', 'advice', 'good']
@@ -74,7 +61,7 @@ def enforce(findings: Iterable[Finding], options: FitOptions) -> list[Finding]:
 
 
 def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
-    """Refuse another unit's calibration: what it is sure of is not so of this one."""
+    """Refuse a prior made for another unit: its small uncertainties do not apply to this one."""
     if prior is None or prior.provenance.model == POPULATION:
         return
     if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:
@@ -89,10 +76,10 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
     """Judge the raw data: saturation, motion, numbers that are no counts, jumps, angular rates."""
     part = sum(bag.n_saturated for bag in bags) / max(sum(bag.n_samples for bag in bags), 1)
-    if part > _SATURATED_ADVISED:
+    if part > 0.001:
         yield Finding(
             'saturation',
-            'refusal' if part > _SATURATED_NEEDED else 'advice',
+            'refusal' if part > 0.05 else 'advice',
             f'{100.0 * part:.2f} % of the samples are at the full scale: an axis sees more than '
             'it can measure, or --full-scale is wrong',
         )
@@ -100,8 +87,8 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
     if still < 0.5:
         yield _advice(
             'motion',
-            f'only {100.0 * still:.0f} % of the time is still; vibration or handling is in the '
-            'rest and was cut out',
+            f'the unit was still for only {100.0 * still:.0f} % of the time; vibration or '
+            'handling in the other time was cut out',
         )
     if not any(interval.sample_sd.any() for bag in bags for interval in bag.intervals):
         text = 'no sample at rest differs from the one before: does the sensor stand still?'
@@ -147,18 +134,19 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
 
 
 def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[str]:
-    """Name axes that read one word throughout a rest, and more than one in most."""
+    """Describe axes that are constant throughout a rest, but not in most of the rests."""
     rests = [(bag.source.name, one) for bag in bags for one in bag.intervals]
     alive = np.array([one.sample_sd > 0.0 for _, one in rests])
     for (name, one), row in zip(rests, alive, strict=True):
         is_dead = ~row & (2 * alive.sum(axis=0) >= len(rests)) & (np.ptp(one.mean, axis=0) == 0.0)
-        for axis in np.flatnonzero(is_dead & (one.count.sum() >= _DEAD_SAMPLES)):
+        # A working axis shows noise or drift within a thousand samples.
+        for axis in np.flatnonzero(is_dead & (one.count.sum() >= 1000)):
             hours = (one.end_ns - one.start_ns) / 3600e9
             yield f'{name}: {"xyz"[axis]} reads {one.mean[0, axis]:g} to the bit for {hours:.2g} h'
 
 
 def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
-    """Say one jump in words; `since_s` is where the part of its bag begins."""
+    """Describe a jump; `since_s`: start of the part of the bag that was read [s]."""
     vector = ', '.join(f'{v / per_mg:+.3g}' for v in jump.step)
     warmed = ''
     if np.isfinite(jump.temperature_change):
@@ -174,7 +162,7 @@ def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
 
 
 def judge_copies(names: Sequence[str]) -> list[Finding]:
-    """Say which thermometers repeat the board's readings."""
+    """Report the thermometers that repeat the board's readings."""
     return [
         _advice('copy', f'temperature/{name} repeats the readings of the board: it is left out')
         for name in names
@@ -182,7 +170,7 @@ def judge_copies(names: Sequence[str]) -> list[Finding]:
 
 
 def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterator[Finding]:
-    """Judge what the still windows cover: temperatures, ramps, directions `up`, shape (n, 3)."""
+    """Judge temperatures, ramps and directions `up`, shape (n, 3), of the still windows."""
     yield _judge_positions(up)
     if not windows.has_temperature:
         text = 'no temperature was recorded: the calibration holds at the temperature of the test'
@@ -195,7 +183,7 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
         yield _advice(
             'unmeasured',
             f'{100.0 * part:.0f} % of the time at rest has no temperatures and is left out: do '
-            'the thermometers and the accelerometer share a clock?',
+            'the thermometers and the accelerometer use the same clock?',
         )
     span = float(np.ptp(windows.temperature))
     text = f'temperature span {span:.1f} degC'
@@ -209,11 +197,12 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
     yield from _judge_ramps(windows)
     if not has_case:
         text = (
-            'no case temperature: the regime is told from the board alone, later and less surely'
+            'no case temperature: the regime is detected from the board temperature alone, later '
+            'and less reliably'
         )
         yield _advice('case', text)
         return
-    # The case leads: the gradient has the sign of the board's rate.
+    # The case temperature leads, so the gradient has the sign of the board's rate.
     moving = np.abs(windows.rate) * 60.0 > RAMP_K_MIN
     if windows.data.weight[moving].sum() >= 30.0 * windows.data.weight.max():
         correlation = float(np.corrcoef(windows.gradient[moving], windows.rate[moving])[0, 1])
@@ -232,15 +221,15 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
     if heating + cooling < 0.02:
         yield _advice(
             'ramps',
-            f'no ramp: the board never changes by {RAMP_K_MIN:g} K/min for long, so what a ramp '
-            'does is not known; record ramps between the soaks',
+            f'no ramp: the board temperature never changes by {RAMP_K_MIN:g} K/min for long, so '
+            'the effect of a ramp is unknown; record ramps between the soaks',
         )
     elif min(heating, cooling) < 0.1 * max(heating, cooling):
         seen, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')
         yield _advice(
             'directions',
-            f'only {seen} was seen; errors in a ramp change sign with its direction, so record '
-            f'{missing}, too',
+            f'only {seen} was recorded; errors in a ramp change sign with its direction, so '
+            f'record {missing}, too',
         )
     calm = windows.weight <= 0.5
     span = float(np.ptp(windows.temperature))
@@ -276,8 +265,8 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Judge whether the positions left a direction unseen, and say what that costs."""
-    if least is not None and least.sd_m_s2 >= _UNSEEN * least.seen_sd_m_s2:
+    """Advise a further position if the sd of |f| in some attitude is 3 times the positions'."""
+    if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield _advice(
             'unseen',
             f'{least.away_deg:.0f} deg away from every position the sd of |f| is '
@@ -287,11 +276,16 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
 
 
 def can_tell_misalignment(up: Floats) -> bool:
-    """Whether positions are enough, and spread enough, to estimate M."""
+    """
+    Whether the number and the spread of positions are sufficient to estimate M.
+
+    The limit is 6 for the sd of a parameter in units of the noise of one position: 18 well spread
+    positions give 1, nine give 3, the six faces held three times each by hand give 4.5 to 8.
+    """
     distinct = distinct_directions(up)
     if len(distinct) < POSITIONS_FOR_MISALIGNMENT:
         return False
-    return geometry(distinct, with_misalignment=True) <= _WORST_GEOMETRY
+    return geometry(distinct, with_misalignment=True) <= 6.0
 
 
 def judge_constants(
@@ -302,16 +296,18 @@ def judge_constants(
     options: FitOptions,
 ) -> Iterator[Finding]:
     """
-    Refuse what nothing is left of to correct: `constants` are K, bias [m/s^2] and M's elements,
-    `raw` is what |f| - g has with these alone, RMS [m/s^2].
+    Refuse data that appear to be compensated already.
+
+    `constants`: K, bias [m/s^2] and elements of M; `raw`: RMS of |f| - g with these alone [m/s^2].
+    No triad is built with all constants below 1e-4 and a drift of |f| below 2e-5 g over 20 K.
     """
     K, bias, skew = constants
     span = float(np.ptp(windows.temperature)) if windows.has_temperature else 0.0
     scale = float(np.abs(K / (1.0 if options.input == 'm/s^2' else K.mean()) - 1.0).max())
     worst, skewed = float(np.abs(bias).max()), float(np.abs(skew).max())
     least = max(scale, worst / options.gravity, skewed)
-    is_none = least < _COMPENSATED and raw < _COMPENSATED_DRIFT * options.gravity
-    if is_none and span > _COMPENSATED_K and can_tell_misalignment(up):
+    is_none = least < 1e-4 and raw < 2e-5 * options.gravity
+    if is_none and span > 20.0 and can_tell_misalignment(up):
         yield Finding(
             'compensated',
             'refusal',
@@ -329,7 +325,7 @@ def judge_result(
     options: FitOptions,
     has_temperature: bool = True,
 ) -> Iterator[Finding]:
-    """Judge what the fit left; `slow` is what no temperature explains, RMS of the axes [m/s^2]."""
+    """Judge the residuals; `slow`: sd of the bias that no temperature explains [m/s^2]."""
     overall = rows[-1]
     raw, fitted = overall.raw.rms / MICRO_G, overall.fitted.rms / MICRO_G
     others = ''
@@ -343,16 +339,17 @@ def judge_result(
         why = ': no temperature drift above the noise; already compensated?'
         yield _advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and has_temperature:
-        why = 'no position tells what another does: take more of them'
+        why = 'each position is predicted badly by the others; record more positions'
         yield _advice('left out', f'{text}: positions left out are worse than raw: {why}')
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    if options.prior is not None and overall.fitted.rms > _CONTRADICTED * alone:
+    if options.prior is not None and overall.fitted.rms > 1.5 * alone:
         yield _advice(
             'prior',
-            f'the bags contradict the prior: two sets by themselves leave {spoken(alone)}, with '
-            f'the prior it is {spoken(overall.fitted.rms)}: is it of this unit, or of its type?',
+            f'the bags contradict the prior: |f| - g is {spoken(overall.fitted.rms)} RMS with the '
+            f'prior, {spoken(alone)} with two sets fitted without it: was the prior made for this '
+            'unit, or for its type?',
         )
     if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:
         yield _advice(

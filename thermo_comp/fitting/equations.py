@@ -9,11 +9,11 @@ Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
     a = (A u_p)_i g,  A = M^-1,  l_p across u_p: tilt of the support
 
 B and S are columns of one table (`unit.columns`), each divided by its RMS. With g = 0 this is the
-equation of an angular rate: b, B beta and o_p remain. Where |f| of the positions differs it takes
-the place of g, and ``kappa sum_j (k_j + k'_j t) n_j(a)`` is added: nonlinear terms (`forces`).
-Everything is a combination of a few base series (one, columns, their derivatives by the start
-states, t, temperatures of the support, the measured values), so the products of the whitened base
-series of each position and section hold all that the regression asks of the windows.
+equation of an angular rate: b, B beta and o_p remain. If |f| differs between positions it replaces
+g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added (`forces`).
+All terms are linear combinations of a few base series (1, columns, their derivatives by the
+initial lag states, t, temperatures of the support, the measured values). The products of the
+whitened base series of each position and section are therefore sufficient for the regression.
 """
 
 from __future__ import annotations
@@ -28,12 +28,8 @@ from .forces import Forces
 from .noise import Whitener
 from .unknowns import Layout, Noise, Prior, State, Windows, lay_out
 
-#: Row and column of the elements of M^-1 that are unknown.
+#: Row and column of the unknown elements of M^-1.
 MISALIGNMENT_ROWS = ((1, 0), (2, 0), (2, 1))
-# Start states vary along few directions: the others have less of the largest variance than this.
-_LEAST_START = 1e-6
-# A derivative by a start state that has faded below this is 0: denormal numbers are slow.
-_FADED = 1e-9
 
 
 @dataclass(frozen=True)
@@ -41,7 +37,7 @@ class Products:
     """
     Products of the base series of the columns in use.
 
-    columns: the columns in use; moved: which of those a start state moves; lag: by which lag
+    columns: the columns in use; moved: those of them with a lag; lag: number of that lag
     means: mean of the base series in each position, shape (n_positions, n_base)
     cells: products in each position and section, shape (n_cells, n_base, n_base)
     first: first cell of each position; section: section of each cell
@@ -61,7 +57,7 @@ class Products:
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
-        """Products of each position without some sections, shape as of `whole`."""
+        """Products of each position without some sections, of the same shape as `whole`."""
         result: Floats = self.whole.copy()
         position = np.cumsum(np.isin(np.arange(len(self.cells)), self.first)) - 1
         gone = np.isin(self.section, sections)
@@ -72,12 +68,12 @@ class Products:
 @dataclass(frozen=True)
 class Tangent:
     """
-    The equations about a state: derivative of each axis in each position by its unknowns, and
-    measured minus predicted, both as combinations of the base series: shapes
-    (n_positions, 3, n_base, n_unknowns) and (n_positions, 3, n_base).
+    The equations linearised about a state, as coefficients of the base series.
 
-    The unknowns of an axis: kappa, bias, weights, nonlinear coefficients, radius, misalignment
-    (3), up (2), stretch, offset, tilts, starts.
+    derivatives: derivatives by the unknowns, shape (n_positions, 3, n_base, n_unknowns); the
+        unknowns of an axis are kappa, bias, weights, nonlinear coefficients, radius, misalignment
+        (3), up (2), stretch, offset, tilts, initial lag states
+    residual: measured minus predicted, shape (n_positions, 3, n_base)
     """
 
     derivatives: Floats
@@ -107,10 +103,12 @@ class Equations:
         self.columns = windows.columns / self.rms
         self.bag_of_position = windows.bag_of_position
         self.n_bags = int(windows.bag.max()) + 1
-        self._starts = np.where(np.abs(windows.start) < _FADED, 0.0, windows.start) / self.rms
+        # Derivatives below 1e-9 are set to 0, because arithmetic with denormal numbers is slow.
+        self._starts = np.where(np.abs(windows.start) < 1e-9, 0.0, windows.start) / self.rms
         values, vectors = np.linalg.eigh(windows.start_covariance)
-        kept = values > _LEAST_START * values.max(initial=0.0)
-        #: Start states are this times their standardised components, shape (n_lags, r).
+        # The initial lag states are strongly correlated: few components have nearly all variance.
+        kept = values > 1e-6 * values.max(initial=0.0)
+        #: Initial lag states are this times standardised components, shape (n_lags, r).
         self.start_root = vectors[:, kept] * np.sqrt(values[kept])
         first = np.searchsorted(windows.position, np.arange(windows.n_positions))
         level = np.add.reduceat(self.measured, first, axis=0)
@@ -124,7 +122,7 @@ class Equations:
         self.reweigh(windows.weight)
 
     def initial_state(self, bias: Floats, misalignment: Floats, up: Floats) -> State:
-        """Make a state without any effect of temperature, of the nominal scale factors."""
+        """Return a state with nominal scale factors and no effect of temperature."""
         return State(
             kappa=np.ones(3),
             bias=bias,
@@ -140,7 +138,7 @@ class Equations:
         )
 
     def norms(self, state: State) -> Floats:
-        """Return |f| of each position, with the error of a radius, shape (n_positions,)."""
+        """Return |f| of each position with the estimated radius, shape (n_positions,)."""
         if self.forces is None:
             return np.full(self.windows.n_positions, self.gravity)
         return self.forces.norms(state.radius, np.zeros_like(state.stretch))
@@ -155,15 +153,17 @@ class Equations:
         return np.asarray(self.forces.norms(state.radius, state.stretch)[:, None])
 
     def reweigh(self, weight: Floats) -> None:
-        """Take other weights of the windows, shape (n,)."""
+        """Set the weights of the windows, shape (n,)."""
         self.weight = weight
         self.noise: Noise | None = None
         self._products: tuple[Bools, Products] | None = None
 
     def layout(self, used: Bools, bends: Bools | None = None) -> Layout:
         """
-        Give every unknown its place; `used`: columns of bias and scale, shape (2, m), `bends`:
-        nonlinear coefficients, shape (2 k,); None for all.
+        Assign a place to every unknown.
+
+        `used`: active columns of bias and scale, shape (2, m); `bends`: active nonlinear
+        coefficients, shape (2 k,); None for all
         """
         if bends is None or self.forces is None:
             bends = np.ones(2 * len(self.forces.kinds) if self.forces else 0, dtype=bool)
@@ -178,7 +178,7 @@ class Equations:
         )
 
     def whiten(self, noise: Noise) -> None:
-        """Filter all base series with a noise, unless that is done."""
+        """Whiten all base series for a noise model, if the current one is another."""
         if noise == self.noise:
             return
         gains = self.whitener.gains(self.weight, noise)
@@ -191,7 +191,7 @@ class Equations:
         self._filtered_others = self.whitener.filter(others, gains)
 
     def products(self, used: Bools) -> Products:
-        """Form the products of the columns in use, shape (2, m), under the current noise."""
+        """Return the products of the active columns, shape (2, m), for the current noise."""
         taken: Bools = np.any(used, axis=0)
         if self._products is not None and np.array_equal(self._products[0], taken):
             return self._products[1]
@@ -235,7 +235,7 @@ class Equations:
         return result
 
     def absent_products(self, absent: Ints, used: Bools, p: int) -> tuple[Floats, Floats]:
-        """Products of absent columns of a position: among themselves, with the base in use."""
+        """Return products of inactive columns in a position: mutual, and with the active base."""
         a, b = np.searchsorted(self.windows.position, (p, p + 1))
         present = self.products(used)
         own, filtered = self._filtered_columns[a:b, absent], self._filtered_others[a:b]
@@ -259,12 +259,12 @@ class Equations:
         effect = self._effect(state, products)
         behind = 1 + n_columns + np.arange(len(products.moved))
         on_bias, on_scale = state.weights[:, :, columns]
-        # Per axis: what multiplies kappa a, with the base series of one first.
+        # Per axis: factor of kappa a as a combination of the base; the first base series is 1.
         scaled = np.swapaxes(effect @ on_scale.T, 1, 2)
         scaled[:, :, 0] = 1.0
         first_tilt = n_base - 3 - n_tilts
         across = self._across(state)
-        in_bias, in_scale = (np.flatnonzero(one[columns]) for one in used)
+        in_bias, in_scale = (np.flatnonzero(mask[columns]) for mask in used)
         n_linear = 2 + len(in_bias) + len(in_scale)
         n_own = layout.axis.shape[1]
         at, n_stretches = n_own + layout.radius.size, layout.stretch.shape[1]
@@ -276,7 +276,7 @@ class Equations:
         T[..., 2 : 2 + len(in_bias)] = effect[:, None, :, in_bias]
         times = (state.kappa * (force + self._bends(state, 0)))[:, :, None, None]
         T[..., 2 + len(in_bias) : n_linear] = times * effect[:, None, :, in_scale]
-        # How the reading answers to the force along its axis.
+        # Derivative of the reading by the force along its axis.
         answers = scaled
         if self.forces is not None:
             answers = self._bend(self.forces, state, layout, scaled, T)
@@ -302,11 +302,12 @@ class Equations:
         self, forces: Forces, state: State, layout: Layout, scaled: Floats, T: Floats
     ) -> Floats:
         """
-        Differentiate by the nonlinear coefficients, the last of each axis, in T; add the slope of
-        their terms to how the readings answer to force (`scaled`).
+        Write the derivatives by the nonlinear coefficients into T; return the derivative of the
+        readings by force, which is `scaled` plus the slope of the nonlinear terms.
         """
         value, slope = forces.terms(self.along_axes(state))
-        # The scale acts on terms at the reference; of their changes its own is next to nothing.
+        # The scale's change multiplies the terms at the reference; its product with their change
+        # per kelvin is negligible.
         over_t = np.zeros_like(scaled)
         over_t[:, :, -4 - self.windows.tilt.shape[1]] = 1.0
         each = np.concatenate((value, value), axis=2)
@@ -348,7 +349,7 @@ class Equations:
         return np.asarray(result)
 
     def _across(self, state: State) -> Floats:
-        """Say what a turn of each attitude does to each axis, (n_positions, 3, 2)."""
+        """Return the derivative of each axis by a rotation of each attitude, (n, 3, 2)."""
         turned = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
         if self.forces is None:
             return np.asarray(self.gravity * state.kappa[:, None] * turned)
@@ -357,8 +358,8 @@ class Equations:
 
     def _effect(self, state: State, products: Products) -> Floats:
         """
-        Say how each column acts as a combination of the base, (n_positions, n_base, n_columns):
-        by itself, and by what the start states of the bag add to it.
+        Return each column as a combination of the base, (n_positions, n_base, n_columns): the
+        column itself plus the contribution of the bag's initial lag states.
         """
         n_columns = len(products.columns)
         start = state.start[self.bag_of_position] @ self.start_root.T
@@ -387,7 +388,7 @@ class Equations:
         return np.asarray(np.einsum('nb,nib->ni', base, of_window))
 
     def force(self, state: State, rows: slice = slice(None)) -> Floats:
-        """Correct windows as the compensator would, that knows no offset, shape (n, 3)."""
+        """Correct windows as the compensator does, without mounting offsets, shape (n, 3)."""
         columns = self.columns[rows]
         along = self.measured[rows] - state.bias - columns @ state.weights[0].T
         along /= state.kappa * (1.0 + columns @ state.weights[1].T)
@@ -396,7 +397,7 @@ class Equations:
         return np.asarray(along @ np.linalg.inv(state.inverse).T)
 
     def precision(self, prior: Prior, layout: Layout) -> Floats:
-        """Inverse variances of the prior, shape (n,); 0 for what an informative prior knows."""
+        """Return inverse prior variances, shape (n,); 0 for those of an informative prior."""
         result = np.zeros(layout.n)
         result[layout.kappa] = prior.scale_sd**-2
         result[layout.bias] = prior.bias_sd**-2.0
@@ -414,7 +415,8 @@ class Equations:
         result[layout.offset] = prior.offset_sd**-2
         result[layout.tilt] = prior.tilt_sd**-2
         result[layout.start] = 1.0 / prior.start_share
-        # Attitudes are flat on the sphere, and nothing to an angular rate: they stay there.
+        # The prior of attitudes is flat. An angular rate does not depend on the attitude: the
+        # precision 1 keeps the equations regular.
         result[layout.up] = 0.0 if self.gravity else 1.0
         return result
 
@@ -429,7 +431,7 @@ class Equations:
         return mean
 
 
-#: Unknowns that a step is added to; attitudes move in their tangent planes.
+# Unknowns to which a step is added; attitudes move in their tangent planes.
 _ADDED = (
     *('kappa', 'bias', 'weights', 'misalignment', 'offset', 'tilt'),
     *('start', 'nonlinear', 'radius', 'stretch'),
@@ -441,7 +443,7 @@ def _added(layout: Layout) -> list[str]:
 
 
 def as_vector(state: State, layout: Layout) -> Floats:
-    """Give the unknowns as a vector; attitudes as 0, they move in the tangent plane."""
+    """Return the unknowns as a vector; its elements for attitudes, tangent steps, are 0."""
     result = np.zeros(layout.n + 1)
     for name in _added(layout):
         result[getattr(layout, name)] = getattr(state, name)
@@ -449,7 +451,7 @@ def as_vector(state: State, layout: Layout) -> Floats:
 
 
 def moved_by(state: State, step: Floats, layout: Layout) -> State:
-    """Add a step to a state; what takes no part is 0."""
+    """Add a step to a state; inactive weights and coefficients are set to 0."""
     padded = np.append(step, 0.0)
     up = state.up + np.einsum('pij,pj->pi', state.tangents, padded[layout.up])
     moved = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}

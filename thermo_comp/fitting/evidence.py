@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what a fit shows for itself: residuals of each step of the model, and of each position.
+Owns the residuals that a fit reports: of each step of the model, and of each position.
 
-A position is judged twice: as fitted, and by the unit's parameters without that position, which
-is what a new attitude will see.
+Each position has two residuals: in sample, and with the unit's parameters fitted without this
+position, which estimates the error in a new attitude.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .windows import CURVE, SET, ThermalWindows
 @dataclass(frozen=True)
 class PositionReport:
     """
-    One still interval as the fit saw it.
+    The result of a fit for one still interval.
 
     source: the bag's name
     start_ns: stamp of its start
@@ -50,10 +50,10 @@ class ResidualRow:
 
     section: ``static``, ``dynamic`` or ``all``
     raw: with the constants at the reference temperature
-    one_set, two_sets: with one curve, blind to the regime, nothing where each regime has its own
-        from the start; with a curve for each regime
-    fitted: with the calibration, on the data that it was fitted to
-    left_out: on data that took no part in the fit, see `left_out_error`
+    one_set: with one curve for both regimes; no values if each regime has its own curve
+    two_sets: with a curve for each regime
+    fitted: with the calibration, on the data of the fit
+    left_out: on data that were not used in the fit, see `left_out_error`
     """
 
     section: str
@@ -68,9 +68,9 @@ def residual_rows(
     windows: ThermalWindows, regression: Regression, selected: Selected, *, is_shared: bool
 ) -> tuple[tuple[ResidualRow, ...], Floats]:
     """
-    Compare the steps of the model; give the left-out error of each window, too [m/s^2].
+    Return the residuals of the steps of the model, and the left-out error of each window [m/s^2].
 
-    `is_shared`: whether the curve columns are those of both sets, see `windows.Sets`.
+    `is_shared`: whether the curve columns act in both regimes, see `windows.Sets`.
     """
     state = selected.posterior.state
     steps = [regression.force(replace(state, weights=np.zeros_like(state.weights)))]
@@ -94,8 +94,8 @@ def residual_rows(
 
 def left_out_error(score: Score, gravity: float | Floats) -> Floats:
     """
-    Say how far off each left-out window is [m/s^2], shape (n,): ``|f| - g`` where the other
-    positions determine the norm, else the drift, RMS of the axes.
+    Return the error of each left-out window [m/s^2], shape (n,): ``|f| - g`` if the other
+    positions determine the norm, else the RMS over the axes of the drift.
     """
     norm = norm_residual(score.force, gravity)
     drift = np.sqrt(np.mean(score.drift**2, axis=1))
@@ -103,9 +103,9 @@ def left_out_error(score: Score, gravity: float | Floats) -> Floats:
 
 
 def _with_only(regression: Regression, selected: Selected, groups: tuple[str, ...]) -> State:
-    """Fit again with some groups only, as wide as they like to be."""
+    """Fit again with some groups only, under a flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
-    # What such a model leaves is no noise of the windows; it counts for all of them alike.
+    # The residuals of such a model are mostly model error: all windows get equal weight.
     prior = replace(
         selected.prior,
         column_sd=only * regression.windows.parts * [[0.05], [0.005]],
@@ -120,7 +120,7 @@ def _with_only(regression: Regression, selected: Selected, groups: tuple[str, ..
 def position_reports(
     windows: ThermalWindows, regression: Regression, selected: Selected, left_out: Floats
 ) -> tuple[PositionReport, ...]:
-    """List the positions with what the fit, and what the others (`left_out`), left on each."""
+    """List the positions with their RMS residuals in sample and left out."""
     state = selected.posterior.state
     sizes = regression.norms(state)[regression.windows.position]
     residual = norm_residual(regression.force(state), sizes)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the fit as a whole: sources in, calibration with its evidence out.
+Owns the sequence of a fit, from sources to a calibration with its residuals and findings.
 
-Angles and norms of raw words whose zero is far away, as in offset binary, mean nothing. So a fit
-is made of what is left above the word of no force, and that word is a part of the bias.
+Angles and norms of raw codes with an offset, as in offset binary, are meaningless. Therefore the
+code at zero force is subtracted before the fit and added to the bias afterwards.
 """
 
 from __future__ import annotations
@@ -37,25 +37,20 @@ from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with
 from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
+from .regression import Regression
 from .selection import Selected, is_better
 from .sensors import board_span, gradients_at_rest, learn_detector, without_copies
 from .sources import FitSource
-from .start import position_means
+from .start import ConstantCalibration, position_means
 from .windows import FEWEST_WINDOWS, SET, Model, ThermalWindows, thermal_windows
 
 Progress = Callable[[float], None]
-
-# Usual full scales of units that report m/s^2.
-_G_RANGES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-# Sets that leave less than this part of the noise may be of a regime that closes otherwise.
-_SETS_EXPLAIN = 0.8
-# A bias beyond this part of 1 g is a word of no force.
-_LARGEST_BIAS = 0.5
+Regressed = tuple[Regression, Selected, Floats | None]  # see `regress`
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """A fit and its evidence; `rates` are the gyroscope's residuals, where one was fitted."""
+    """A calibration with its residuals and findings; `rates`: residuals of the gyroscope."""
 
     calibration: Calibration
     selected: Selected
@@ -87,7 +82,7 @@ def fit(
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
-    """Stream one source into its sufficient statistics; FitError if it never rests."""
+    """Reduce a source to its sufficient statistics; FitError if it has no still interval."""
     bag = reduce_source(
         source,
         min_rest_s=options.min_rest_s,
@@ -106,7 +101,7 @@ def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
     """Fit a calibration to bags that have been reduced; FitError if they contradict themselves."""
-    # Thousands of small products: threads would wait for each other.
+    # The fit consists of many products of small matrices, which threads would only slow down.
     with threadpool_limits(1, 'blas'):
         return _fit_about_offset(bags, options, progress)
 
@@ -117,28 +112,29 @@ def _fit_about_offset(
     offset = find_offset(bags, options)
     if not offset.any():
         return _fit_alike(bags, options, progress)
-    note = f'no force reads {" ".join(f"{word:g}" for word in offset)}: words with an offset'
-    known = options.prior and about(options.prior, -offset)
-    found = _fit_alike(
-        [centred(bag, offset) for bag in bags], replace(options, prior=known), progress
-    )
+    codes = ' '.join(f'{code:g}' for code in offset)
+    note = f'zero force reads {codes} counts: the samples use an offset code'
+    prior = options.prior and about(options.prior, -offset)
+    centred_bags = [centred(bag, offset) for bag in bags]
+    result = _fit_alike(centred_bags, replace(options, prior=prior), progress)
     return replace(
-        found,
-        calibration=with_notes(about(found.calibration, offset), [f'offset: {note}']),
-        findings=(Finding('offset', 'advice', note), *found.findings),
+        result,
+        calibration=with_notes(about(result.calibration, offset), [f'offset: {note}']),
+        findings=(Finding('offset', 'advice', note), *result.findings),
         bags=tuple(bags),
     )
 
 
 def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
-    """Find the word of no force of each axis, shape (3,): 0 but for words that have one."""
+    """Return the code at zero force of each axis, shape (3,); 0 without an offset code."""
     if options.offset is not None:
         return np.full(3, options.offset)
     if options.input != 'counts':
         return np.zeros(3)
     if options.prior is not None:
         known = constants_of(options.prior)
-        is_far = np.abs(known.bias / known.scale).max() > _LARGEST_BIAS * options.gravity
+        # A bias above 0.5 g is an offset code.
+        is_far = np.abs(known.bias / known.scale).max() > 0.5 * options.gravity
         return np.asarray(np.rint(known.bias) * is_far)
     middle = max(bag.middle for bag in bags)
     if middle:
@@ -148,23 +144,23 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
 
 
 def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
-    """Take the words of no force out of a bag, and of its source."""
+    """Subtract the codes at zero force from a bag and from the blocks of its source."""
     blocks = bag.source.blocks
 
     def moved() -> Iterator[Any]:
         for block in blocks():
             yield replace(cast(Any, block), accel=block.accel - offset)
 
-    intervals = tuple(replace(one, mean=one.mean - offset) for one in bag.intervals)
+    intervals = tuple(replace(interval, mean=interval.mean - offset) for interval in bag.intervals)
     return replace(bag, source=replace(bag.source, blocks=moved), intervals=intervals)
 
 
 def about(calibration: Calibration, offset: Floats) -> Calibration:
-    """Make a calibration of words above those of no force one of the words themselves."""
+    """Convert a calibration of centred codes into one of the codes themselves."""
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
-        # Words of 16 bits without a sign, of which nobody said how long they are.
+        # Unsigned codes of the default length, 16 bits.
         full_scale = 2.0 * COUNTS_FULL_SCALE + 1.0
     moved = (
         AxisReference(axis.scale_factor, axis.bias + by)
@@ -180,7 +176,7 @@ def with_notes(calibration: Calibration, notes: Sequence[str]) -> Calibration:
 
 
 def _fit_alike(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:
-    """Fit the bags, but for those of another environment: see `environments`."""
+    """Fit the bags, without those of another environment, see `environments`."""
     whole = _fit(bags, options, tell)
     known = options.prior
     if known is None:
@@ -200,7 +196,7 @@ def _fit_alike(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) 
         if known is None and not agree_better(*pair, gone[0]):
             return whole
     elif known is not None:
-        # Nothing is left that could update the prior.
+        # All bags contradict the prior, so none can update it.
         provenance = whole.calibration.provenance
         rest = replace(whole, calibration=replace(known, provenance=provenance))
     calibration, finding = with_doubt(
@@ -217,7 +213,7 @@ def _fit_alike(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) 
 
 
 def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:
-    """Fit a calibration to bags in which no force is about zero."""
+    """Fit a calibration to bags whose readings at zero force are near 0."""
     seen = [bool(len(bag.board.value)) for bag in bags]
     if any(seen) and not all(seen):
         name = bags[seen.index(False)].source.name
@@ -229,22 +225,8 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     findings += data_checks.judge_copies(copies)
     known = options.prior
     terms: tuple[NonlinearTerm, ...] = ()
-    detector = options.detector or (known.detector if known else learn_detector(bags))
+    model = _model_of(bags, options)
     tell(0.55)
-    sensors = known.sensors if known else sensors_of(bags)
-    if known is not None:
-        sets, columns = prior_sets(known), prior_columns(known)
-    else:
-        sets = sets_of(options, bags)
-        is_paper = options.model == 'golovach'
-        rests = gradients_at_rest(bags, sensors)
-        span = board_span(bags, options.reference_temperature)
-        columns = () if is_paper else bank(sensors, rests, span)
-        if not any(len(bag.case.value) for bag in bags):
-            # A gradient that is guessed from the board's rate tells nothing that its lags do not.
-            columns = tuple(one for one in columns if not one.is_of_sensor)
-    reference = options.reference_temperature
-    model = Model(options.model, sets, columns, sensors, detector, reference)
     windows = with_forces(thermal_windows(bags, model), bags, options)
     if known is not None and windows.data.forces and known.nonlinearity is None:
         known = with_blank(known, options)
@@ -256,19 +238,12 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(data_checks.judge_windows(windows, up, has_case), options)
     tell(0.7)
-    regression, selected, typical = regress(windows, start, up, options, tell)
-    asks = has_case and known is None and options.detector is None
-    if asks and _may_have_sets(selected):
-        # Only the sets feel when the regime closes: with the case, or with the board too.
-        closed = replace(model, detector=replace(detector, closes='case'))
-        others = with_forces(thermal_windows(bags, closed), bags, options)
-        again = regress(others, start, up, options, tell)
-        if is_better(selected.score, again[1].score):
-            windows, (regression, selected, typical) = others, again
+    windows, (regression, selected, typical) = _regressed(windows, bags, start, up, options, tell)
     if known is None:
         selected, terms = choose(regression, selected, options)
     claim = claim_of(regression, selected, typical, options.gravity_sd)
-    residuals, left_out = residual_rows(windows, regression, selected, is_shared=sets.is_shared)
+    is_shared = model.sets.is_shared
+    residuals, left_out = residual_rows(windows, regression, selected, is_shared=is_shared)
     state = selected.posterior.state
     K = state.kappa * start.scale
     constants, raw = (K, state.bias, state.misalignment), residuals[-1].raw.rms
@@ -278,17 +253,10 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
         K, residuals, claim.offset_sd, options, windows.has_temperature
     )
     try:
+        unit, nonlinearity = _unit(bags, options), of_file(regression, terms, options)
         calibration = build_calibration(
-            windows,
-            regression,
-            selected,
-            claim,
-            bags,
-            _unit(bags, options),
-            residuals,
-            findings,
-            known,
-            of_file(regression, terms, options),
+            *(windows, regression, selected, claim, bags, unit),
+            *(residuals, findings, known, nonlinearity),
         )
         rates: tuple[RateRow, ...] = ()
         if known is not None or not is_beyond(windows):
@@ -297,13 +265,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
             text = 'the unit rotated in some rests, so no gyroscope was fitted'
             findings.append(Finding('rate', 'advice', text))
     except ValueError as error:
-        if 'misalignment' in str(error):
-            raise FitError(
-                'its axes stand at less than 60 degrees to each other, which no accelerometer '
-                'has: is it the right topic, did the axes stay the same in all positions, and '
-                'do at least 9 positions show them?'
-            ) from error
-        raise FitError(f'these data give no calibration that can be used: {error}') from error
+        raise _unusable(error) from error
     least = least_known(calibration, selected.posterior.state.up)
     unseen = list(data_checks.judge_coverage(least))
     unseen += judge_terms(calibration)
@@ -321,28 +283,90 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     )
 
 
+def _model_of(bags: Sequence[ReducedBag], options: FitOptions) -> Model:
+    """Return curves, columns and detector: those of the prior, or else all that the bags allow."""
+    prior, reference = options.prior, options.reference_temperature
+    if prior is not None:
+        sets, columns = prior_sets(prior), prior_columns(prior)
+        detector = options.detector or prior.detector
+        return Model(options.model, sets, columns, prior.sensors, detector, reference)
+    detector, sensors = options.detector or learn_detector(bags), sensors_of(bags)
+    columns = ()
+    if options.model != 'golovach':
+        rests = gradients_at_rest(bags, sensors)
+        columns = bank(sensors, rests, board_span(bags, reference))
+    if not any(len(bag.case.value) for bag in bags):
+        # Without a case thermometer the gradient is estimated from the board's rate, and its
+        # columns are combinations of those of the board.
+        columns = tuple(column for column in columns if not column.is_of_sensor)
+    return Model(options.model, sets_of(options, bags), columns, sensors, detector, reference)
+
+
+def _regressed(
+    windows: ThermalWindows,
+    bags: Sequence[ReducedBag],
+    start: ConstantCalibration,
+    up: Floats,
+    options: FitOptions,
+    tell: Progress,
+) -> tuple[ThermalWindows, Regressed]:
+    """
+    Fit the windows with the better end condition of the dynamic regime.
+
+    The condition affects only the sets: constant temperatures of case and board, or of the case
+    alone. The second is tried if the bags have a case thermometer and two sets may be chosen.
+    """
+    result = regress(windows, start, up, options, tell)
+    has_case = all(len(bag.case.value) for bag in bags)
+    has_choice = has_case and options.prior is None and options.detector is None
+    if not has_choice or not _may_have_sets(result[1]):
+        return windows, result
+    model = windows.model
+    closed = replace(model, detector=replace(model.detector, closes='case'))
+    others = with_forces(thermal_windows(bags, closed), bags, options)
+    again = regress(others, start, up, options, tell)
+    return (others, again) if is_better(result[1].score, again[1].score) else (windows, result)
+
+
+def _unusable(error: ValueError) -> FitError:
+    """Return the error of a calibration with values outside their ranges."""
+    if 'misalignment' in str(error):
+        return FitError(
+            'the angle between two of its axes is less than 60 degrees, which no accelerometer '
+            'has: is it the right topic, did the axes stay the same in all positions, and are '
+            'there at least 9 positions?'
+        )
+    return FitError(f'these data give no calibration that can be used: {error}')
+
+
 def _may_have_sets(selected: Selected) -> bool:
-    """Whether sets are chosen, or would explain much more although left-out data are not sure."""
-    chosen = next(one for one in selected.trials if one.is_chosen)
-    least = _SETS_EXPLAIN * chosen.prior.sigma
+    """
+    Whether the chosen model has two sets, or a model with two sets is similarly good.
+
+    Similarly good: within one standard error of the chosen model on left-out data, with less than
+    80 % of its noise.
+    """
+    chosen = next(trial for trial in selected.trials if trial.is_chosen)
+    limit = 0.8 * chosen.prior.sigma
     return any(
-        SET in one.groups and (one.is_chosen or (one.is_near and (one.prior.sigma < least).all()))
-        for one in selected.trials
+        SET in trial.groups
+        and (trial.is_chosen or (trial.is_near and (trial.prior.sigma < limit).all()))
+        for trial in selected.trials
     )
 
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Name the thermometers beside the board that every bag has; the case leads, seen or not."""
+    """Return the thermometers that all bags have, without the board's; the case is first."""
     seen = ({name for name, one in bag.temperatures.items() if len(one.value)} for bag in bags)
     return 'case', *sorted(set.intersection(*seen) - {'board', 'case'})
 
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
-    """Find the unit's serial; FitError if the bags name different ones, or it is none."""
+    """Return the unit's serial; FitError if the bags have different or invalid serials."""
     serials = {source.serial: source.name for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
-        said = ', '.join(f'{name} of {serial}' for serial, name in sorted(serials.items()))
-        raise FitError(f'the bags are of different units: {said}')
+        names = ', '.join(f'{name} of {serial}' for serial, name in sorted(serials.items()))
+        raise FitError(f'the bags are of different units: {names}')
     try:
         return valid_serial(options.serial or next(iter(serials), 'unknown'))
     except ValueError as mistake:
@@ -352,13 +376,12 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     serial = check_serial([bag.source for bag in bags], options)
     full_scale = options.saturated_at
-    largest = max(bag.reach for bag in bags)
+    largest = max(bag.max_abs for bag in bags)
     if full_scale == COUNTS_FULL_SCALE and bags[0].is_integer:
         full_scale = widened(full_scale, np.array([[np.rint(largest)]]))
     if full_scale is None:
-        full_scale = next(
-            (r * STANDARD_GRAVITY for r in _G_RANGES if r * STANDARD_GRAVITY > 1.1 * largest),
-            2.0 * largest,
-        )
+        # The smallest usual full scale of sensors in m/s^2 that contains the data.
+        ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
+        full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
     cycle = float(np.median([bag.cycle_s for bag in bags]))
     return Unit(serial, options.input, full_scale, cycle)

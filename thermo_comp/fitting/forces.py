@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the magnitude of the specific force in each position of a fit, and the terms nonlinear in it.
+Owns |f| in each position of a fit that is not at 1 g everywhere, and the nonlinear terms.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from ..unit.nonlinearity import POWERS, Kind, linearised, unit_of
 @dataclass(frozen=True)
 class Forces:
     """
-    What is known of ``|f|^2 = still^2 + spin^2`` of each position, shapes (n_positions,) [m/s^2].
+    The known magnitude ``|f|^2 = still^2 + spin^2`` of each position, (n_positions,) [m/s^2].
 
-    kinds: nonlinear terms that may take part, k of them, in the order of a file; their
-        coefficients are those of a file: each kind at the reference, then each per kelvin
+    kinds: the k nonlinear terms that may take part, in the order of a file; the order of the
+        coefficients is all kinds at the reference temperature, then all kinds per kelvin
     t: board temperature of each window less the reference, shape (n,) [K]
-    still: the known |f| itself; gravity where the unit rotates
-    spin: centripetal acceleration w^2 r at the radius as given; else 0
-    sd: standard deviation of |f| beside that of the radius
-    radius_sd: relative standard deviation of the radius; 0 where it is not estimated
+    still: |f| without rotation; gravity if the unit rotates
+    spin: centripetal acceleration w^2 r at the stated radius; 0 without rotation
+    sd: standard deviation of |f| without the part of the radius
+    radius_sd: relative standard deviation of the radius; 0 if the radius is not estimated
     """
 
     kinds: tuple[Kind, ...]
@@ -56,7 +56,7 @@ class Forces:
         return np.maximum(self.sd / self.sizes, 1e-12)
 
     def terms(self, force: Floats) -> tuple[Floats, Floats]:
-        """Return each term per unit of its coefficient, and its slope, shape of force + (k,)."""
+        """Return each term per unit coefficient and its slope, (*force.shape, k)."""
         each = {
             'square': (force**2, 2.0 * force),
             'odd_square': (np.abs(force) * force, 2.0 * np.abs(force)),
@@ -67,7 +67,7 @@ class Forces:
         return value, slope
 
     def linearise(self, x: Floats, nonlinear: Floats, rows: slice) -> Floats:
-        """Take the nonlinear terms from readings of windows, shape (n, 3)."""
+        """Return the readings of windows, shape (n, 3), without the nonlinear terms."""
         k = len(self.kinds)
         at = nonlinear[:, :k] + self.t[rows, np.newaxis, np.newaxis] * nonlinear[:, k:]
         k2, kq, k3 = (

@@ -3,10 +3,10 @@
 """
 Owns the fit of the gyroscope: the angular rate of the still windows, over the same columns.
 
-A gyroscope at rest reads the Earth's rate, another one in each attitude, and a bias that a turn-on
-changes: so each position has an offset of its own, and what temperature does is told by the
-changes within the positions; the constant is told by the mean over them. The regression is the
-accelerometer's without gravity: every m/s^2 of it reads rad/s.
+A gyroscope at rest measures the component of the Earth's rate in its attitude, plus a bias that
+changes at each turn-on. Each position therefore has an offset. Changes within a position determine
+the effect of temperature; the mean over the positions determines the constant bias. The regression
+is that of the accelerometer with gravity 0, in rad/s in place of m/s^2.
 """
 
 from __future__ import annotations
@@ -31,19 +31,13 @@ from .start import position_means, within_positions
 from .unknowns import Prior
 from .windows import ThermalWindows
 
-# What it is on one axis, of an attitude that nobody knows.
+# Sd of the Earth's rate on one axis in an unknown attitude [rad/s].
 _EARTH_SD = EARTH_RATE / math.sqrt(3.0)
-# Built-in prior, wide for any gyroscope: bias [rad/s].
-_BIAS_SD = 1.0
-# Typical and steepest slope of the bias [rad/s per K]: consumer MEMS, 0.03 and 0.3 deg/s/K.
-_SLOPE, _STEEPEST = 1e-5, 5e-3
-# The noise begins with this [rad/s].
-_SIGMA = 1e-5
 
 
 @dataclass(frozen=True)
 class RateRow:
-    """The rate at rest of one section less the mean of each position, as of `ResidualRow`."""
+    """Residuals of the rate about the mean of each position, as in `ResidualRow`."""
 
     section: str
     raw: ResidualStatistics
@@ -57,7 +51,11 @@ def add_gyroscope(
     bags: Sequence[ReducedBag],
     options: FitOptions,
 ) -> tuple[Calibration, tuple[RateRow, ...]]:
-    """Give a calibration the gyroscope of its prior, else of bags with rates and temperature."""
+    """
+    Add a gyroscope to a calibration: that of the prior, or else one fitted to the bags.
+
+    Without a prior the bags must have angular rates and temperatures, else none is added.
+    """
     if options.prior is not None:
         known = options.prior.gyroscope
         sensors = calibration.sensors if known is None else windows.model.sensors
@@ -67,7 +65,7 @@ def add_gyroscope(
     data = replace(
         windows.data,
         mean=windows.angular_rate,
-        # An angular rate has no scale to tell here, nor does it feel the tilt of a support.
+        # At rest neither the scale of an angular rate nor the tilt of a support is observable.
         in_scale=np.zeros(len(windows.data.groups), dtype=bool),
         tilt=windows.data.tilt[:, :0],
     )
@@ -75,35 +73,37 @@ def add_gyroscope(
     level = position_means(data)
     up = np.tile((0.0, 0.0, 1.0), (data.n_positions, 1))
     state = regression.initial_state(level.mean(axis=0), np.zeros(3), up)
-    asked = {*data.groups} if options.groups is None else {*options.groups}
-    may = np.isin(data.groups, list(asked)) & (data.kelvins > 0.0)
-    widths = np.outer((1.0, 0.0), may * data.kelvins)
-    never = np.zeros(len(data.groups), dtype=bool)
+    allowed = {*data.groups} if options.groups is None else {*options.groups}
+    is_candidate = np.isin(data.groups, list(allowed)) & (data.kelvins > 0.0)
+    kelvins = np.outer((1.0, 0.0), is_candidate * data.kelvins)
+    forced = np.zeros(len(data.groups), dtype=bool)
+    # Typical and largest sd of a slope [rad/s per K]; the largest is that of consumer MEMS.
     candidates = Candidates(
-        _SLOPE * widths, _STEEPEST * widths, never, np.zeros(widths.shape, dtype=bool)
+        1e-5 * kelvins, 5e-3 * kelvins, forced, np.zeros(kelvins.shape, dtype=bool)
     )
     prior = Prior(
         bias_mean=np.zeros(3),
-        bias_sd=np.full(3, _BIAS_SD),
+        bias_sd=np.full(3, 1.0),  # [rad/s], flat for any gyroscope
         scale_sd=1.0,
         misalignment_sd=1.0,
-        column_sd=np.zeros_like(widths),
+        column_sd=np.zeros_like(kelvins),
         offset_sd=_EARTH_SD,
-        sigma=np.full(3, _SIGMA),
+        sigma=np.full(3, 1e-5),
         offset_scale=_EARTH_SD,
     )
     selected = select(regression, state, prior, candidates)
-    # Of the offsets, which every position shows, the Earth's rate is no error of the gyroscope.
-    shown = replace(selected, prior=replace(selected.prior, offset_scale=0.0))
-    claim = claim_of(regression, shown)
+    # The positions show the offsets, so their sd is not marginalised.
+    fixed_sd = replace(selected, prior=replace(selected.prior, offset_scale=0.0))
+    claim = claim_of(regression, fixed_sd)
+    # The Earth's rate in the offsets is a true rate, not an error of the gyroscope.
     turn_on = math.sqrt(max(claim.offset_sd**2 - _EARTH_SD**2, 0.0))
     triad = build_calibration(
         windows, regression, selected, replace(claim, offset_sd=turn_on), bags, calibration.unit
     )
     needed = {*calibration.sensors, *triad.sensors}
     sensors = tuple(name for name in windows.model.sensors if name in needed)
-    told = replace(calibration, gyroscope=gyroscope_of(triad), sensors=sensors)
-    return told, _rows(windows, regression, selected)
+    result = replace(calibration, gyroscope=gyroscope_of(triad), sensors=sensors)
+    return result, _rows(windows, regression, selected)
 
 
 def _rows(

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the evidence: widths of the priors and noises, learnt within a model whose columns are given.
+Owns the estimation of prior standard deviations and noises in a model with given columns.
 
-Each column has a prior standard deviation of its own, shared by the axes, bias and scale apart. It
-follows MacKay's fixed point with a log-normal hyperprior per kelvin: the mode of log evidence plus
-hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``. A column
-that the data cannot see keeps its typical width instead of vanishing.
+Each column has one prior standard deviation for the bias of all axes and one for the scale. They
+follow MacKay's fixed point with a log-normal hyperprior per kelvin: the mode of log evidence plus
+hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``. The sd of a
+column about which the data have no information stays at the centre of the hyperprior.
 
 References
 ----------
@@ -28,25 +28,11 @@ from .bayes_factors import log_bayes_factors
 from .regression import Posterior, Regression
 from .unknowns import Prior, State
 
-# Standard deviation of the natural logarithm of a column's typical width: a factor of ten.
+# Hyperprior sd of the natural logarithm of a column's prior sd: a factor of ten.
 _LOG_SD = float(np.log(10.0))
-# Degrees of freedom of the half-Student prior of the mounting's standard deviation.
+#: Degrees of freedom of the half-Student prior of the mounting's standard deviation; 4 as in [2]_.
 STUDENT_NU = 4.0
-# A support tilts by no more than some of this [rad/K]: aluminium of 23 ppm/K, heated unevenly.
-_TILT_PER_K = 1.5e-5
-# No mounting or turn-on repeats worse than this [m/s^2]: 5 mg, as of the cheapest consumer MEMS.
-_LARGEST_OFFSET_SD = 0.05
-# A round that moves no logarithm of a width by more than this is the last.
-_SETTLED = 0.05
-# The largest change of a logarithm in one round.
-_STRIDE = 2.0
-# No sensor is quieter [m/s^2]; samples that never change would leave no noise at all.
-_LEAST_SIGMA = 1e-8
-# Windows this many standard deviations off their neighbours lose weight; the largest counted.
-_FAR_SDS, _FARTHEST_SDS = 3.0, 1e3
-# A fifth of a normal sample lies farther off than this many standard deviations ...
-_FIFTH_SDS = 1.2816
-# ... from the median of this many windows on both sides.
+# Number of windows on each side whose median is the local level of the residuals.
 _NEIGHBOURS = 3
 
 
@@ -60,17 +46,16 @@ def settle(
     rounds: int = 25,
 ) -> tuple[Posterior, Prior]:
     """
-    Repeat the fixed point until it stands.
+    Repeat the fixed point until no logarithm of a standard deviation changes by more than 0.05.
 
-    typical, largest: widths of the columns that the hyperprior centres on, and that none exceeds;
-    fixed: columns that keep their width; shape (2, m)
+    typical, largest: centre of the hyperprior and upper bound of each column's sd, shape (2, m)
+    fixed: columns whose sd is not estimated, shape (2, m)
     """
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
-        found, change = _updated(regression, posterior, prior, typical, largest, fixed)
-        prior = found
+        prior, change = _updated(regression, posterior, prior, typical, largest, fixed)
         posterior = regression.solve(posterior.state, prior, n_steps=1)
-        if change < _SETTLED:
+        if change < 0.05:
             break
     return posterior, prior
 
@@ -83,7 +68,7 @@ def _updated(
     largest: Floats,
     fixed: Bools,
 ) -> tuple[Prior, float]:
-    """Move each width towards its fixed point; the largest change of a logarithm."""
+    """Move each sd towards its fixed point; return also the largest change of a logarithm."""
     state, layout, sd = posterior.state, posterior.layout, prior.column_sd
     moves = (sd > 0.0) & ~fixed
     safe, centre = np.where(moves, sd, 1.0), np.where(moves, typical, 1.0)
@@ -99,7 +84,8 @@ def _updated(
         change = max(change, moved)
     tilt_sd = prior.tilt_sd
     if state.tilt.size:
-        bound = _TILT_PER_K * temperature_rms(regression)
+        # Scale of the half-normal prior: 15 urad/K, aluminium of 23 ppm/K heated unevenly.
+        bound = 1.5e-5 * temperature_rms(regression)
         step = _toward(
             np.array(posterior.determined[layout.tilt].sum()),
             np.array(np.sum(state.tilt**2)),
@@ -110,14 +96,14 @@ def _updated(
         tilt_sd = float(tilt_sd * np.exp(step))
         change = max(change, float(np.abs(step)) / 3.0)
     misalignment_sd = prior.misalignment_sd
-    told = float(posterior.determined[layout.misalignment].sum())
-    if told > 1.0 and prior.informative is None:
-        misalignment_sd = max(np.sqrt(np.sum(state.misalignment**2) / told), 1e-5)
+    gamma = float(posterior.determined[layout.misalignment].sum())
+    if gamma > 1.0 and prior.informative is None:
+        misalignment_sd = max(np.sqrt(np.sum(state.misalignment**2) / gamma), 1e-5)
     start_share = prior.start_share
     if layout.start.size:
-        # The run-time prior counts for one: a single bag must not be sure of itself.
-        told = float(posterior.determined[layout.start].sum())
-        start_share = float(min((np.sum(state.start**2) + 1.0) / (told + 1.0), 1.0))
+        # The run-time prior has the weight of one state, so that one bag cannot make it small.
+        gamma = float(posterior.determined[layout.start].sum())
+        start_share = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
         change = max(change, float(np.abs(np.log(start_share / prior.start_share))) / 4.0)
     sigma = white_noise(regression, posterior)
     change = max(change, float(np.abs(np.log(sigma / prior.sigma)).max()))
@@ -138,15 +124,15 @@ def _updated(
 def _toward(
     effective: Floats, power: Floats, sd: Floats, slope: Floats, bend: Floats | float
 ) -> Floats:
-    """Newton's step of log sd towards ``power / sd^2 = effective + slope``."""
+    """Return Newton's step of log sd towards ``power / sd^2 = effective + slope``, at most 2."""
     ratio = power / (sd * sd)
-    pull = ratio - effective - slope
-    stiffness = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend
-    return np.asarray(np.clip(pull / stiffness, -_STRIDE, _STRIDE))
+    gradient = ratio - effective - slope
+    curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend
+    return np.asarray(np.clip(gradient / curvature, -2.0, 2.0))
 
 
 def _offset_sd(posterior: Posterior, prior: Prior) -> tuple[float, float]:
-    """Move the mounting's standard deviation towards its mode under its prior, see `claim`."""
+    """Move the sd of mounting offsets towards its mode, see `claim` for its prior."""
     at = posterior.layout.offset
     effective = float(posterior.determined[at].sum())
     power = float(np.sum(posterior.state.offset**2))
@@ -160,34 +146,35 @@ def _offset_sd(posterior: Posterior, prior: Prior) -> tuple[float, float]:
         np.array(slope),
         bend + 0.1,
     )
-    # No mounting repeats to a thousandth of the prior's scale.
-    bounds = 1e-3 * prior.offset_scale, _LARGEST_OFFSET_SD
+    # Bounds [m/s^2]: a thousandth of the prior's scale; 5 mg, as of the cheapest consumer MEMS.
+    bounds = 1e-3 * prior.offset_scale, 0.05
     new = float(np.clip(prior.offset_sd * np.exp(step), *bounds))
     return new, float(np.abs(np.log(new / prior.offset_sd))) if effective > 1.0 else 0.0
 
 
 def temperature_rms(regression: Regression) -> float:
-    """RMS of the board temperature about the reference [K]: of the first curve column."""
+    """Return the RMS of the board temperature about the reference [K], at least 1."""
     return max(float(regression.windows.kelvins[0]), 1.0)
 
 
 def white_noise(regression: Regression, posterior: Posterior) -> Floats:
-    """White noise of each axis from its residuals and the parameters spent on them, (3,)."""
+    """Return the white noise of each axis from residuals and effective parameters, (3,)."""
     n = len(regression.weight)
     determined, layout = posterior.determined, posterior.layout
     own = determined[layout.axis].sum(axis=1) + determined[layout.offset].sum(axis=0)
-    # Attitudes, tilts, misalignment and start states are determined by all three axes.
+    # Attitudes, tilts, misalignment and lag states are determined by all three axes.
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     shared = sum(determined[at].sum() for at in common)
     spent = own + shared / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
-    return np.asarray(np.maximum(sigma, _LEAST_SIGMA))
+    # The bound of 1e-8 m/s^2 is below any sensor's noise; constant samples would give 0.
+    return np.asarray(np.maximum(sigma, 1e-8))
 
 
 def pruned(posterior: Posterior, prior: Prior, fixed: Bools, least_gain: float) -> Prior:
     """
-    Drop columns whose log Bayes factor is below `least_gain`: the least first, the others then
-    without it.
+    Drop columns with a log Bayes factor below `least_gain`, one at a time, the smallest first; the
+    factors of the others are then those without it.
     """
     state, covariance = posterior.state, posterior.covariance
     layout = posterior.layout
@@ -212,7 +199,11 @@ def pruned(posterior: Posterior, prior: Prior, fixed: Bools, least_gain: float) 
 
 
 def downweigh(regression: Regression, posterior: Posterior, prior: Prior) -> None:
-    """Take windows far off their neighbours for as noisy as they look: a knock stands alone."""
+    """
+    Reduce the weight of windows more than 3 sd from the local median: short disturbances.
+
+    The weight is that at which the window would be 3 sd away.
+    """
     base = regression.windows.weight
     size = regression.residual(posterior.state, posterior.layout) / prior.sigma
     size *= np.sqrt(base)[:, None]
@@ -223,8 +214,8 @@ def downweigh(regression: Regression, posterior: Posterior, prior: Prior) -> Non
             usual = sliding_window_view(around, 2 * _NEIGHBOURS + 1, axis=0)
             np.subtract(part, np.median(usual, axis=-1), out=part)
     size = np.abs(size)
-    # A converter that carries its remainder makes means of few values, most of them equal: their
-    # median deviation is 0, where that of the largest fifth is not.
-    usual = np.quantile(size, 0.8, axis=0) / _FIFTH_SDS
-    size = np.minimum(size / np.maximum(usual, 1e-300), _FARTHEST_SDS).max(axis=1)
-    regression.reweigh(base * (_FAR_SDS / np.maximum(size, _FAR_SDS)) ** 2)
+    # The window means of a charge-balancing converter often have few distinct values, with a
+    # median deviation of 0. The 80 % quantile of |x| is robust, too: 1.2816 sd of a normal.
+    usual = np.quantile(size, 0.8, axis=0) / 1.2816
+    size = np.minimum(size / np.maximum(usual, 1e-300), 1e3).max(axis=1)
+    regression.reweigh(base * (3.0 / np.maximum(size, 3.0)) ** 2)

@@ -1,19 +1,18 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the jumps: where a sensor that lies still changes by itself.
+Owns the detection of jumps: steps in the reading of a sensor at rest.
 
-A sensor can change by itself within one sample: a die that relaxes, a part that loses its grip.
-The temperature does not jump, so no function of temperature can follow, and a fit over the jump
-smears it over the whole curve. A jump is told from a turn of the unit by three witnesses: the
-readings beside it are as quiet as ever; the norm of the reading changes, which a turn leaves
-nearly alone; the gyroscope, where there is one, saw no rotation.
+The reading of a sensor can step within one sample, if a die relaxes or a part slips. The
+temperature does not step, so no function of temperature describes a jump, and a fit across it
+distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit: the noise
+beside it is normal; the norm of the reading changes, which a rotation hardly does; the gyroscope,
+if there is one, shows no rotation.
 
-Behind a low pass neighbouring samples have a correlation r, and the scatter of means hides a step.
-The changes ``a_i - r a_(i-1)`` have none (whitening, or generalised least squares for noise of
-the first order): beside them a step that comes within one sample stands out. So does a shock that
-the low pass lets die away; hence the level must differ, too, in quiet samples on either side, over
-as long as it takes to see that.
+After a low-pass filter neighbouring samples have a correlation r, and their slow noise hides a
+step. The differences ``a_i - r a_(i-1)`` are white (generalised least squares for first-order
+noise), and a step within one sample is significant in them. So is a shock that decays; hence the
+mean levels of quiet samples on either side must differ, too.
 """
 
 from __future__ import annotations
@@ -28,40 +27,25 @@ from ..typing import Floats, Ints
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Still intervals further apart than this are not looked at for a step: too much can have happened;
-# nor those whose readings point so far from each other.
-_LONGEST_GAP_S, _NEAR = 30.0, np.cos(np.radians(10.0))
-# Readings on either side of the gap that say what the level was: so long, or so many times the
-# time constant of the noise, but no longer than that.
-_MARGIN_S, _MARGIN_TAUS, _LONGEST_MARGIN_S = 10.0, 60.0, 100.0
-# Noise of less correlation from sample to sample is white; more cannot be told from a walk.
-_COLOURED, _MOST_COLOURED = 0.4, 0.999
+# Shortest length of the readings on either side of a gap that give the level [s].
+_MARGIN_S = 10.0
+# Smallest number of samples on either side of a step.
 _FEWEST_SAMPLES = 8
-_ROUNDS = 3  # place and correlation of a step, each from the other
-_PIECES = 40  # into which the readings around a gap are cut for their correlation
-# A step this many sd is one; the search over its place makes about 5 by chance.
+# Smallest step in units of its sd; the search over its place reaches about 5 by chance.
 _STEP_SDS = 8.0
-# What whitened samples show must last: by so many sd, and by so much of it.
-_LASTING_SDS, _LASTING_SHARE = 4.0, 0.5
-# A hand on the unit leaves far more than this many times the quiet noise.
-_QUIET_RATIO = 2.0
-# A turn by d changes |a| by at most twice the sensor's error (10 % of g, generously) times d.
-_NORM_SHARE = 0.2
-# A gyro that saw less than this part of the turn needed saw none.
-_TURN_SHARE = 0.33
 
 
 @dataclass(frozen=True)
 class Jump:
     """
-    A step in the reading of a sensor at rest, which no turn of the unit explains.
+    A step in the reading of a sensor at rest that is no rotation of the unit.
 
     time: since the bag's first sample [s]
     duration_s: interval between the samples before and after it [s]
     step: change of the reading, per axis [input units]
     along: change of the norm, that is, along the specific force [input units]
-    temperature_change, temperature_change_sd: step of the board's readings at that time, beside a
-        drift, and its sd [K]; NaN where too few readings are near
+    temperature_change, temperature_change_sd: step of the board's readings at that time about a
+        linear drift, and its sd [K]; NaN with too few readings
     """
 
     time: float
@@ -73,17 +57,24 @@ class Jump:
 
 
 def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
-    """Find the jumps between a bag's rests; streams it again only where there may be one."""
-    means = [np.average(one.mean, axis=0, weights=one.count) for one in bag.intervals]
+    """
+    Find the jumps between a bag's rests; the bag is read again if there are close rests.
+
+    Two rests are compared if the gap between them is at most 30 s and their directions differ by
+    less than 10 degrees.
+    """
+    means = [
+        np.average(interval.mean, axis=0, weights=interval.count) for interval in bag.intervals
+    ]
     ups = [mean / np.linalg.norm(mean) for mean in means]
     gaps = [
         ((before.end_ns - bag.start_ns) * 1e-9, (after.start_ns - bag.start_ns) * 1e-9)
         for (before, up), (after, other) in pairwise(zip(bag.intervals, ups, strict=True))
-        if after.start_ns - before.end_ns <= _LONGEST_GAP_S * 1e9 and up @ other > _NEAR
+        if after.start_ns - before.end_ns <= 30e9 and up @ other > np.cos(np.radians(10.0))
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
     near = _near(bag, gaps, [_MARGIN_S] * len(gaps))
-    # Slow noise takes longer to know its level.
+    # The level of correlated noise needs a longer mean.
     margins = [_margin(part, quiet_sd) for part in near]
     slow = [place for place, margin in enumerate(margins) if margin > _MARGIN_S]
     wider = _near(bag, [gaps[place] for place in slow], [margins[place] for place in slow])
@@ -109,13 +100,13 @@ def _near(
 
 
 def _margin(near: Floats, quiet_sd: Floats) -> float:
-    """Choose how far beside a gap to look, by the time constant of the noise."""
+    """Return the length of the readings beside a gap: 60 time constants of the noise [s]."""
     time, accel = near[:, 0], near[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
     _, r = _place_and_colour(time, accel, quiet_sd)
     tau = -float(np.median(np.diff(time))) / np.log(r) if r else 0.0
-    return float(np.clip(_MARGIN_TAUS * tau, _MARGIN_S, _LONGEST_MARGIN_S))
+    return float(np.clip(60.0 * tau, _MARGIN_S, 100.0))
 
 
 def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
@@ -126,28 +117,30 @@ def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
 def _examine(
     near: Floats, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
 ) -> Jump | None:
+    """Test the readings beside a gap for a jump; None without one."""
     time, accel, gyro = near[:, 0], near[:, 1:4], near[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
     if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
         return None
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
-    # A bump passes: only what the quiet samples on both sides show is a step.
+    # A shock decays; a step is also a difference between the quiet samples on both sides.
     lasting, known, left = _step(time[beside], accel[beside], time[at])
     lasting_sd = quiet_sd * known * _correlation(left, quiet_sd)
     step, known, left = _step(time, accel, time[at], r)
-    # Of coloured noise the scatter within a cell says little.
+    # With correlated noise the scatter within a cell underestimates the noise of means.
     sd = np.sqrt(np.mean(left**2, axis=0)) if r else quiet_sd
     step_sd = sd * known * _correlation(left, sd)
     if r:
-        is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > _LASTING_SHARE)
-        is_step &= np.abs(lasting) > _LASTING_SDS * lasting_sd
+        # At least half of the step must last, with four standard deviations.
+        is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > 0.5)
+        is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
         is_step = np.abs(lasting) > _STEP_SDS * lasting_sd
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # Noise from neighbouring differences, which a drift does not widen.
+    # The noise is estimated from differences of neighbours, which do not depend on a drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(one, axis=0) ** 2, axis=0) for one in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
@@ -156,10 +149,13 @@ def _examine(
     along_sd = float(np.sqrt((middle / norm) ** 2 @ step_sd**2))
     needed = float(np.sqrt(max(size**2 - along**2, 0.0))) / norm
     seen = _turn(time, gyro, at)
-    is_no_turn = seen < _TURN_SHARE * needed or (
-        abs(along) > _NORM_SHARE * size and abs(along) > _STEP_SDS * along_sd
+    # The step is no rotation if the gyroscope measured less than a third of the angle needed, or
+    # if |a| changed: a rotation by d changes |a| by at most 2 d times the sensor's error (10 %).
+    is_no_turn = seen < 0.33 * needed or (
+        abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd
     )
-    if not is_no_turn or np.any(spread > _QUIET_RATIO * quiet_sd):
+    # Twice the quiet noise: a hand on the unit makes far more.
+    if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
     warmed, warmed_sd = _temperature_step(bag, time[0], time[at], time[-1])
     x, y, z = step.tolist()
@@ -175,12 +171,12 @@ def _examine(
 
 def _correlation(left: Floats, sd: Floats) -> Floats:
     """
-    How much less well a mean is known than by white noise of `sd`, per axis, 1 or more.
+    Return the sd of a mean over that for white noise of `sd`, per axis, at least 1.
 
-    What is left beside a step, (n, 3), in twentieths of each side: their variance, and their
-    correlation r from one to the next, which makes means worse by (1 + r) / (1 - r).
+    It follows from the means of 40 pieces of the residuals `left`, shape (n, 3): from their
+    variance and their lag-1 correlation r, which multiplies the variance by (1 + r) / (1 - r).
     """
-    size = max(len(left) // _PIECES, 1)
+    size = max(len(left) // 40, 1)
     n = len(left) // size
     means = left[: n * size].reshape(n, size, 3).mean(axis=1)
     square = np.mean(means**2, axis=0)
@@ -191,7 +187,7 @@ def _correlation(left: Floats, sd: Floats) -> Floats:
 
 
 def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> tuple[float, float]:
-    """Estimate what the board's readings did at a step, and the sd of that."""
+    """Estimate the step of the board's readings at the time of a jump, and its sd [K]."""
     time = _seconds(bag.board.stamp_ns, bag.start_ns)
     use = (time >= begin) & (time <= end)
     time, value = time[use], bag.board.value[use]
@@ -203,12 +199,17 @@ def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> t
 
 
 def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[int, float]:
-    """Find the first sample after the step, and the noise's correlation, 0 where it is white."""
+    """
+    Find the first sample after the step and the lag-1 correlation of the noise.
+
+    Each is estimated given the other, three times. A correlation below 0.4 counts as white; above
+    0.999 it could not be distinguished from a random walk.
+    """
     at, r = _place_of_step(time, accel, quiet_sd, 0.0), 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(3):
         left = _step(time, accel, time[at])[2] / quiet_sd
         follows = float(np.sum(left[1:] * left[:-1]) / max(np.sum(left**2), 1e-300))
-        r = min(follows, _MOST_COLOURED) if follows > _COLOURED else 0.0
+        r = min(follows, 0.999) if follows > 0.4 else 0.0
         if not r:
             break
         at = _place_of_step(time, accel, quiet_sd, r)
@@ -216,14 +217,14 @@ def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[in
 
 
 def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> int:
-    """Find the first sample after the step that explains most, beside a straight drift."""
+    """Find the first sample after the most likely step, about a linear drift."""
     n = len(time)
     trend = _trend(time, r)
     left = whitened(accel, r)
     left = left - trend @ (trend.T @ left)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
-    # Of H_k = (i >= k), whitened: 1 at k, 1 - r behind. Its product with a residual is a sum from
-    # k on, its own square after the trend is taken out follows from the trend's sums.
+    # The whitened step H_k = (i >= k) is 1 at k and 1 - r after it. Its product with a residual is
+    # a sum from k on; its square without the trend follows from the sums of the trend.
     tail = _sums_behind(left, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)
@@ -232,18 +233,18 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
 
 
 def _sums_behind(rows: Floats, r: float) -> Floats:
-    """Sum rows from each on, all but the first of them ``1 - r`` times."""
+    """Return for each row its value plus ``1 - r`` times the sum of all later rows."""
     return np.asarray((1.0 - r) * np.cumsum(rows[::-1], axis=0)[::-1] + r * rows)
 
 
 def whitened(values: Floats, r: float) -> Floats:
-    """Take out of rows a correlation r from one to the next, shape (n, k)."""
+    """Whiten rows, shape (n, k), of first-order noise with lag-1 correlation r."""
     first = np.sqrt(1.0 - r * r) * values[:1]
     return np.concatenate((first, values[1:] - r * values[:-1]))
 
 
 def _step(time: Floats, values: Floats, at: float, r: float = 0.0) -> tuple[Floats, float, Floats]:
-    """Estimate a step beside a drift, its sd in units of the noise, and what is left, (n, k)."""
+    """Estimate a step about a drift, its sd in units of the noise, and residuals (n, k)."""
     trend = _trend(time, r)
     jump = whitened((time >= at).astype(np.float64)[:, None], r)[:, 0]
     jump -= trend @ (trend.T @ jump)
@@ -254,13 +255,13 @@ def _step(time: Floats, values: Floats, at: float, r: float = 0.0) -> tuple[Floa
 
 
 def _trend(time: Floats, r: float = 0.0) -> Floats:
-    """Columns of a level and a drift, whitened and orthonormal, shape (n, 2)."""
+    """Return orthonormal whitened columns of a level and a drift, shape (n, 2)."""
     columns = np.column_stack((np.ones(len(time)), time - time.mean()))
     return np.asarray(np.linalg.qr(whitened(columns, r))[0])
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Angle turned through within a second of the step, against the level on each side."""
+    """Return the angle of rotation within 1 s of the step, about the level on each side [rad]."""
     levels = (np.median(gyro[:at], axis=0), np.median(gyro[at:], axis=0))
     dt = np.diff(time)
     angle = np.zeros(3)

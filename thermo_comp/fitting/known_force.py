@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the statement of |f| for a bag that is not at 1 g: one value, a table of sections, or a
-rotation rate with a radius; given by the user, or in the bag's metadata.
+Owns the known |f| of a bag that is not at 1 g, from the user or from the bag's metadata.
+
+It is one value, a table of sections, or a rotation rate with a radius.
 """
 
 from __future__ import annotations
@@ -27,13 +28,8 @@ from ..unit.gravity import parse_acceleration
 #: Keys of a bag's metadata.
 MAGNITUDE, ROTATION = 'specific_force_magnitude_m_s2', 'rotation_topic'
 RADIUS, RADIUS_SD = 'rotation_radius_m', 'rotation_radius_sd_m'
-#: Largest table of sections [bytes].
-_LARGEST_TABLE = 1 << 20
-#: Largest believable |f| [m/s^2]: a gun.
-_LARGEST = 1e7
-#: Smallest number of rate readings in a rest.
+#: Smallest number of rate readings in a rest: fewer give no standard error of their mean.
 _FEWEST_RATES = 3
-_EVER_S = math.inf
 
 
 class Section(NamedTuple):
@@ -47,8 +43,11 @@ class Section(NamedTuple):
 
 class Magnitude(NamedTuple):
     """
-    |f| of a rest: that without rotation (None: gravity), w^2 r at the radius as given, and the sd
-    of |f| without that of the radius [m/s^2].
+    |f| of a rest [m/s^2].
+
+    still: |f| without rotation; None for gravity
+    spin: centripetal acceleration w^2 r at the stated radius
+    sd: sd of |f| without the part of the radius
     """
 
     still: float | None
@@ -56,17 +55,18 @@ class Magnitude(NamedTuple):
     sd: float = 0.0
 
     def norm(self, gravity: float) -> float:
-        """Return |f| at the radius as given [m/s^2]."""
+        """Return |f| at the stated radius [m/s^2]."""
         return math.hypot(gravity if self.still is None else self.still, self.spin)
 
 
 @dataclass(frozen=True)
 class KnownForce:
     """
-    |f| of a bag over time; outside the sections the unit is at 1 g.
+    |f| of a bag over time; outside the sections |f| is gravity.
 
     stamp_ns, rate: readings of the rotation rate [rad/s], about a vertical axis
-    radius, radius_sd: distance of the unit from the axis [m]; a sd above 0: the fit estimates it
+    radius, radius_sd: distance of the unit from the axis [m]; the fit estimates it if the sd is
+        above 0
     """
 
     name: str
@@ -77,13 +77,13 @@ class KnownForce:
     radius_sd: float = 0.0
 
     def radius_part(self, size: Magnitude, gravity: float) -> float:
-        """Return the sd of |f| that comes from the radius [m/s^2]."""
+        """Return the part of the sd of |f| due to the radius [m/s^2]."""
         if not self.radius:
             return 0.0
         return size.spin**2 / size.norm(gravity) * self.radius_sd / self.radius
 
     def of(self, start_ns: int, end_ns: int, first_ns: int) -> Magnitude:
-        """Return |f| of a rest, from its stamps and that of the bag's first sample."""
+        """Return |f| of a rest, given its stamps and the stamp of the bag's first sample."""
         if self.stamp_ns is None or self.rate is None:
             middle_s = (0.5 * (start_ns + end_ns) - first_ns) * 1e-9
             for one in self.sections:
@@ -100,15 +100,18 @@ class KnownForce:
             )
         spin = self.rate[inside] ** 2 * self.radius
         mean, sd = float(spin.mean()), float(spin.std(ddof=1)) / math.sqrt(len(spin))
-        # |f|^2 = g^2 + spin^2; near 1 g the error of the rate matters less.
+        # |f|^2 = g^2 + spin^2, so d|f| = spin / |f| d(spin).
         return Magnitude(None, mean, sd * mean / math.hypot(mean, 9.8))
 
 
 @dataclass(frozen=True)
 class AskedForce:
     """
-    What the user says of |f|: `magnitude` a value with unit or the path of a table, `rotation` the
-    topic of the rate, as TOPIC or TOPIC:FIELD, with the radius and its sd [m].
+    The user's options about |f|.
+
+    magnitude: a value with unit, or the path of a table
+    rotation: topic of the rotation rate, as TOPIC or TOPIC:FIELD
+    radius, radius_sd: distance of the unit from the axis and its sd [m]
     """
 
     magnitude: str | None = None
@@ -121,30 +124,30 @@ class AskedForce:
             raise ValueError('a rotation topic needs a radius, and no other specific force')
 
 
-#: Nothing beside the bags' metadata.
+#: No options: the bags' metadata apply.
 USUAL_FORCE = AskedForce()
 
 
 def known_force(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForce | None:
     """
-    Find what is known of |f| in a bag, from the user or else from its metadata; None: gravity.
+    Return the known |f| of a bag, from the user or else from its metadata; None for gravity.
 
-    Raises FitError if it cannot be understood, or the topic of the rate has no messages.
+    Raises FitError if the text cannot be parsed, or the topic of the rate has no messages.
     """
-    said = info.metadata
+    metadata = info.metadata
     try:
         if asked.magnitude is not None:
             sections = _asked_sections(asked.magnitude, path)
             return KnownForce(str(path), sections) if sections else None
         if asked.rotation is not None:
             return _rotating(path, info, asked)
-        if ROTATION in said:
-            radius, sd = float(said.get(RADIUS, 'nan')), float(said.get(RADIUS_SD, '0'))
+        if ROTATION in metadata:
+            radius, sd = float(metadata.get(RADIUS, 'nan')), float(metadata.get(RADIUS_SD, '0'))
             if not (0.0 < radius < math.inf and 0.0 <= sd < math.inf):
                 raise ValueError(f'metadata with {ROTATION} need a positive {RADIUS}')
-            return _rotating(path, info, AskedForce(None, said[ROTATION], radius, sd))
-        if MAGNITUDE in said:
-            return KnownForce(str(path), parse_sections(said[MAGNITUDE]))
+            return _rotating(path, info, AskedForce(None, metadata[ROTATION], radius, sd))
+        if MAGNITUDE in metadata:
+            return KnownForce(str(path), parse_sections(metadata[MAGNITUDE]))
     except ValueError as mistake:
         raise FitError(f'{path}: {mistake}') from mistake
     return None
@@ -153,14 +156,14 @@ def known_force(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForc
 def parse_sections(text: str) -> tuple[Section, ...]:
     """
     Read a magnitude [m/s^2], or lines of ``BEGIN END MAGNITUDE [SD]``, in seconds since the first
-    sample and m/s^2. A semicolon ends a line, too; what follows a # is a comment.
+    sample and m/s^2. A semicolon also ends a line; a # begins a comment.
     """
     lines = [
         one.split('#')[0].replace(',', ' ').split() for one in text.replace(';', '\n').split('\n')
     ]
     rows = [_numbers(line) for line in lines if line]
     if len(rows) == 1 and len(rows[0]) < 3:
-        return (_section(0.0, _EVER_S, *rows[0]),)
+        return (_section(0.0, math.inf, *rows[0]),)
     if not rows or not all(len(row) in (3, 4) for row in rows):
         raise ValueError(
             'the specific force must be one number in m/s^2, or lines of BEGIN END MAGNITUDE [SD] '
@@ -172,7 +175,8 @@ def parse_sections(text: str) -> tuple[Section, ...]:
 def _section(begin_s: float, end_s: float, size: float, sd: float = 0.0) -> Section:
     if not begin_s < end_s:
         raise ValueError(f'a section must end after its begin {begin_s:g} s, got {end_s:g} s')
-    if not (0.0 < size < _LARGEST and 0.0 <= sd < size):
+    # 1e7 m/s^2 is above the launch of a gun.
+    if not (0.0 < size < 1e7 and 0.0 <= sd < size):
         raise ValueError(
             f'a specific force must be above 0 with a smaller sd, got {size:g} +- {sd:g} m/s^2'
         )
@@ -190,12 +194,12 @@ def _numbers(words: list[str]) -> list[float]:
 
 
 def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
-    """Read a value with unit, or the table of a file, whose lines may begin with a bag's name."""
+    """Read a value with unit, or a table from a file; a line may begin with a bag's name."""
     table = Path(text)
     if not table.is_file():
-        return (_section(0.0, _EVER_S, parse_acceleration(text)),)
+        return (_section(0.0, math.inf, parse_acceleration(text)),)
     try:
-        content = read_bounded(table, _LARGEST_TABLE).decode('utf-8')
+        content = read_bounded(table, 1 << 20).decode('utf-8')
     except (OSError, ValueError) as error:
         raise ThermoCompError(f'cannot be read: {error}', table) from error
     mine: list[str] = []

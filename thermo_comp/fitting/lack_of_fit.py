@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the lack of fit: how far the errors on left-out data exceed what the calibration claims.
+Owns the lack of fit: the excess of the left-out errors over the published uncertainty.
 
-Per regime and temperature, the mean square of the left-out drift less its claimed variance. So a
-kink of the curve, a tilt of the support or a drift of the bias is claimed even if no column says
-it. Models that left-out data cannot tell from the chosen one add their difference from it.
+Per regime and temperature it is the mean square of the left-out drift less its published variance.
+So a kink of the curve, a tilt of the support or a drift of the bias widens the covariance although
+no column describes it. Models within one standard error of the chosen model contribute half of
+their squared difference from it.
 """
 
 from __future__ import annotations
@@ -23,21 +24,15 @@ from .selection import Selected
 from .unknowns import Layout, State
 from .windows import ThermalWindows
 
-# Temperatures at which the lack of fit of a regime is told, at most.
-_TEMPERATURES = 5
-# Fewer windows show no mean square worth telling.
-_FEWEST_WINDOWS = 10
-# Neighbouring windows have much of their error in common: this many count for one.
-_ALIKE = 10.0
-# An excess counts beyond this many standard errors.
-_ERRORS = 2.0
-# A model within one standard error is as likely as the chosen one: half of the squared difference.
-_SHARE_OF_OTHERS = 0.5
-
 
 @dataclass(frozen=True)
 class Excess:
-    """Excess of the left-out mean square over the claim, by window and axis [(m/s^2)^2]."""
+    """
+    Excess of the squared left-out drift over its published variance, (n, 3) [(m/s^2)^2].
+
+    square: excess with the chosen model
+    others: half of the squared difference to models that are as good within one standard error
+    """
 
     square: Floats
     others: Floats
@@ -46,7 +41,7 @@ class Excess:
 def lack_of_fit(
     windows: ThermalWindows, regression: Regression, selected: Selected, claim: Claim
 ) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:
-    """Return the lack of fit of the static and of the dynamic regime; () where there is none."""
+    """Return the lack of fit of the static and of the dynamic regime; () for none."""
     excess = _excess(regression, selected, claim)
     is_dynamic = windows.weight > 0.5
     return _points(windows, excess, ~is_dynamic), _points(windows, excess, is_dynamic)
@@ -59,15 +54,15 @@ def _excess(regression: Regression, selected: Selected, claim: Claim) -> Excess:
     square = selected.score.drift**2 - noise - claimed
     mine = drift_of_positions(regression, regression.force(selected.posterior.state))
     others = np.zeros_like(mine)
-    near = [one for one in selected.trials if one.is_near]
+    near = [trial for trial in selected.trials if trial.is_near]
     for one in near:
         away = drift_of_positions(regression, regression.force(one.posterior.state)) - mine
-        others = np.maximum(others, _SHARE_OF_OTHERS * away**2)
+        others = np.maximum(others, 0.5 * away**2)
     return Excess(square, others)
 
 
 def drift_of_positions(regression: Equations, values: Floats) -> Floats:
-    """Take the mean of its position from each window, shape (n, k)."""
+    """Subtract from each window the mean of its position, shape (n, k)."""
     position = regression.windows.position
     first = np.searchsorted(position, np.arange(regression.windows.n_positions))
     count = np.diff(np.append(first, len(position)))[:, None]
@@ -77,8 +72,8 @@ def drift_of_positions(regression: Equations, values: Floats) -> Floats:
 def drift_variance(
     regression: Regression, state: State, layout: Layout, covariance: Floats
 ) -> Floats:
-    """Variance that the unit's covariance claims of the drift of each window, shape (n, 3)."""
-    in_bias, in_scale = (np.flatnonzero(one) for one in layout.used)
+    """Return the variance of the drift of each window by a covariance of the unit, (n, 3)."""
+    in_bias, in_scale = (np.flatnonzero(mask) for mask in layout.used)
     on_bias, on_scale = (
         drift_of_positions(regression, regression.columns[:, one]) for one in (in_bias, in_scale)
     )
@@ -93,9 +88,10 @@ def drift_variance(
 
 
 def _points(windows: ThermalWindows, excess: Excess, rows: Bools) -> tuple[LackOfFit, ...]:
+    """Average the excess of some windows in at most 5 bins of temperature, 10 windows or more."""
     rows = rows & np.isfinite(excess.square[:, 0])
     n = int(rows.sum())
-    n_bins = min(_TEMPERATURES, n // _FEWEST_WINDOWS)
+    n_bins = min(5, n // 10)
     if not n_bins:
         return ()
     temperature = windows.temperature[rows]
@@ -104,8 +100,10 @@ def _points(windows: ThermalWindows, excess: Excess, rows: Bools) -> tuple[LackO
     for part in np.array_split(order, n_bins):
         square = excess.square[rows][part]
         mean = square.mean(axis=0)
-        error = square.std(axis=0) / np.sqrt(max(len(part) / _ALIKE, 1.0))
-        mean = np.where(mean > _ERRORS * error, mean, 0.0)
+        # Errors of neighbouring windows are correlated: ten windows count as one observation. An
+        # excess below two standard errors is set to 0.
+        error = square.std(axis=0) / np.sqrt(max(len(part) / 10.0, 1.0))
+        mean = np.where(mean > 2.0 * error, mean, 0.0)
         x, y, z = np.sqrt(mean + excess.others[rows][part].mean(axis=0)).tolist()
         points.append(LackOfFit(float(temperature[part].mean()), (x, y, z)))
     rising = [

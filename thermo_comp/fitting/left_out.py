@@ -3,13 +3,13 @@
 """
 Owns the score of a model: the error of its correction on data that took no part in the fit.
 
-Left out are, in turn, each position, and each section and each half of the program in all
-positions at once. A half shows what sections do not: columns that follow one program between its
-sections, and fail in another one. The left-out windows are corrected as the node would correct
-them: by the unit's parameters alone, with start states at their run-time mean, without mounting
-offsets and without tilts of the support.
-Judged are the drift, which is each axis less its mean over the position (a constant attitude needs
-no other knowledge), and the norm of the position where the other positions determine it.
+Each position is left out in turn, and so is each section and each half of the program, in all
+positions at once. Left-out halves detect columns that interpolate between the sections of one
+program and fail in another one. The left-out windows are corrected as the node would correct them:
+with the unit's parameters alone, initial lag states at their run-time mean, no mounting offsets
+and no tilts of the support.
+The errors are the drift (each axis less its mean over the position, which does not depend on the
+attitude) and ``|f| - g`` of the position, if the other positions determine it.
 
 References
 ----------
@@ -30,24 +30,20 @@ from .equations import moved_by
 from .regression import Normal, Posterior, Reduced, Regression
 from .unknowns import Prior, State
 
-# A left-out position counts where the others leave its norm, or its drift, no more than this times
-# the variance that all positions leave it, with mounting and noise.
-_DETERMINED = 10.0
-# So many windows of a position show the variance of its drift.
-_DRIFT_WINDOWS = 50
-# Fewer windows of a position have no drift to speak of.
+# Largest ratio of the variance of a position's norm or drift without this position in the fit to
+# that with it, mounting offset and noise included. Above it the position is not scored.
+_VARIANCE_RATIO = 10.0
+# Smallest number of windows of a position from which its drift is scored.
 _FEWEST_WINDOWS = 8
-# Gauss-Newton steps that a fit without a section takes from the fit of everything.
-_SECTION_STEPS = 2
-# With one fold there is no scatter to take a standard error from.
-_ERROR_OF_ONE = 0.1
 
 
 @dataclass(frozen=True)
 class Folds:
     """
-    Mean square error of each fold of one kind [(m/s^2)^2], NaN where it says nothing, and the
-    windows of each, shape (n,).
+    Left-out errors of the n folds of one kind.
+
+    square: mean square error of each fold [(m/s^2)^2], NaN if the fold is not scored, shape (n,)
+    windows: number of windows of each fold, shape (n,)
     """
 
     square: Floats
@@ -63,12 +59,12 @@ class Folds:
 
     def gain_of(self, other: Folds) -> tuple[float, float] | None:
         """
-        Log ratio of the mean square error to that of another model, over the folds in common, and
-        its standard error; None without such folds.
+        Return the log ratio of the mean square error to that of another model, and its standard
+        error, over the folds that both have; None without such folds.
 
-        Two estimates: the mean over folds of their log ratios, which a few large folds cannot
-        rule, and the log ratio of the sums with its jackknife error, which small folds cannot. If
-        they agree in sign the surer one counts, else there is no gain.
+        There are two estimates: the mean over folds of their log ratios, which is robust to a few
+        large folds, and the log ratio of the sums with its jackknife error, which is robust to
+        small folds. If their signs agree the more significant one is returned, else the gain is 0.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
@@ -77,7 +73,8 @@ class Folds:
         before, after = ((one.square * one.windows)[known] + 1e-300 for one in (self, other))
         whole = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            return whole, _ERROR_OF_ONE
+            # One fold has no scatter; 0.1 is 5 % of an RMS.
+            return whole, 0.1
         each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))
         spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
@@ -94,11 +91,11 @@ class Score:
 
     positions, sections: drift of left-out positions, and of left-out sections of the program
     norms: ``|f| - g`` of left-out positions whose norm the others determine
-    force: corrected windows, each position by the others, NaN where its norm is not determined,
+    force: windows of each position corrected by a fit without it, NaN if its norm is not scored,
         shape (n, 3)
-    drift: drift of each window by the other positions, or where these do not determine it, by the
-        other sections, shape (n, 3)
-    halves: drift of left-out halves of the program, at temperatures that the other half has seen
+    drift: drift of each window by a fit without its position or, if that does not determine it,
+        without its section, shape (n, 3)
+    halves: drift of left-out halves of the program, at temperatures that occur in the other half
     """
 
     positions: Folds
@@ -115,14 +112,30 @@ class Score:
 
     @property
     def rms(self) -> float:
-        """The headline: RMS drift of what was left out, the larger of the two kinds of folds."""
+        """RMS of the left-out drift: the larger of that of positions and of sections."""
         found = [one.rms for one in (self.positions, self.sections) if np.isfinite(one.rms)]
         return max(found, default=float('nan'))
 
 
 def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Score:
-    """Leave out each position and each section, and judge the correction of the rest there."""
+    """Score a model on left-out positions, sections and halves of the program."""
     regression.whiten(prior.noise)
+    windows = regression.windows
+    share = regression.weight / windows.weight
+    positions, norms, force, drift = _by_positions(regression, posterior, prior, share)
+    n_sections = windows.n_sections if windows.n_sections > 1 else 0
+    numbers = np.arange(n_sections)
+    single, halves = list(numbers[:, None]), np.array_split(numbers, 2) if n_sections else []
+    by_section, section_drift = _by_sections(regression, posterior, prior, share, single)
+    by_half, _ = _by_sections(regression, posterior, prior, share, halves, is_within=True)
+    drift = np.where(np.isfinite(drift), drift, section_drift)
+    return Score(positions, by_section, norms, force, drift, by_half)
+
+
+def _by_positions(
+    regression: Regression, posterior: Posterior, prior: Prior, share: Floats
+) -> tuple[Folds, Folds, Floats, Floats]:
+    """Leave out each position; return folds of drift and norm, corrected windows and drift."""
     windows, state, layout = regression.windows, posterior.state, posterior.layout
     tangent = regression.tangent(state, layout, regression.products(layout.used))
     normal = regression.normal(tangent, regression.products(layout.used).whole, prior)
@@ -130,7 +143,6 @@ def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Scor
     n_positions = windows.n_positions
     edges = np.searchsorted(windows.position, np.arange(n_positions + 1))
     counts = np.diff(edges).astype(np.float64)
-    share = regression.weight / windows.weight
     force = np.full((len(windows.time), 3), np.nan)
     sizes = regression.norms(state)
     drift = np.full_like(force, np.nan)
@@ -142,8 +154,8 @@ def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Scor
         weight = share[rows]
         level = np.average(own, axis=0, weights=weight)
         away = own - level
-        is_told = _is_drift_determined(regression, posterior, prior, covariance, rows)
-        if rows.stop - rows.start >= _FEWEST_WINDOWS and is_told:
+        is_known = _is_drift_determined(regression, posterior, prior, covariance, rows)
+        if rows.stop - rows.start >= _FEWEST_WINDOWS and is_known:
             drift[rows] = away
             square = np.mean(away**2, axis=1)
             squares[p] = np.average(square, weights=weight)
@@ -151,19 +163,7 @@ def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Scor
             force[rows] = own
             error = np.linalg.norm(own, axis=1) - sizes[p]
             norms[p] = np.average(error**2, weights=weight)
-    n_sections = windows.n_sections
-    sections = [np.array([one]) for one in range(n_sections if n_sections > 1 else 0)]
-    by_section, section_drift = _by_sections(regression, posterior, prior, share, sections)
-    by_half, _ = _by_sections(
-        regression,
-        posterior,
-        prior,
-        share,
-        np.array_split(np.arange(n_sections), 2) if n_sections > 1 else [],
-        is_within=True,
-    )
-    drift = np.where(np.isfinite(drift), drift, section_drift)
-    return Score(Folds(squares, counts), by_section, Folds(norms, counts), force, drift, by_half)
+    return Folds(squares, counts), Folds(norms, counts), force, drift
 
 
 def _without_position(
@@ -174,7 +174,7 @@ def _without_position(
     reduced: Reduced,
     p: int,
 ) -> tuple[State, Floats]:
-    """Fit the unit without a position, to first order: the state and the covariance."""
+    """Return state and covariance of the fit without a position, to first order."""
     state, layout = posterior.state, posterior.layout
     bag = regression.bag_of_position[[p]]
     rest = regression.reduce(normal, prior, layout, state, bag, without=p)
@@ -191,12 +191,13 @@ def _without_position(
 def _is_drift_determined(
     regression: Regression, posterior: Posterior, prior: Prior, covariance: Floats, rows: slice
 ) -> bool:
-    """Whether the others, whose covariance is given, make the drift of a position as sure."""
+    """Whether `covariance`, that without this position, determines its drift."""
     state, layout = posterior.state, posterior.layout
     in_bias, in_scale = layout.used
     if not in_bias.any():
         return True
-    some = regression.columns[rows][:: max((rows.stop - rows.start) // _DRIFT_WINDOWS, 1)]
+    # Every n-th window: 50 of them are sufficient for the variance.
+    some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
     some = some - some.mean(axis=0)
     p = regression.windows.position[rows.start]
     force = regression.along_axes(state)[p]
@@ -208,7 +209,7 @@ def _is_drift_determined(
         by_others += float(np.sum((along @ covariance[where]) * along))
         everything += float(np.sum((along @ posterior.covariance[where]) * along))
     noise = float(np.sum(prior.sigma**2)) * len(some)
-    return by_others < _DETERMINED * (everything + noise)
+    return by_others < _VARIANCE_RATIO * (everything + noise)
 
 
 def _is_norm_determined(
@@ -219,7 +220,7 @@ def _is_norm_determined(
     covariance: Floats,
     p: int,
 ) -> bool:
-    """Whether the others, whose covariance is given, make the norm of a position as sure."""
+    """Whether `covariance`, that without this position, determines its norm."""
     if not regression.gravity:
         return False
     state, layout = posterior.state, posterior.layout
@@ -231,7 +232,7 @@ def _is_norm_determined(
         places = np.concatenate((layout.axis[axis], layout.shared))
         along[places] += on_axes[axis] * (base @ derivatives[p, axis, :, :own])
     everything = along @ posterior.covariance @ along + prior.offset_sd**2
-    return bool(along @ covariance @ along < _DETERMINED * everything)
+    return bool(along @ covariance @ along < _VARIANCE_RATIO * everything)
 
 
 def _by_sections(
@@ -244,8 +245,10 @@ def _by_sections(
     is_within: bool = False,
 ) -> tuple[Folds, Floats]:
     """
-    Leave out the sections of each fold in all positions; the drift is about the mean of what
-    stayed. `is_within`: judge it only at temperatures that stayed.
+    Score the drift of left-out sections about the mean of the windows that stay in the fit.
+
+    `folds`: the sections left out at once, in all positions; `is_within`: score only windows at
+    temperatures that occur in the fit
     """
     windows, layout = regression.windows, posterior.layout
     products = regression.products(layout.used)
@@ -255,7 +258,8 @@ def _by_sections(
     for k, fold in enumerate(folds):
         grams = products.without(fold)
         state = posterior.state
-        for _ in range(_SECTION_STEPS):
+        # Two Gauss-Newton steps from the fit of all data are sufficient.
+        for _ in range(2):
             step, *_rest = regression.step(state, prior, layout, grams)
             state = moved_by(state, step, layout)
         force = regression.force(state)

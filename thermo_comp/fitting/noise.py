@@ -26,14 +26,10 @@ import numpy as np
 from ..typing import Floats, Ints
 from .unknowns import Noise
 
-# Candidate variance ratios of the Gauss-Markov part.
+# Candidate ratios of the Gauss-Markov variance to the white variance of a window.
 _RATIOS = 10.0 ** np.arange(-2.5, 3.6, 0.5)
-# Candidate correlation times: multiples of the shortest one, which is this many windows.
-_TIME_STEP, _SHORTEST_WINDOWS = 10.0**0.5, 3.0
-# A recording shows a correlation time that it holds this many times.
-_SPANS = 6.0
-# Twice the log likelihood that two further parameters must gain: 1 % of the chi-square.
-_LEAST_GAIN = 9.2
+# Ratio of neighbouring candidates of the correlation time.
+_TIME_STEP = 10.0**0.5
 
 
 class Whitener:
@@ -44,7 +40,7 @@ class Whitener:
         lengths = np.diff(np.r_[starts, len(position)])
         n_steps = int(lengths.max())
         step = np.arange(n_steps)[:, None]
-        #: Row of the table at each step of each position; those beyond its end point to row 0.
+        #: Row of each step of each position in the table; 0 for steps beyond the position's end.
         self._is_there = step < lengths
         self._row = np.where(self._is_there, starts + step, 0)
         self._n = len(position)
@@ -53,17 +49,17 @@ class Whitener:
             self._is_there[1:], time[self._row[1:]] - time[self._row[:-1]], 0.0
         )
         self._interval = interval
-        #: Correlation times that the positions are long enough to show [s].
+        #: Candidate correlation times [s]: from 3 windows to a sixth of a position's length.
         span = float(np.median(interval.sum(axis=0)))
         typical = float(np.median(interval[1:][self._is_there[1:]])) if n_steps > 1 else 1.0
         self.times_s: list[float] = []
-        time_s = _SHORTEST_WINDOWS * typical
-        while time_s <= span / _SPANS:
+        time_s = 3.0 * typical
+        while time_s <= span / 6.0:
             self.times_s.append(time_s)
             time_s *= _TIME_STEP
 
     def shows(self, time_s: float) -> bool:
-        """Whether the positions are long enough, and the windows short enough, for a time."""
+        """Whether a correlation time is within the range of the candidates."""
         return bool(self.times_s) and self.times_s[0] <= time_s <= self.times_s[-1] * _TIME_STEP
 
     def gains(self, weight: Floats, noise: Noise) -> tuple[Floats, Floats, Floats]:
@@ -101,14 +97,16 @@ class Whitener:
         return result
 
     def log_determinant(self, gains: tuple[Floats, Floats, Floats]) -> float:
-        """Logarithm of the determinant of the noise's covariance, in units of sigma^2."""
+        """Return the log determinant of the noise covariance, in units of sigma^2."""
         return 2.0 * float(np.log(gains[2][self._is_there]).sum())
 
     def estimate(self, residual: Floats, weight: Floats) -> Noise:
         """
         Find the Gauss-Markov noise of residuals, shape (n, 3), by their profile likelihood.
 
-        One ratio and one time serve the three axes, whose white noise is profiled out.
+        The axes have a common ratio and correlation time; their white variances are profiled out.
+        The result is white noise unless twice the log likelihood gains 9.2, the 1 % point of a
+        chi-square with two degrees of freedom.
         """
         candidates = [Noise(float(r), t) for t in self.times_s for r in _RATIOS]
         if not candidates:
@@ -116,7 +114,7 @@ class Whitener:
         white = float(self._deviances(residual, weight, [Noise()])[0])
         deviances = self._deviances(residual, weight, candidates)
         best = int(np.argmin(deviances))
-        if white - float(deviances[best]) < _LEAST_GAIN:
+        if white - float(deviances[best]) < 9.2:
             return Noise()
         at, on = divmod(best, len(_RATIOS))
         table = deviances.reshape(-1, len(_RATIOS))
@@ -125,9 +123,9 @@ class Whitener:
         return Noise(float(10.0**log_ratio), float(10.0**log_time))
 
     def _deviances(self, residual: Floats, weight: Floats, noises: Sequence[Noise]) -> Floats:
-        """Minus twice the profile log likelihood of each noise, shape (n_noises,)."""
-        ratio = np.array([one.ratio for one in noises])[:, None]
-        time_s = np.array([one.time_s for one in noises])[:, None]
+        """Return -2 times the profile log likelihood of each noise, shape (n_noises,)."""
+        ratio = np.array([noise.ratio for noise in noises])[:, None]
+        time_s = np.array([noise.time_s for noise in noises])[:, None]
         shape = len(noises), self._row.shape[1]
         level, variance = np.zeros((*shape, 3)), np.broadcast_to(ratio, shape)
         square, size = np.zeros((len(noises), 3)), np.zeros(len(noises))
@@ -149,7 +147,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return where a parabola through a smallest value and its neighbours is least, -1 .. 1."""
+    """Return the minimum of the parabola through three neighbouring values, -1 .. 1."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the choice of the nonlinear terms of a fit: by evidence, and by left-out norms.
+Owns the choice of the nonlinear terms of a fit by log evidence and by left-out norms.
 
-A term that the data determine leaves if it lowers the log evidence, or if left-out norms are no
-better with it. A term that they do not determine stays near its prior, with its uncertainty.
+A term that the data determine is removed if it lowers the log evidence, or if it does not improve
+the left-out norms. A term that the data do not determine stays near its prior, with the prior sd.
 """
 
 from __future__ import annotations
@@ -27,31 +27,29 @@ from .left_out import Score, score_of
 from .options import FitOptions
 from .reduction import ReducedBag
 from .regression import Posterior, Regression
-from .selection import Selected
+from .selection import LEAST_GAIN, TRIAL_GAIN, Selected
 from .unknowns import Prior, State
 from .windows import ThermalWindows
 
-# |f| differs from gravity if it is off by this part.
-_DIFFERS = 1e-3
-# A coefficient changes by this part of its prior sd per kelvin, 1 sd.
-_SLOPE_SHARE = 0.02
-# A change of the log evidence that counts (a bare mention: Kass and Raftery, 1995), and the one
-# for which |f| f, which square and cube nearly imitate, joins.
-_COUNTS, _JOINS = 1.0, 4.0
-# Effective parameters per coefficient from which the data, not the prior, determine it: its sd is
-# then a tenth of the prior's.
+# Prior sd of a coefficient's change per kelvin over that of the coefficient [1/K].
+_SLOPE_RATIO = 0.02
+# Effective parameters per coefficient from which the data determine it: 0.99 means that the
+# posterior sd is a tenth of the prior sd.
 _DETERMINED = 0.99
-# The range of |f| in a file is wider than that of the positions by this part.
-_MARGIN = 0.01
-_NIL = (0.0, 0.0, 0.0)
+_ZERO = (0.0, 0.0, 0.0)
 
-_Used = frozenset[int]  # places of coefficients that take part
+_Active = frozenset[int]  # places of the coefficients in use
 
 
 def with_forces(
     windows: ThermalWindows, bags: Sequence[ReducedBag], options: FitOptions
 ) -> ThermalWindows:
-    """Add |f| of the positions, where it is not gravity or nonlinear terms are asked for."""
+    """
+    Add |f| of the positions and the nonlinear terms to the windows.
+
+    They stay unchanged if |f| is within 1e-3 of gravity in all positions, and neither the options
+    nor the prior have nonlinear terms.
+    """
     still, spin, sd = np.full((3, windows.data.n_positions), 0.0)
     still[:] = options.gravity
     for p, (bag, rest) in enumerate(windows.rests):
@@ -60,36 +58,36 @@ def with_forces(
             size, spin[p], sd[p] = known.of(rest.start_ns, rest.end_ns, first_ns)
             still[p] = options.gravity if size is None else size
     prior = options.prior.nonlinearity if options.prior else None
-    is_usual = np.ptp([*np.hypot(still, spin), options.gravity]) < _DIFFERS * options.gravity
+    is_usual = np.ptp([*np.hypot(still, spin), options.gravity]) < 1e-3 * options.gravity
     if is_usual and prior is None and options.k2_sd is None and options.k3_sd is None:
         return windows
-    rotating = [one.source.force for one in bags if one.source.force and one.source.force.radius]
+    rotating = [bag.source.force for bag in bags if bag.source.force and bag.source.force.radius]
     radii = {(one.radius, one.radius_sd) for one in rotating}
     if len(radii) > 1:
         raise FitError(f'the bags state different radii: {sorted(radii)}')
     radius, radius_sd = next(iter(radii), (1.0, 0.0))
     if radius_sd and options.prior is not None:
         raise FitError('a fit with a prior takes the radius as given: leave out --radius-sd')
-    kinds = tuple(POWERS) if prior is None else tuple(one.kind for one in prior.terms)
+    kinds = tuple(POWERS) if prior is None else tuple(term.kind for term in prior.terms)
     t = windows.temperature - windows.model.reference_temperature
     forces = Forces(kinds, t, still, spin, sd, radius_sd / radius)
     return replace(windows, data=replace(windows.data, forces=forces))
 
 
 def is_beyond(windows: ThermalWindows) -> bool:
-    """Whether |f| differs between the positions: the unit rotated in some of them."""
+    """Whether |f| differs between the positions."""
     forces = windows.data.forces
     return forces is not None and float(np.ptp(forces.sizes)) > 0.0
 
 
 def prior_sd(forces: Forces, options: FitOptions) -> Floats:
-    """Prior sd of the coefficients at the reference, then per kelvin, shape (2 k,)."""
+    """Return the prior sd of the coefficients at the reference, then per kelvin, (2 k,)."""
     sd = np.array([options.nonlinear_sd(kind) for kind in forces.kinds])
-    return np.concatenate((sd, _SLOPE_SHARE * sd))
+    return np.concatenate((sd, _SLOPE_RATIO * sd))
 
 
 def starting_sd(forces: Forces, options: FitOptions) -> Floats:
-    """Return the same for the terms that a fit begins with: square and cube."""
+    """Return the prior sd of the initial terms, square and cube; 0 for the other."""
     begins = np.array([kind != 'odd_square' for kind in forces.kinds])
     return np.asarray(prior_sd(forces, options) * np.tile(begins, 2))
 
@@ -104,37 +102,37 @@ def choose(
     k, wide = len(forces.kinds), prior_sd(forces, options)
 
     @cache
-    def fitted(used: _Used) -> tuple[Posterior, Prior]:
+    def fitted(used: _Active) -> tuple[Posterior, Prior]:
         prior = replace(selected.prior, nonlinear_sd=wide * np.isin(np.arange(2 * k), list(used)))
         return regression.solve(selected.posterior.state, prior), prior
 
     @cache
-    def score(used: _Used) -> Score:
+    def score(used: _Active) -> Score:
         return score_of(regression, *fitted(used))
 
-    def loss(used: _Used, without: _Used) -> float:
+    def loss(used: _Active, without: _Active) -> float:
         return fitted(used)[0].log_evidence - fitted(without)[0].log_evidence
 
-    def left_out_gain(used: _Used, without: _Used) -> tuple[float, float]:
+    def left_out_gain(used: _Active, without: _Active) -> tuple[float, float]:
         return score(without).norms.gain_of(score(used).norms) or (0.0, 0.0)
 
-    def is_determined(used: _Used, at: int) -> bool:
+    def is_determined(used: _Active, at: int) -> bool:
         posterior = fitted(used)[0]
         share = posterior.determined[posterior.layout.nonlinear[:, at]]
         return bool(share.mean() > _DETERMINED)
 
-    def thinned(used: _Used) -> _Used:
+    def thinned(used: _Active) -> _Active:
         asked = [at for at in range(k) if at in used and is_determined(used, at)]
         losses = {at: loss(used, used - {at, k + at}) for at in asked}
         worst = min(losses, key=losses.__getitem__, default=None)
-        if worst is None or losses[worst] > -_COUNTS:
+        if worst is None or losses[worst] > -LEAST_GAIN:
             return used
         return thinned(used - {worst, k + worst})
 
     odd = forces.kinds.index('odd_square')
     used = thinned(frozenset(range(2 * k)) - {odd, k + odd})
     joined = used | {odd, k + odd}
-    if loss(joined, used) > _JOINS:
+    if loss(joined, used) > TRIAL_GAIN:
         gain, error = left_out_gain(joined, used)
         used = thinned(joined) if gain > error else used
     found: dict[int, tuple[float, float]] = {}
@@ -146,11 +144,13 @@ def choose(
         else:
             found[at] = loss(used, without), gain
     for at in found:
-        if is_determined(used, k + at) and loss(used, used - {k + at}) < -_COUNTS:
+        if is_determined(used, k + at) and loss(used, used - {k + at}) < -LEAST_GAIN:
             used = used - {k + at}
     posterior, prior = fitted(used)
     fit: dict[str, Any] = {'score': score(used), 'posterior': posterior, 'prior': prior}
-    trials = tuple(replace(one, **fit) if one.is_chosen else one for one in selected.trials)
+    trials = tuple(
+        replace(trial, **fit) if trial.is_chosen else trial for trial in selected.trials
+    )
     terms = []
     for at, evidence in found.items():
         places = posterior.layout.nonlinear[:, [at, k + at]]
@@ -160,44 +160,45 @@ def choose(
 
 
 def blank_term(kind: Kind, sd: float, *evidence: float) -> NonlinearTerm:
-    """Make a term without coefficients."""
-    return NonlinearTerm(kind, _NIL, _NIL, sd, *evidence)
+    """Return a term with all coefficients 0."""
+    return NonlinearTerm(kind, _ZERO, _ZERO, sd, *evidence)
 
 
 def of_file(
     regression: Regression, terms: Sequence[NonlinearTerm], options: FitOptions
 ) -> Nonlinearity | None:
-    """Make the nonlinearity of a file, its coefficients still 0."""
+    """Return the nonlinearity for a file, with all coefficients 0."""
     forces = regression.forces
     if forces is None:
         return None
     known = options.prior.nonlinearity if options.prior else None
     sizes = forces.sizes
-    low, high = (1.0 - _MARGIN) * float(sizes.min()), (1.0 + _MARGIN) * float(sizes.max())
+    # The file's range of |f| is 1 % wider than that of the positions at either end.
+    low, high = 0.99 * float(sizes.min()), 1.01 * float(sizes.max())
     if known:
         low, high = min(low, known.force_range_m_s2[0]), max(high, known.force_range_m_s2[1])
     sd = known.beyond_sd_g_g2 if known else options.nonlinear_sd('square')
     kept = known.terms if known else terms
-    blank = (replace(one, coefficient=_NIL, per_kelvin=_NIL) for one in kept)
+    blank = (replace(term, coefficient=_ZERO, per_kelvin=_ZERO) for term in kept)
     return Nonlinearity((low, high), sd, tuple(blank))
 
 
 def with_terms(state: State, calibration: Calibration) -> State:
-    """Give a state the nonlinear coefficients of a prior calibration."""
+    """Set the nonlinear coefficients of a state to those of a calibration."""
     if calibration.nonlinearity is None:
         return state
     terms = calibration.nonlinearity.terms
-    each = [one.coefficient for one in terms] + [one.per_kelvin for one in terms]
+    each = [term.coefficient for term in terms] + [term.per_kelvin for term in terms]
     return replace(state, nonlinear=np.reshape(each, (-1, 3)).T.copy())
 
 
 def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
-    """Give a prior without a nonlinearity square and cube, unknown but for their prior sd."""
+    """Add square and cube with their prior sd to a prior that has no nonlinearity."""
     posterior, at = calibration.posterior, parameter_layout(calibration).misalignment
     if calibration.nonlinearity is not None or posterior is None:
         return calibration
     sd = [options.nonlinear_sd('square'), options.nonlinear_sd('cube')]
-    each = np.tile([*sd, *(_SLOPE_SHARE * one for one in sd)], 3)
+    each = np.tile([*sd, *(_SLOPE_RATIO * value for value in sd)], 3)
     factor = np.insert(posterior.matrix, [at] * len(each), 0.0, axis=0)
     rest = np.insert(posterior.variances, [at] * len(each), each**2)
     terms = (blank_term('square', sd[0]), blank_term('cube', sd[1]))
@@ -210,7 +211,7 @@ def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
 
 
 def without_terms(calibration: Calibration) -> Calibration:
-    """Leave out the nonlinearity: what remains is the same at 1 g, and its covariance wider."""
+    """Remove the nonlinear terms of a calibration, and their rows of its covariance."""
     layout, posterior = parameter_layout(calibration), calibration.posterior
     if posterior is not None:
         gone = np.arange(layout.nonlinear, layout.misalignment)
@@ -220,7 +221,7 @@ def without_terms(calibration: Calibration) -> Calibration:
 
 
 def judge_terms(calibration: Calibration) -> list[Finding]:
-    """Say which coefficients the data have not determined."""
+    """Advise more positions if the data do not determine some nonlinear terms."""
     nonlinearity = calibration.nonlinearity
     if nonlinearity is None:
         return []

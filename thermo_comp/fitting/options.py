@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the user may say of a fit: options, local gravity, families of curves.
+Owns the options of a fit: their checks, local gravity, families of curves.
 
-A wrong gravity scales all three scale factors by the same ratio and leaves no trace in the
-residuals, so the fit never guesses it.
+An error of the local gravity changes all three scale factors by the same ratio and is not visible
+in the residuals, so gravity must be given.
 
 References
 ----------
@@ -31,34 +31,21 @@ from ..unit.nonlinearity import Kind
 from .reduction import ReducedBag
 from .windows import Sets
 
-_EQUATORIAL_GRAVITY = 9.7803253359
-_SOMIGLIANA_K = 0.00193185265241
-_ECCENTRICITY_SQUARED = 0.00669437999014
-_SEMI_MAJOR_AXIS = 6378137.0
-_FLATTENING = 1.0 / 298.257223563
-_M_RATIO = 0.00344978650684
-#: Gravity found anywhere on land, with some room; outside it the number is a slip of the pen.
+#: Range of gravity on land, with a margin [m/s^2]; a value outside it is a mistake in typing.
 PLAUSIBLE_GRAVITY = (9.76, 9.84)
-#: The converter of the paper's unit: 16 bits in two's complement.
+#: Largest code of the converter of the paper's unit: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0
 #: Families of the curve over temperature.
 CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
-#: What evidence judges: curve and set of the two sets, then the groups of the response.
+#: Groups of columns that the fit selects: the curve, the difference of the two sets, the response.
 GROUPS = (
     'curve', 'set', 'gradient', 'board', 'gradient_lag', 'product', 'gradient_x_temperature',
     'square', 'gradient_even', 'gradient_even_about_rest', 'play', 'bend',
 )  # fmt: skip
-# Prior sd of the nonlinear terms, above the limits of quartz pendulums (some 20 .. 60 ug/g^2 and
-# some ug/g^3): [g/g^2] and [g/g^3].
-_K2_SD, _K3_SD = 1e-4, 1e-5
 _ORDERS = {'linear': 1, 'quadratic': 2, 'cubic': 3}
-_SPLINE_PIECES = 4
-# Knots nearer to the reference than this part of their distance fall on it.
-_NEAR = 0.3
-# Semiconductors double their leakage in some 10 K: an e-fold of 15 K, and of twice that.
-_E_FOLDS_K = (15.0, 30.0)
-#: What is refused, and may be allowed by its name.
+#: Names of the refusals that a user can allow.
 REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compensated')
+# Allowed words of each option.
 _WORDS: dict[str, tuple[str, ...]] = {
     'input': ('counts', 'm/s^2'),
     'model': ('response', 'golovach'),
@@ -73,26 +60,27 @@ class FitOptions:
     """
     Options of a fit; ValueError if one is outside its range.
 
-    gravity: local gravity; FitError if it is none of the Earth's
-    model: the whole bank, thinned by evidence; or the paper: a linear static and a quadratic
-        dynamic set, without a response
-    static_curve, dynamic_curve: one of `CURVES`; None takes the model's own
-    groups, forced: groups of columns that may take part (None: all); that stay whatever they earn
-    prior: what is known beforehand, of the type or of this unit; its columns are the model
-    ageing_bias, ageing_scale: sd of what each has changed by since the prior [m/s^2], [1]; both 0:
-        what the bags show
-    mounting_sd: how well mounting and turn-on repeat, sd of the bias [m/s^2]; None: not known
+    gravity: local gravity [m/s^2]; FitError if it does not occur on Earth
+    model: 'response' selects from all columns; 'golovach' is the paper's model: a linear static
+        and a quadratic dynamic set, no response
+    static_curve, dynamic_curve: one of `CURVES`; None for the model's default
+    groups, forced: groups of columns that may take part (None: all), and that are not selected but
+        always kept
+    prior: calibration of this unit or of its type; its columns are the model
+    ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior; both
+        0: estimated from the bags
+    mounting_sd: sd of the bias offset of a mounting or turn-on [m/s^2]; None: estimated
     gravity_sd: standard deviation of `gravity` [m/s^2]
-    k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], as of a data sheet;
-        None: 100 ug/g^2 and 10 ug/g^3, where positions are not at 1 g, else no such terms
-    serial: unit serial; None takes the sources'
+    k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], as in a data sheet;
+        None: 100 ug/g^2 and 10 ug/g^3 if positions are not at 1 g, else no such terms
+    serial: unit serial; None for that of the sources
     input: unit of the samples
-    full_scale: magnitude of a saturated sample; None takes 32767 for counts, and for m/s^2 the
-        smallest usual range that holds the data
-    offset: what raw words read without a force, as 32768; None finds it out
-    reference_temperature: T_ref; the paper uses 20
-    detector: thermometer and detector settings; None learns them from the bags
-    min_rest_s: length of the shortest rest; None chooses, see `reduction`
+    full_scale: magnitude of a saturated sample; None: 32767 for counts, and for m/s^2 the smallest
+        usual range that contains the data
+    offset: code at zero force, as 32768; None: estimated from the bags
+    reference_temperature: T_ref [degC]; the paper uses 20
+    detector: thermometer and detector settings; None: estimated from the bags
+    min_rest_s: length of the shortest rest [s]; None: chosen, see `reduction`
     still_sd: largest scatter of the samples at rest [m/s^2]
     allow: names of refusals that the user overrides, see `data_checks`
     """
@@ -145,14 +133,18 @@ class FitOptions:
                     raise ValueError(f'`{name}` must be of {", ".join(words)}, got {word!r}')
 
     def nonlinear_sd(self, kind: Kind) -> float:
-        """Prior sd of the coefficients of a nonlinear term."""
+        """
+        Return the prior sd of a nonlinear term [g/g^2; of the cube g/g^3].
+
+        The defaults are above the limits of quartz pendulums: some 20 .. 60 ug/g^2, some ug/g^3.
+        """
         if kind == 'cube':
-            return _K3_SD if self.k3_sd is None else self.k3_sd
-        return _K2_SD if self.k2_sd is None else self.k2_sd
+            return 1e-5 if self.k3_sd is None else self.k3_sd
+        return 1e-4 if self.k2_sd is None else self.k2_sd
 
     @property
     def saturated_at(self) -> float | None:
-        """Magnitude of a saturated sample, where it is known before the samples are."""
+        """Magnitude of a saturated sample; None if it depends on the data."""
         return self.full_scale or (COUNTS_FULL_SCALE if self.input == 'counts' else None)
 
 
@@ -178,18 +170,20 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name in _ORDERS:
         return Polynomial((0.0, *[1.0] * _ORDERS[name]))
     if name == 'exponential':
-        return Exponential(-float(len(_E_FOLDS_K)), (1.0,) * len(_E_FOLDS_K), _E_FOLDS_K)
-    knots = np.linspace(lower, upper, _SPLINE_PIECES + 1)
-    step = max((upper - lower) / _SPLINE_PIECES, 1.0)
-    kept = sorted([0.0, *(float(k) for k in knots if abs(k) > _NEAR * step)])
+        # The leakage of semiconductors doubles in about 10 K: an e-fold of 15 K, and of 30 K.
+        return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
+    # A spline of four pieces; a knot close to the reference is replaced by one at it.
+    knots = np.linspace(lower, upper, 5)
+    step = max((upper - lower) / 4, 1.0)
+    kept = sorted([0.0, *(float(k) for k in knots if abs(k) > 0.3 * step)])
     return CubicSpline(tuple(kept), tuple(float(k != 0.0) for k in kept))
 
 
 def normal_gravity(latitude_deg: float, height_m: float) -> float:
     """
-    Gravity of the WGS 84 ellipsoid (Somigliana) at a height above it.
+    Return the gravity of the WGS 84 ellipsoid (Somigliana) at a height above it.
 
-    Real gravity differs by up to some 30 mGal (30 ug) in mountains. Raises ValueError for a
+    Real gravity differs from it by up to 30 mGal (30 ug) in mountains. Raises ValueError for a
     latitude outside -90..90 deg or a height outside -1000..10000 m.
     """
     if not -90.0 <= latitude_deg <= 90.0:
@@ -197,11 +191,10 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     if not -1000.0 <= height_m <= 10000.0:
         raise ValueError(f'`height_m` must be within -1000..10000, got {height_m}')
     sine2 = math.sin(math.radians(latitude_deg)) ** 2
-    at_ellipsoid = (
-        _EQUATORIAL_GRAVITY
-        * (1.0 + _SOMIGLIANA_K * sine2)
-        / math.sqrt(1.0 - _ECCENTRICITY_SQUARED * sine2)
-    )
-    relative = height_m / _SEMI_MAJOR_AXIS
-    slope = 2.0 * (1.0 + _FLATTENING + _M_RATIO - 2.0 * _FLATTENING * sine2)
+    # Constants of WGS 84: gravity at the equator, Somigliana's k, eccentricity squared, ...
+    root = math.sqrt(1.0 - 0.00669437999014 * sine2)
+    at_ellipsoid = 9.7803253359 * (1.0 + 0.00193185265241 * sine2) / root
+    # ... semi-major axis, flattening, and m, centrifugal acceleration over gravity at the equator.
+    relative, flattening, m = height_m / 6378137.0, 1.0 / 298.257223563, 0.00344978650684
+    slope = 2.0 * (1.0 + flattening + m - 2.0 * flattening * sine2)
     return at_ellipsoid * (1.0 - slope * relative + 3.0 * relative**2)

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what is known of a unit before its bags: an earlier calibration of it, or those of siblings.
+Owns informative priors: an earlier calibration of the unit, or the population of its type.
 
-Both are calibrations: a mean and a covariance of all parameters. What a type of unit has in common
-is the mean over units of the parameters relative to the scale factors, and their scatter; an
-earlier calibration of the unit itself has grown by its ageing. The fit takes either as the
-Gaussian prior of its regression, in the columns of that file.
+Both are calibrations: a mean and a covariance of all parameters. A population has the mean and the
+scatter over units of the parameters relative to the scale factors. The covariance of an earlier
+calibration of the unit is increased by its ageing. Either is the Gaussian prior of the regression,
+which then has the columns of that file.
 """
 
 from __future__ import annotations
@@ -32,22 +32,17 @@ from .start import ConstantCalibration
 from .unknowns import InformativePrior, State
 from .windows import Sets
 
-#: A population needs so many units to have a scatter.
+#: Smallest number of units of a population: fewer give no scatter.
 UNITS_NEEDED = 3
-# What siblings do not have in common may lie in other directions than those few units show: this
-# part of the scatter counts for each parameter by itself, and parts of it more may be added.
-_ALONE = 0.01
-_MORE_ALONE = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
-# Ageing that nobody has stated, of biases [parts of g] and of scales, is what the bags show.
-_AGEINGS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
-# Ageing of scales is as large as that of biases, in these units, or a small part of it.
-_SCALE_SHARES = (0.0, 0.01, 1.0)
-# Correlations are believed to this part of a variance.
-_EXACT = 1e-6
+# Share of the scatter of a population that is taken as uncorrelated between the parameters. A few
+# units do not show all directions in which another unit can differ.
+_UNCORRELATED = 0.01
+# Candidates of the further uncorrelated variance, relative to each variance of the prior.
+_INFLATIONS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
-    """Return the response as columns; FitError if one is of one regime, as in version 1."""
+    """Return the response as columns; FitError if one acts in one regime only (version 1)."""
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
@@ -61,7 +56,7 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
 
 
 def prior_sets(calibration: Calibration) -> Sets:
-    """Return the curves of a calibration: each regime has its own."""
+    """Return the curves of a calibration, one for each regime."""
     return Sets(
         calibration.static.x.bias_function, calibration.dynamic.x.bias_function, is_shared=False
     )
@@ -77,11 +72,11 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Give a state the bias and weights of a calibration, whose scale is nominal."""
+    """Set bias and weights of a state to those of a calibration with the nominal scale."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError('the curves of the prior differ from axis to axis, or from bias to scale')
-    # Of each axis the level of the static set, and behind it what else there is beside that.
+    # Per axis: the level of the static set, then the other coefficients relative to this level.
     both = np.array([[values[one.static : one.end] for one in part] for part in layout[:2]])
     both[..., layout.bias[0].dynamic] -= both[..., 0]
     both[0] /= regression.nominal_scale[:, None]
@@ -92,11 +87,12 @@ def informative_priors(
     calibration: Calibration, regression: Regression, state: State, sets: Sets, options: FitOptions
 ) -> list[InformativePrior]:
     """
-    Turn a calibration into priors on its columns, for the evidence, the last to begin with;
-    FitError without claim.
+    Return candidate priors from a calibration, which the fit compares by evidence.
+
+    The fit begins with the last one, the widest. FitError if the calibration has no covariance.
     """
     if calibration.posterior is None:
-        raise FitError('the prior has no covariance: an import makes no claim to build on')
+        raise FitError('the prior has no covariance: an imported calibration cannot be a prior')
     K = constants_of(calibration).scale
     covariance = calibration.posterior.covariance()
     places = parameter_layout(calibration)
@@ -113,15 +109,16 @@ def informative_priors(
         return result
 
     stated = options.ageing_bias, options.ageing_scale
-    tried = [(grown(*stated), more) for more in _MORE_ALONE]
+    tried = [(grown(*stated), more) for more in _INFLATIONS]
     if not any(stated):
+        # Candidates of the ageing: of biases in units of g, of scales relative to that of biases.
         tried += [
             (grown(ageing * options.gravity, share * ageing), 0.0)
-            for share in _SCALE_SHARES
-            for ageing in _AGEINGS
+            for share in (0.0, 0.01, 1.0)
+            for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
-    # The fit only begins with the last: noise must not take what a narrow one leaves.
-    tried.append((tried[-1][0], _MORE_ALONE[-1]))
+    # The first fit must be wide: under a narrow prior the noise would absorb the differences.
+    tried.append((tried[-1][0], _INFLATIONS[-1]))
     layout = regression.layout(regression.windows.parts)
     kinds = regression.forces.kinds if regression.forces else ()
     used = range(len(calibration.response))
@@ -133,8 +130,9 @@ def informative_priors(
         floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
         sd = np.sqrt(floor)
         scaled, correlation = to_file / sd[:, None], known / np.outer(sd, sd)
-        wider = correlation + (_EXACT + more) * np.eye(len(sd))
-        # Parameters that are almost one, as the levels of both sets, would drown in a product.
+        # A relative jitter of 1e-6 bounds the correlations of the file's float32 covariance. The
+        # QR factor, not a product, keeps the precision of nearly equal parameters.
+        wider = correlation + (1e-6 + more) * np.eye(len(sd))
         whitened = solve_triangular(np.linalg.cholesky(wider), scaled, lower=True)
         root: Floats = np.asarray(np.linalg.qr(whitened, mode='r'))
         root = root * np.sign(np.diag(root))[:, None]
@@ -143,13 +141,20 @@ def informative_priors(
 
 
 def population(calibrations: Sequence[Calibration]) -> Calibration:
-    """Make the prior of a type of unit from some; FitError if they are too few or not alike."""
+    """
+    Make the prior of a type of unit from calibrations of at least three units.
+
+    Raises FitError if they are fewer, or differ in input, reference, sensors or curves.
+    """
     if len(calibrations) < UNITS_NEEDED:
         raise FitError(f'{len(calibrations)} calibrations, need {UNITS_NEEDED} for a population')
-    # Units of a type need not share a nonlinearity, which takes a centrifuge to see.
-    calibrations = [without_terms(one) if one.nonlinearity else one for one in calibrations]
+    # Nonlinear terms are left out: most units have none, since they need a centrifuge.
+    calibrations = [
+        without_terms(calibration) if calibration.nonlinearity else calibration
+        for calibration in calibrations
+    ]
     first = calibrations[0]
-    serials = {one.unit.serial for one in calibrations}
+    serials = {calibration.unit.serial for calibration in calibrations}
     if len(serials) < len(calibrations):
         raise FitError('two of the calibrations are of one unit: a population needs one of each')
     for one in calibrations:
@@ -177,31 +182,34 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
         for key, own in keys.items()
     ]
     like = _like(calibrations, columns)
-    K = np.array([constants_of(one).scale for one in calibrations])
+    K = np.array([constants_of(calibration).scale for calibration in calibrations])
     mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
-    told = [_told(one, like, mean_K) for one in calibrations]
-    vectors = np.array([vector for vector, _ in told])
+    units = [_relative_to(calibration, like, mean_K) for calibration in calibrations]
+    vectors = np.array([vector for vector, _ in units])
     mean = vectors.mean(axis=0)
     away = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
-    scatter = (1.0 - _ALONE) * away.T @ away
-    scatter[np.diag_indices_from(scatter)] += _ALONE * np.sum(away**2, axis=0)
-    # Of the mean itself, too.
+    scatter = (1.0 - _UNCORRELATED) * away.T @ away
+    scatter[np.diag_indices_from(scatter)] += _UNCORRELATED * np.sum(away**2, axis=0)
+    # Add the variance of the mean.
     scatter *= 1.0 + 1.0 / len(vectors)
-    # What none of the units told is as alike in all as their prior was: it stays as unknown.
-    scatter += np.mean([covariance for _, covariance in told], axis=0)
+    # Parameters that none of the units determined keep the uncertainty of their own prior.
+    scatter += np.mean([covariance for _, covariance in units], axis=0)
     return with_parameters(like, mean_K, mean, scatter)
 
 
 def _alike(columns: Sequence[Column]) -> list[Column]:
-    """Return columns as they are told apart: units differ in what they have seen, and in heat."""
+    """Return columns without the fields that differ between units of a type: range and rest."""
     return [replace(column, range=(0.0, 1.0), rest_k=0.0) for column in columns]
 
 
-def _told(calibration: Calibration, like: Calibration, mean_K: Floats) -> tuple[Floats, Floats]:
-    """Return a unit's parameters and covariance at the places of others, at the mean scale."""
+def _relative_to(
+    calibration: Calibration, like: Calibration, mean_K: Floats
+) -> tuple[Floats, Floats]:
+    """Return a unit's parameters and covariance in the layout of `like`, at the mean scale."""
     if calibration.posterior is None:
         raise FitError(
-            f'{calibration.unit.serial} has no covariance: an import says nothing of its type'
+            f'{calibration.unit.serial} has no covariance: an imported calibration cannot be part '
+            'of a population'
         )
     everything = _alike(prior_columns(like))
     terms = [everything.index(column) for column in _alike(prior_columns(calibration))]
@@ -231,12 +239,12 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 
 
 def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
-    """Make a calibration like some, of these columns, which its parameters wait for."""
+    """Return a calibration with the union of the ranges and these columns, all weights 0."""
     first = calibrations[0]
     slow = [[axis.residual_sd_m_s2 for axis in one.static.axes()] for one in calibrations]
     regimes = []
     for k, regime in enumerate(first.regime_sets()):
-        each = [one.regime_sets()[k] for one in calibrations]
+        each = [calibration.regime_sets()[k] for calibration in calibrations]
         x, y, z = (
             replace(own, residual_sd_m_s2=float(sd))
             for own, sd in zip(regime.axes(), np.median(slow, axis=0), strict=True)
@@ -253,7 +261,7 @@ def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Cal
         provenance=Provenance(
             tool_version=__version__,
             model=POPULATION,
-            sources=tuple(Source(one.unit.serial) for one in calibrations),
+            sources=tuple(Source(calibration.unit.serial) for calibration in calibrations),
         ),
         evidence=(),
         posterior=None,

@@ -3,11 +3,12 @@
 """
 Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
 
-One pass over the blocks, in bounded memory: samples become cells of about half a second (see
-`stillness`), the cells of a still interval become windows of ten seconds, each exactly as long but
-for the last one. Within a window every thermal regressor is linear in time to far below the
-noise, so the window's mean is a sufficient statistic; its noise is what the regression finds,
-because a charge-balancing converter makes means better than the scatter of its samples says.
+The blocks are read once, in bounded memory. Samples are averaged to cells of about half a second
+(see `stillness`), and the cells of a still interval to windows of ten seconds; only the last
+window of an interval is shorter. Within a window every thermal regressor is linear in time to far
+below the noise, so the mean of a window is a sufficient statistic. The noise of the means is
+estimated by the regression, because that of a charge-balancing converter is smaller than the
+scatter of its samples implies.
 """
 
 from __future__ import annotations
@@ -30,22 +31,14 @@ from ..typing import Floats, Ints
 from .coverage import best_rests, directions, distinct_directions, rough_centre
 from .sources import FitSource, angular_velocity
 
-#: Usual length of a window [s].
+#: Default length of a window [s].
 WINDOW_S = 10.0
-_CELL_S = 0.5
-# Faster readings are averaged to this interval: no thermometer of this kind is that fast, and the
-# thermometers' recursion runs in Python.
-_SHORTEST_READING_INTERVAL_S = 0.2
-_LEAST_FILLED = 0.9
-# What is tried, the strictest first: lengths of the shortest rest [s], ratios of variances.
+# Candidates of the length of the shortest rest [s], the strictest first.
 _MIN_RESTS_S = (3.0, 2.0, 1.0)
-# Of samples so slow that a cell lasts this long [s], shorter ones may find more rests: of so many
-# samples, for so many attitudes.
-_SLOW_CELL_S, _FEW_SAMPLES, _ENOUGH = 3.0, 5, 6
-# Cells on either side of a shake, what a parabola through all may leave, mean square [sd], and how
-# many shakes are a habit.
-_AROUND, _ONE_LINE, _CYCLES = 4, 4.0, 6
-_RATIOS = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
+# Candidates of the largest ratio of a rest's variance to the quietest one, the strictest first.
+_VARIANCE_RATIOS = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
+# Number of samples in a cell if the samples are slow and rests are short.
+_FEW_SAMPLES = 5
 
 
 class Readings(NamedTuple):
@@ -55,20 +48,23 @@ class Readings(NamedTuple):
     value: Floats
 
 
+#: Readings of a thermometer that was not recorded.
 NO_READINGS = Readings(np.empty(0, np.int64), np.empty(0))
-# What arrays say of themselves.
+#: Recording information of arrays, which have none.
 NO_RECORDING = RecordingInfo(Path(), '', {}, 0, 0)
 
 
 @dataclass(frozen=True)
 class StillInterval:
     """
-    One interval without motion: one position, from its first to its last cell's middle.
+    One interval without motion: one position.
 
-    Its windows follow each other from `begin_s`, since the bag's first sample [s]; `n_whole` have
-    the full length, one that is shorter may come after them. Of each the mean `time` [s], `count`
-    and `mean` of the raw samples are kept, and that of the angular rate [rad/s], None where the
-    bag has none throughout. `sample_sd` is the scatter of single samples.
+    start_ns, end_ns: stamps of the middles of its first and last cell
+    begin_s: start of its first window, since the bag's first sample [s]
+    n_whole: number of windows of full length; a shorter one may follow
+    time, count, mean: mean time [s], number and mean of the samples of each window
+    sample_sd: standard deviation of single samples
+    angular_rate: mean of each window [rad/s]; None if a part of the bag has no rate
     """
 
     start_ns: int
@@ -85,14 +81,18 @@ class StillInterval:
 @dataclass(frozen=True)
 class ReducedBag:
     """
-    What the fit keeps of one bag.
+    The statistics of one bag that the fit uses.
 
-    Stamps are of the first and last sample used; dropped are samples that are not finite or out of
-    order. Its length, and that at rest, are counted in cells; windows last `window_s` as asked,
-    or a multiple where the samples are slow; `cycle_s` is typical between samples. `middle` is the
-    word of no force where the words have no sign, else 0; `reach` how far the readings go but for
-    single glitches; `since_s` where the part begins that was read [s]; `restless` what speaks
-    against rests; `angular_rate` how much of the bag has one, all finite.
+    start_ns, end_ns: stamps of the first and last sample used
+    n_dropped: number of samples that are not finite or out of order
+    n_cells, n_still_cells: length of the bag and of its rests in cells
+    window_s: length of a window; longer than the option if the samples are slow
+    cycle_s: typical interval between samples
+    middle: code at zero force if the codes are unsigned, else 0
+    max_abs: largest reading without single glitches [input units]
+    since_s: start of the part of the bag that was read
+    restless: reason why there are no rests
+    angular_rate: part of the bag that has finite angular rates
     """
 
     source: FitSource
@@ -109,7 +109,7 @@ class ReducedBag:
     cycle_s: float
     is_integer: bool
     middle: float = 0.0
-    reach: float = 0.0
+    max_abs: float = 0.0
     info: RecordingInfo = NO_RECORDING
     since_s: float = 0.0
     restless: str = ''
@@ -130,7 +130,7 @@ def reduce_source(
     source: FitSource,
     *,
     window_s: float = WINDOW_S,
-    cell_s: float = _CELL_S,
+    cell_s: float = 0.5,
     min_rest_s: float | None = None,
     still_sd: float = stillness.STILL_SD,
     full_scale: float | None,
@@ -140,10 +140,10 @@ def reduce_source(
     """
     Stream one source and keep its sufficient statistics.
 
-    `still_sd` is the largest scatter at rest [parts of g]. Without `min_rest_s` rests last 3 s;
-    where a recording has so many short ones that they tell bias and scale, how short, and how
-    quiet beside the quietest, is what tells these best. Cells have the `least` samples, or fewer
-    where these are slow and rarely rest as long.
+    `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
+    3 s, or less if shorter rests determine bias and scale better; the largest
+    variance of a rest is chosen in the same way. A cell has `least` samples, or 5 if the samples
+    are slow and the unit rarely rests as long.
     """
     cells = CellAccumulator(min(cell_s, window_s), full_scale, window_s, least)
     readings: dict[str, list[Readings]] = {}
@@ -169,7 +169,7 @@ def reduce_source(
             raise FitError(f'{source.name}: {n} readings of {name} are beyond {HOTTEST:g} degC')
     found, reader = cells.finish(), source.reader()
     if source.force is not None:
-        # At another |f| the norms of the rests do not show which thresholds are best.
+        # The thresholds are chosen by the norms at rest, which must be those of gravity.
         found = stillness.without_rotation(found)
         shortest = min_rest_s or _MIN_RESTS_S[0]
         ranges = stillness.still_intervals(found, shortest, still_sd)
@@ -177,7 +177,9 @@ def reduce_source(
         ranges = _rests(found, min_rest_s, still_sd)
     per_window = max(1, round(window_s / found.cell_s)) if found.cell_s else 1
     n_still = sum(upper - lower for lower, upper in ranges)
-    if least > _FEW_SAMPLES and found.cell_s > _SLOW_CELL_S and 2 * n_still < len(found.count):
+    # Cells longer than 3 s, and less than half of the time at rest: try shorter cells, and keep
+    # them if they give six attitudes.
+    if least > _FEW_SAMPLES and found.cell_s > 3.0 and 2 * n_still < len(found.count):
         closer = reduce_source(
             source,
             window_s=window_s,
@@ -188,8 +190,10 @@ def reduce_source(
             fewest_windows=fewest_windows,
             least=_FEW_SAMPLES,
         )
-        means = np.array([one.mean.mean(axis=0) for one in closer.intervals]).reshape(-1, 3)
-        if len(distinct_directions(directions(means, rough_centre(means)))) >= _ENOUGH:
+        means = np.array([interval.mean.mean(axis=0) for interval in closer.intervals]).reshape(
+            -1, 3
+        )
+        if len(distinct_directions(directions(means, rough_centre(means)))) >= 6:
             return closer
     return ReducedBag(
         source=source,
@@ -214,12 +218,12 @@ def reduce_source(
         n_saturated=found.n_saturated,
         n_cells=len(found.count),
         n_still_cells=n_still,
-        # A bag of which no sample counts has windows of the usual length, and none of them.
+        # A bag without a usable sample has no cells: its window length is the option's.
         window_s=round(per_window * found.cell_s, 6) or window_s,
         cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,
         is_integer=found.is_integer,
         middle=found.middle,
-        reach=_reach(found),
+        max_abs=_max_abs(found),
         info=reader.info if reader else NO_RECORDING,
         since_s=reader.since_s if reader else 0.0,
         restless=causes.cause(found, still_sd)
@@ -228,7 +232,8 @@ def reduce_source(
     )
 
 
-def _reach(cells: Cells) -> float:
+def _max_abs(cells: Cells) -> float:
+    """Return the 99 % quantile over the cells of the largest absolute mean plus 3 sd."""
     if not len(cells.count):
         return 0.0
     sizes = np.max(np.abs(cells.mean) + 3.0 * np.sqrt(cells.variance), axis=1)
@@ -243,10 +248,10 @@ def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
 
 
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
-    """Find the rests, by the thresholds under which they tell the triad best."""
+    """Find the rests, with the thresholds at which they determine the triad best."""
     found: list[list[tuple[int, int]]] = []
     for shortest in _MIN_RESTS_S if min_rest_s is None else (min_rest_s,):
-        for ratio in _RATIOS:
+        for ratio in _VARIANCE_RATIOS:
             ranges = stillness.still_intervals(cells, shortest, still_sd, ratio)
             if ranges not in found:
                 found.append(ranges)
@@ -260,14 +265,17 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
 
 def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> list[tuple[int, int]]:
     """
-    Join rests between which the unit was shaken, but not moved, where that happens all the time:
-    a compressor that cycles.
+    Join rests that are separated by a vibration without motion, if this happens six times or more,
+    as with a compressor that cycles.
+
+    Two rests are joined if a parabola describes the four cells on either side of the vibration,
+    with a mean squared residual below 4 variances.
     """
     is_calm = stillness.is_under(cells, still_sd)
     result = ranges[:1]
     for start, stop in ranges[1:]:
         first, last = result[-1]
-        around = slice(max(first, last - _AROUND), min(stop, start + _AROUND))
+        around = slice(max(first, last - 4), min(stop, start + 4))
         time, mean = cells.time[around], cells.mean[around]
         variance = np.maximum(cells.variance[around], cells.quantum**2 / 12.0)
         root = np.sqrt(np.maximum(cells.count[around, None], 1) / np.maximum(variance, 1e-300))
@@ -276,26 +284,27 @@ def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> lis
             line = np.vander((time - time[0]) / np.ptp(time), 3) * root[:, [axis]]
             value = mean[:, axis] * root[:, axis]
             left = value - line @ np.linalg.lstsq(line, value, rcond=None)[0]
-            is_one = is_one and np.mean(left**2) < _ONE_LINE
+            is_one = is_one and np.mean(left**2) < 4.0
         if is_one:
             result[-1] = first, stop
         else:
             result.append((start, stop))
-    return result if len(ranges) - len(result) >= _CYCLES else ranges
+    return result if len(ranges) - len(result) >= 6 else ranges
 
 
 def _windows(
     cells: Cells, lower: int, upper: int, per_window: int, has_rate: bool
 ) -> StillInterval:
+    """Average the cells of a still interval to windows of `per_window` cells."""
     n_whole, rest = divmod(upper - lower, per_window)
-    # Less than half a window weighs too little to be one.
+    # A remainder below half a window is dropped.
     end = upper - rest if n_whole and 2 * rest < per_window else upper
     rows = slice(lower, end)
     offsets = np.arange(0, end - lower, per_window)
     count = cells.count[rows].astype(np.float64)
     total = np.add.reduceat(count, offsets)
-    # Where the bag ends within a cell, its window does not last as long.
-    if n_whole and total[n_whole - 1] < _LEAST_FILLED * np.median(total):
+    # If the bag ends within a cell the last window is shorter: less than 90 % of the samples.
+    if n_whole and total[n_whole - 1] < 0.9 * np.median(total):
         n_whole -= 1
 
     def means(of_cells: Floats) -> Floats:
@@ -316,14 +325,18 @@ def _windows(
 
 
 def _thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
-    """Keep possible readings, in rising order after the last one; average very fast ones."""
+    """
+    Keep plausible readings with stamps rising from the last one; average readings below 0.2 s.
+
+    No thermometer is faster than 0.2 s, and the recursion over the readings runs in Python.
+    """
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
     use = (value >= COLDEST) & (value <= HOTTEST)
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
-    size = int(_SHORTEST_READING_INTERVAL_S * (len(stamp_ns) - 1) / span_s) if span_s else 1
+    size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
     n = len(stamp_ns) // size * size if size > 1 else 0
     if n:
         first = stamp_ns[0]

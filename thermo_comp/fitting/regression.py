@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the one regression: bias, scale, misalignment, attitudes, start states, given the prior.
+Owns the regression: the posterior of all unknowns under a given prior, by Gauss-Newton.
 
-All unknowns have Gaussian priors (attitudes: flat on the sphere). Gauss-Newton finds the mode, the
-inverse of the Hessian is the covariance. The unknowns of each bag are eliminated first, so what a
-bag tells of the unit is one matrix and one vector, and leaving data out is a subtraction.
+All unknowns have Gaussian priors (attitudes: flat on the sphere). Gauss-Newton finds the mode; the
+inverse of the Hessian is the covariance. The unknowns of each bag are eliminated first, so the
+information of a bag about the unit is one matrix and one vector, which are subtracted to leave the
+bag out.
 
 References
 ----------
@@ -26,14 +27,8 @@ from .equations import Equations, Tangent, as_vector, moved_by
 from .inactive import Inactive
 from .unknowns import Layout, Prior, State
 
-# Of a matrix of unit diagonal: what keeps it positive definite to the last digit, the least first.
-_JITTERS = (1e-13, 1e-11, 1e-9, 1e-7)
-# A step that promises less of twice the log density than this is the last one.
-_NEAR = 1e-3
-# Shares of a step that leads uphill, and how much stiffer what is held is made.
-_SHARES = (1.0, 0.25, 0.06, 0.015, 0.004, 0.001)
-_HELD = 1e9
-# Sd of the mean of the start states of all bags, over that of each: it is next to nothing.
+# Prior sd of the mean over all bags of the initial lag states, over that of one bag. A non-zero
+# mean is a response of the unit, which other initial states would show as well.
 _COMMON_START = 0.1
 
 
@@ -42,8 +37,8 @@ class Normal:
     """
     Normal equations of all positions, before any prior.
 
-    hessian, gradient: of each position and axis, shapes (n_positions, 3, k, k), (..., k), in the
-        order of `Tangent`
+    hessian, gradient: of each position and axis, in the order of `Tangent`, shapes
+        (n_positions, 3, k, k), (n_positions, 3, k)
     square: sum of squares of the whitened residuals of each axis, shape (3,)
     """
 
@@ -55,9 +50,12 @@ class Normal:
 @dataclass(frozen=True)
 class Common:
     """
-    The bound on the sum of the start states over the bags, as its own small system: factor of its
-    matrix, its cross block with the unit's unknowns, the sum once the bags have moved, and how the
-    unknowns of each bag answer to it.
+    The prior on the sum over the bags of their initial lag states, as a small linear system.
+
+    factor: Cholesky factor of its matrix
+    cross: its cross block with the unit's unknowns
+    sum: sum of the states after the step of each bag
+    answers: derivatives of the unknowns of each bag by this sum
     """
 
     factor: Floats
@@ -66,21 +64,21 @@ class Common:
     answers: tuple[Floats, ...]
 
     def solve(self, right: Floats) -> Floats:
-        """Solve with the matrix of the bound."""
+        """Solve the system for a right-hand side."""
         return np.asarray(cho_solve((self.factor, True), right, check_finite=False))
 
 
 @dataclass(frozen=True)
 class Reduced:
     """
-    What some bags tell of the unit, their own unknowns eliminated.
+    The normal equations of the unit's unknowns, with the unknowns of each bag eliminated.
 
-    information, pull: of each bag, shapes (n_bags, n_unit, n_unit), (n_bags, n_unit)
-    factors: of each bag the factor of its own block, its inverse times the cross block, and times
-        the gradient
-    log_determinant: of the blocks of all bags
-    common: what the bound on the mean of the start states adds to the information and to the pull;
-        None where there is none
+    information, pull: Hessian and gradient of each bag, shapes (n_bags, n_unit, n_unit),
+        (n_bags, n_unit)
+    factors: of each bag the Cholesky factor of its block, and the inverse of the block times the
+        cross block and times the gradient
+    log_determinant: sum over the blocks of the bags
+    common: contribution of the prior on the mean of the initial lag states; None without it
     """
 
     information: Floats
@@ -106,13 +104,13 @@ class Reduced:
 @dataclass(frozen=True)
 class Posterior:
     """
-    The mode and its surroundings.
+    The Gaussian approximation of the posterior at its mode.
 
-    determined: what of each unknown the data determined, not the prior, 0..1, shape (n,)
-    covariance: of what belongs to the unit, shape (n_unit, n_unit)
-    variance: of all unknowns, shape (n,)
+    determined: effective parameters of each unknown (MacKay's gamma), 0 .. 1, shape (n,)
+    covariance: covariance of the unit's unknowns, shape (n_unit, n_unit)
+    variance: variances of all unknowns, shape (n,)
     square: sum of squares of the whitened residuals of each axis, shape (3,) [(m/s^2)^2]
-    log_evidence: logarithm of the marginal likelihood, but for a constant of the data
+    log_evidence: logarithm of the marginal likelihood, without a constant of the data
     """
 
     state: State
@@ -125,21 +123,25 @@ class Posterior:
 
     @property
     def effective_parameters(self) -> Floats:
-        """Effective parameters of each column in bias and scale, all axes, shape (2, m)."""
+        """Effective parameters of each column, sum over the axes, shape (2, m)."""
         padded = np.append(self.determined, 0.0)
         return np.asarray(padded[self.layout.weights].sum(axis=1))
 
 
 def factored(matrix: Floats) -> Floats:
-    """Return the lower Cholesky factor of a positive definite matrix, but for rounding."""
+    """
+    Return the lower Cholesky factor of a matrix that is positive definite except for rounding.
+
+    The smallest jitter that suffices is added to the matrix scaled to a unit diagonal.
+    """
     root = np.sqrt(np.diag(matrix))
     scaled = matrix / np.outer(root, root)
     diagonal = np.diag_indices(len(matrix))
-    for jitter in _JITTERS[:-1]:
+    for jitter in (1e-13, 1e-11, 1e-9):
         scaled[diagonal] += jitter
         with suppress(np.linalg.LinAlgError):
             return np.asarray(np.linalg.cholesky(scaled) * root[:, None])
-    scaled[diagonal] += _JITTERS[-1]
+    scaled[diagonal] += 1e-7
     return np.asarray(np.linalg.cholesky(scaled) * root[:, None])
 
 
@@ -165,10 +167,10 @@ class Regression(Equations):
         bags: Ints | None = None,
         without: int = -1,
     ) -> Reduced:
-        """Eliminate what belongs to each bag alone; `without`: a position that is left out."""
+        """Eliminate the unknowns of each bag; `without`: a position that is left out."""
         n, own = layout.n_unit, layout.axis.shape[1]
         both = own + len(layout.shared)
-        of_axis = [slice(int(one[0]), int(one[0]) + own) for one in layout.axis]
+        of_axis = [slice(int(places[0]), int(places[0]) + own) for places in layout.axis]
         shared = slice(n - len(layout.shared), n)
         precision = self.precision(prior, layout)
         away = as_vector(state, layout)
@@ -199,7 +201,7 @@ class Regression(Equations):
                     g[local] += vector[both:]
             H[np.diag_indices(size)] += precision[block]
             g -= precision[block] * away[block]
-            # Attitudes of which nothing is seen stay where they are.
+            # Attitudes without any information keep their value.
             blind = np.diag(H) <= 0.0
             H[blind, blind] = 1.0
             factor = factored(H)
@@ -227,10 +229,7 @@ class Regression(Equations):
         factors: list[tuple[Floats, Floats, Floats]],
         answers: list[Floats],
     ) -> Common:
-        """
-        Bound what the start states of all bags have in common: that is no start, it is a response
-        of the unit that another start would show.
-        """
+        """Return the system of the prior on the sum of the initial lag states of all bags."""
         at = [places - one.start for places, one in zip(layout.start, layout.blocks, strict=True)]
         bound = (_COMMON_START * self.n_bags) ** 2 * prior.start_share
         matrix = sum(one[own] for one, own in zip(answers, at, strict=True))
@@ -252,7 +251,7 @@ class Regression(Equations):
         )
 
     def unit_prior(self, prior: Prior, layout: Layout) -> Floats:
-        """Inverse covariance of the unit's own unknowns, shape (n_unit, n_unit)."""
+        """Return the prior precision of the unit's unknowns, shape (n_unit, n_unit)."""
         if prior.informative is not None:
             return prior.informative.precision
         return np.diag(self.precision(prior, layout)[: layout.n_unit])
@@ -260,13 +259,13 @@ class Regression(Equations):
     def unit_step(
         self, information: Floats, pull: Floats, prior: Prior, layout: Layout, state: State
     ) -> tuple[Floats, Floats]:
-        """Solve for the unit's own unknowns: the step, and the factor of their Hessian."""
+        """Return the step of the unit's unknowns, and the Cholesky factor of their Hessian."""
         known, n = self.unit_prior(prior, layout), layout.n_unit
         away = (as_vector(state, layout) - self.prior_mean(prior, layout))[:n]
         if prior.informative is None:
             factor = factored(information + known)
             return cho_solve((factor, True), pull - known @ away, check_finite=False), factor
-        # In standard deviations of the prior no parameter drowns another.
+        # In units of the prior's standard deviations the system is well conditioned.
         root = prior.informative.root
         turned = solve_triangular(root, information, trans='T')
         turned = solve_triangular(root, turned.T, trans='T')
@@ -279,8 +278,9 @@ class Regression(Equations):
         self, state: State, prior: Prior, layout: Layout, grams: Floats, *, held: bool = False
     ) -> tuple[Floats, Reduced, Floats, Floats]:
         """
-        Take a Gauss-Newton step: the step, the reduced equations, the factor of the unit's
-        Hessian, and the sum of squares of each axis; `held`: only what enters linearly moves.
+        Return the Gauss-Newton step, the reduced equations, the Cholesky factor of the unit's
+        Hessian, and the sum of squares of each axis. `held`: the nonlinear unknowns are held by a
+        damping factor, so that only the linear ones move.
         """
         tangent = self.tangent(state, layout, self.products(layout.used))
         normal = self.normal(tangent, grams, prior)
@@ -289,7 +289,7 @@ class Regression(Equations):
             diagonal = np.einsum('...ii->...i', normal.hessian)
             k = diagonal.shape[-1]
             turns = own + len(layout.shared) + 2 + layout.stretch.shape[1]
-            diagonal[..., [0, *range(own, turns), *range(k - n_starts, k)]] *= _HELD
+            diagonal[..., [0, *range(own, turns), *range(k - n_starts, k)]] *= 1e9
         reduced = self.reduce(normal, prior, layout, state)
         whole, factor = self.unit_step(*reduced.whole, prior, layout, state)
         step = np.zeros(layout.n)
@@ -303,7 +303,7 @@ class Regression(Equations):
         return step, reduced, factor, normal.square
 
     def energy(self, state: State, prior: Prior, layout: Layout, grams: Floats) -> float:
-        """Minus twice the log density of data and state, but for constants of the prior."""
+        """Return -2 times the log density of data and state, without the prior's constants."""
         v = self.misfit(state, self.products(layout.used))
         square = np.sum((v @ grams) * v, axis=(0, 2))
         return self._size(np.maximum(square, 0.0), prior) + self._away(state, prior, layout)
@@ -328,7 +328,7 @@ class Regression(Equations):
         return size
 
     def solve(self, state: State, prior: Prior, n_steps: int = 6) -> Posterior:
-        """Find the mode under a prior in so many steps at most; with none, stay where it is."""
+        """Find the posterior at the mode, in at most `n_steps`; with 0 steps at `state`."""
         self.whiten(prior.noise)
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).whole
@@ -342,7 +342,7 @@ class Regression(Equations):
             if reached > energy:
                 break
             gained, energy, state = energy - reached, reached, found
-            if gained < _NEAR:
+            if gained < 1e-3:
                 break
         return self._posterior(state, prior, layout, reduced, factor, square)
 
@@ -356,8 +356,10 @@ class Regression(Equations):
         energy: float,
     ) -> tuple[State, float]:
         """
-        Take a step; where it leads uphill, shares of it in the unknowns that enter as products,
-        while the others, which enter linearly, follow. Returns the state and its energy.
+        Take a step; return the state and its energy.
+
+        If the step increases the energy, fractions of it are tried in the nonlinear unknowns,
+        which enter as products, and the linear unknowns are solved again for each fraction.
         """
         found = moved_by(state, step, layout)
         reached = self.energy(found, prior, layout, grams)
@@ -366,7 +368,7 @@ class Regression(Equations):
         bends = np.zeros(layout.n, dtype=bool)
         for places in (layout.kappa, layout.shared, layout.up, layout.stretch, layout.start):
             bends[places] = True
-        for share in _SHARES:
+        for share in (1.0, 0.25, 0.06, 0.015, 0.004, 0.001):
             turned = moved_by(state, np.where(bends, share * step, 0.0), layout)
             follow, *_ = self.step(turned, prior, layout, grams, held=True)
             found = moved_by(turned, np.where(bends, 0.0, follow), layout)
@@ -406,7 +408,7 @@ class Regression(Equations):
         return Posterior(state, layout, determined, covariance, everything, square, evidence)
 
     def inactive(self, posterior: Posterior, prior: Prior, asked: Bools) -> Inactive:
-        """Ask the data for columns that take no part, shape (m,), beside the mode."""
+        """Return sparsity and quality factors of inactive columns, (m,), at the mode."""
         state, layout = posterior.state, posterior.layout
         used, n = layout.used, layout.n_unit
         columns = np.flatnonzero(asked & ~used.any(axis=0))
@@ -423,7 +425,7 @@ class Regression(Equations):
         S: Floats = np.zeros((2, k, 3, 2, k, 3))
         Q: Floats = np.zeros((2, k, 3))
         cross: Floats = np.zeros((n, 2, k, 3))
-        local = [np.zeros((one.stop - one.start, 2, k, 3)) for one in layout.blocks]
+        local = [np.zeros((block.stop - block.start, 2, k, 3)) for block in layout.blocks]
         force = self.along_axes(state)
         for p, bag in enumerate(self.bag_of_position.tolist()):
             among, beside = self.absent_products(columns, used, p)

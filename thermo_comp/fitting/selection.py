@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the choice of the model: it grows from constants, one group of columns at a time.
+Owns the choice of the model: groups of columns are added to the constants one at a time.
 
-The log evidence says which groups are worth a trial; the left-out score says whether a group
-stays. It stays if the correction of data that took no part improves by more than its standard
-error over the folds, for positions and for sections of the program alike: a group that only
-explains one recording, or one program, fails one of the two.
+The log evidence ranks the groups to be tried; the left-out score decides. A group is added if it
+reduces the error on left-out data by more than the standard error over the folds, both for
+positions and for sections of the program. A group that describes only one recording, or one
+program, fails one of the two tests.
 
 References
 ----------
@@ -29,43 +29,35 @@ from .regression import Posterior, Regression
 from .unknowns import InformativePrior, Noise, Prior, State
 from .windows import BEND, CURVE, SET
 
-# A group is worth a trial if it could add this to the log evidence: e^4 = 55 to one.
-_WORTH_A_TRIAL = 4.0
-# So many groups are tried in a round, the most promising first.
+#: Smallest possible gain in log evidence of a group that is tried: odds of e^4 = 55 to one.
+TRIAL_GAIN = 4.0
+# Largest number of groups tried in a round.
 _TRIALS = 3
-# Groups that one law of physics needs together: parts that lag by m have the curve of their own
-# temperature, (t - m)^2 = t^2 - 2 t m + m^2; where m is of the flow between two thermometers, the
-# product is mixed.
 #: Groups that are linear in a temperature difference.
 LAGS = ('gradient', 'board', 'gradient_lag')
+# Groups that are tried together, because one effect has columns in all of them: the curve of a
+# part that lags by m is (t - m)^2 = t^2 - 2 t m + m^2, m from the board or from the gradient.
 _TOGETHER = (('product', 'square'), (*LAGS, 'product', 'gradient_x_temperature', 'square'))
-# So many columns of knees are asked for in a round.
-_MOST_BENDS = 16
-# The noise is sought in steps of this factor, then of its roots; its white part follows in so many
-# rounds.
-_NOISE_STEP, _NOISE_ROUNDS = 3.0, 2
-# A column of the chosen model stays if the log evidence falls by this without it: less is worth no
-# more than a bare mention (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
-_LEAST_GAIN = 1.0
-# Logarithms of mean squares that differ by less than this are equal: 5 % of an RMS.
+#: Smallest log Bayes factor of a column that is kept: below 1 the evidence is "not worth more than
+#: a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
+LEAST_GAIN = 1.0
+# Logarithms of mean squares that differ by less than this count as equal: 5 % of an RMS.
 _EQUAL = 0.1
-# The RMS error of the two halves may rise by this factor: two folds scatter by a quarter.
+# Largest factor by which the RMS error of the two halves may rise: two folds scatter by a quarter.
 _MOST_BY_HALVES = 1.25
-# Norms of left-out positions alone decide for a group if they gain so many standard errors.
-_SURE_ERRORS = 2.0
 
 
 @dataclass(frozen=True)
 class Trial:
     """
-    A model that was looked at.
+    A model that was tried.
 
     groups: its groups of columns; () for constants
     score: its left-out errors
     posterior, prior: its fit
-    typical: widths that the priors of its columns centre on, shape (2, m)
-    is_chosen: whether it is the one
-    is_near: whether it is as good as the chosen one within the standard error of their difference
+    typical: typical prior sd of its columns, shape (2, m)
+    is_chosen: whether it is the chosen model
+    is_near: whether its score is within one standard error of that of the chosen model
     """
 
     groups: tuple[str, ...]
@@ -79,7 +71,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Selected:
-    """The chosen model: its fit, its left-out score, and all models that were looked at."""
+    """The chosen model: its fit, its left-out score, and all models that were tried."""
 
     posterior: Posterior
     prior: Prior
@@ -90,12 +82,12 @@ class Selected:
 @dataclass(frozen=True)
 class Candidates:
     """
-    What may take part.
+    The columns that may take part in a model.
 
-    typical, largest: widths that the prior of each column centres on and never exceeds, in units
+    typical, largest: centre of the hyperprior and upper bound of each column's prior sd, in units
         of its RMS, shape (2, m); 0 for a column that may not take part
-    forced: columns that stay whatever they gain, shape (m,)
-    fixed: columns that keep their width and their place, shape (2, m)
+    forced: columns that are always kept, shape (m,)
+    fixed: columns that are always kept, with their prior sd, shape (2, m)
     """
 
     typical: Floats
@@ -105,7 +97,7 @@ class Candidates:
 
     @property
     def kept(self) -> Bools:
-        """Which columns are never dropped, shape (2, m)."""
+        """Columns that are never dropped, shape (2, m)."""
         return self.fixed | self.forced
 
 
@@ -122,7 +114,7 @@ def select(
     forced = tuple(dict.fromkeys(names[candidates.forced & may].tolist()))
     asked = [name for name in dict.fromkeys(names[may].tolist()) if name not in forced]
     grow = _Growth(regression, candidates, names)
-    # Drift looks like mountings, or like noise, as long as there is no curve: two beginnings.
+    # Without a curve the drift is attributed to mountings or to noise: start from both.
     begun = [prior]
     if prior.offset_scale > 0.0:
         begun.append(replace(prior, offset_sd=float(prior.sigma.mean())))
@@ -130,7 +122,7 @@ def select(
     constants = chosen = _likeliest(fits)
     trials, round_number = [constants], 0
     if CURVE in asked:
-        # All else is relative to a curve, which may help only together with it.
+        # The curve is added without a test: it may improve the score only with other groups.
         groups = *forced, CURVE
         curve = _likeliest(
             [grow.fit(groups, fit.posterior.state, fit.prior, fit.typical) for fit in fits]
@@ -149,7 +141,7 @@ def select(
         chosen = _simplest_of_the_best(chosen, better)
     if chosen is not constants and not is_better(constants.score, chosen.score):
         gain = chosen.posterior.log_evidence - constants.posterior.log_evidence
-        if not _is_open(constants.score, chosen.score) or gain < _WORTH_A_TRIAL:
+        if not _is_undecided(constants.score, chosen.score) or gain < TRIAL_GAIN:
             chosen = constants
     settled = replace(candidates, typical=chosen.typical)
     posterior, prior, score = finish(regression, chosen.posterior, chosen.prior, settled)
@@ -169,14 +161,14 @@ def fit_all(
     candidates: Candidates,
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
-    """Fit all columns that may take part; of priors of the unit the likeliest is taken."""
+    """Fit all columns; of several informative priors take that of the largest log evidence."""
     posterior, prior = _settle(regression, state, prior, candidates)
     downweigh(regression, posterior, prior)
     posterior, prior = _settle(regression, posterior.state, prior, candidates)
     if informative:
         tried = [
-            regression.solve(posterior.state, replace(prior, informative=one), n_steps=3)
-            for one in informative
+            regression.solve(posterior.state, replace(prior, informative=candidate), n_steps=3)
+            for candidate in informative
         ]
         best = int(np.argmax([one.log_evidence for one in tried]))
         prior = replace(prior, informative=informative[best])
@@ -192,10 +184,10 @@ def finish(
     regression: Regression, posterior: Posterior, prior: Prior, candidates: Candidates
 ) -> tuple[Posterior, Prior, Score]:
     """
-    Settle the chosen model: knocks, columns that gain too little, and slow noise.
+    Complete the chosen model: weights of outliers, columns with too little gain, slow noise.
 
-    Exponentially correlated noise explains as well what the model misses of the temperature: it is
-    kept only if the correction of left-out data is no worse with it.
+    Slow noise also absorbs thermal effects that the model lacks, so it is kept only if it does not
+    worsen the correction of left-out data.
     """
     downweigh(regression, posterior, prior)
     white = _pruned(
@@ -218,13 +210,13 @@ def _pruned(
     candidates: Candidates,
     rounds: int = 25,
 ) -> tuple[Posterior, Prior]:
-    """Drop columns that gain too little, as long as the log evidence agrees once they are gone."""
+    """Drop columns with too little gain, as long as the log evidence of the new fit agrees."""
     while True:
-        fewer = pruned(posterior, prior, candidates.kept, _LEAST_GAIN)
+        fewer = pruned(posterior, prior, candidates.kept, LEAST_GAIN)
         if np.array_equal(fewer.column_sd, prior.column_sd):
             return posterior, prior
         found = _settle(regression, posterior.state, fewer, candidates, rounds)
-        if found[0].log_evidence < posterior.log_evidence - _LEAST_GAIN:
+        if found[0].log_evidence < posterior.log_evidence - LEAST_GAIN:
             return posterior, prior
         posterior, prior = found
 
@@ -240,7 +232,7 @@ def _settle(
 def _with_slow_noise(
     regression: Regression, posterior: Posterior, prior: Prior, candidates: Candidates
 ) -> tuple[Posterior, Prior]:
-    """Estimate the exponentially correlated noise from the residuals, and settle with it."""
+    """Estimate the slow noise from the residuals, then by log evidence, and settle with it."""
     residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
     best = regression.whitener.estimate(residual, regression.weight)
     if best == prior.noise:
@@ -248,31 +240,32 @@ def _with_slow_noise(
 
     def with_noise(noise: Noise) -> tuple[Posterior, Prior]:
         trial = replace(prior, noise=noise)
-        for _ in range(_NOISE_ROUNDS):
-            looked = regression.solve(posterior.state, trial, n_steps=1)
-            trial = replace(trial, sigma=white_noise(regression, looked))
-        return looked, trial
+        for _ in range(2):
+            fitted = regression.solve(posterior.state, trial, n_steps=1)
+            trial = replace(trial, sigma=white_noise(regression, fitted))
+        return fitted, trial
 
-    # Residuals lack what the parameters took of the noise; the log evidence counts it.
-    looked, found = with_noise(best)
-    step = _NOISE_STEP
-    while step > _NOISE_STEP**0.2:
+    # The parameters absorb a part of the noise, so residuals underestimate it; the log evidence
+    # does not. Search ratio and time in steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
+    refined, found = with_noise(best)
+    step = 3.0
+    while step > 3.0**0.2:
         around = [
             with_noise(Noise(best.ratio * ratio, best.time_s * time))
             for ratio, time in ((step, 1.0), (1.0 / step, 1.0), (1.0, step), (1.0, 1.0 / step))
             if regression.whitener.shows(best.time_s * time)
         ]
         nearby = max(around, key=lambda one: one[0].log_evidence)
-        if nearby[0].log_evidence > looked.log_evidence:
-            looked, found = nearby
+        if nearby[0].log_evidence > refined.log_evidence:
+            refined, found = nearby
             best = found.noise
         else:
             step = step**0.5
-    return _settle(regression, looked.state, found, candidates)
+    return _settle(regression, refined.state, found, candidates)
 
 
 class _Growth:
-    """Fits models of some groups, each beginning from the fit of a smaller one."""
+    """Fits models of some groups, each initialised by the fit of a smaller model."""
 
     def __init__(self, regression: Regression, candidates: Candidates, names: Floats) -> None:
         self._regression = regression
@@ -280,7 +273,7 @@ class _Growth:
         self._names = names
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
-        """Fit a model; columns that a smaller model dropped are asked again."""
+        """Fit a model; columns that a smaller model dropped are tried again."""
         candidates = replace(self._candidates, typical=typical)
         wanted = np.isin(self._names, groups)
         begin = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
@@ -291,26 +284,26 @@ class _Growth:
         return Trial(groups, score, posterior, prior, typical)
 
     def trials(self, chosen: Trial, absent: list[str]) -> list[Trial]:
-        """Fit the groups that could add most to the log evidence, each beside the chosen ones."""
+        """Fit the chosen model plus each group with a large possible gain in log evidence."""
         if not absent:
             return []
         typical = self._candidates.typical
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self._regression.inactive(chosen.posterior, chosen.prior, columns)
         if BEND in absent:
-            # Of many knees few are asked for: those that the data show one after another.
+            # At most 16 of the many bend columns are tried, chosen by forward selection.
             is_bend = self._names == BEND
-            knees = inactive.chosen(typical, is_bend, _WORTH_A_TRIAL, _MOST_BENDS)
+            knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, 16)
             typical = np.where(is_bend & ~knees, 0.0, typical)
         asked: list[tuple[str, ...]] = [(name,) for name in absent]
         together = (tuple(name for name in names if name in absent) for names in _TOGETHER)
         asked += [names for names in together if len(names) > 1]
         gains = {names: inactive.gain(typical, np.isin(self._names, names)) for names in asked}
-        likely = [names for names in asked if gains[names] > _WORTH_A_TRIAL]
+        likely = [names for names in asked if gains[names] > TRIAL_GAIN]
         likely.sort(key=gains.__getitem__, reverse=True)
         tried = likely[:_TRIALS]
         if chosen.groups == (CURVE,) and (SET,) in likely[_TRIALS:]:
-            # The paper's two sets are always looked at.
+            # The paper's two sets are always tried.
             tried.append((SET,))
         state, prior = chosen.posterior.state, chosen.prior
         return [
@@ -320,8 +313,9 @@ class _Growth:
 
     def _typical(self, chosen: Trial, names: tuple[str, ...], most: Floats) -> Floats:
         """
-        Typical widths once a group is added: those of its columns explain what is left, and are
-        `most` at most.
+        Return the typical prior sd of a model with further groups.
+
+        The sd of a new column corresponds to the RMS residual of the chosen model, up to `most`.
         """
         kelvins = self._regression.windows.kelvins
         moved = float(kelvins[0]) or 1.0
@@ -343,7 +337,7 @@ def _likeliest(fits: Sequence[Trial]) -> Trial:
 
 
 def _simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
-    """Take the largest gain, or of smaller models the first that is as good within the error."""
+    """Return the model with the largest gain, or a smaller one that is not significantly worse."""
     best = max(better, key=lambda one: _gain(before.score, one.score))
     for one in sorted(better, key=lambda one: len(one.groups)):
         if one is best or not is_better(one.score, best.score):
@@ -352,13 +346,16 @@ def _simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
 
 
 def is_better(before: Score, after: Score) -> bool:
-    """Whether left-out data show a model to be better, by more than their standard error."""
+    """Whether the second model is better on left-out data by more than the standard error."""
     return _gain(before, after) > 0.0
 
 
 def _gain(before: Score, after: Score) -> float:
     """
-    Return the sum of log gains of the drift if a model is better by more than the errors, else 0.
+    Return the gain of a model if it exceeds its standard errors, else 0.
+
+    It is the sum of the log gains of the drift. If the drifts are equal, the norms of left-out
+    positions decide with a gain of two standard errors.
     """
     positions, sections, norms = _gains(before, after)
     drift = [one for one in (positions, sections) if one]
@@ -368,20 +365,20 @@ def _gain(before: Score, after: Score) -> float:
     total = sum(gain for gain, _ in drift)
     if total > _EQUAL * len(drift) and all(gain > error for gain, error in drift):
         return total
-    is_sure = norms is not None and norms[0] > max(_SURE_ERRORS * norms[1], _EQUAL)
+    is_sure = norms is not None and norms[0] > max(2.0 * norms[1], _EQUAL)
     if is_sure and norms and all(abs(gain) < _EQUAL for gain, _ in drift):
         return norms[0]
     return 0.0
 
 
-def _is_open(before: Score, after: Score) -> bool:
-    """Whether left-out data cannot tell: the drifts are equal, no norms are left out in common."""
+def _is_undecided(before: Score, after: Score) -> bool:
+    """Whether left-out data do not decide: equal drifts, and no norms scored in both models."""
     *drift, norms = _gains(before, after)
     return norms is None and all(abs(one[0]) < _EQUAL for one in drift if one)
 
 
 def _is_near(chosen: Score, other: Score) -> bool:
-    """Whether another model differs from the chosen one by no more than one standard error."""
+    """Whether a model is at most one standard error worse than the chosen one."""
     found = [one for one in _gains(chosen, other) if one]
     return bool(found) and all(gain > -error for gain, error in found)
 

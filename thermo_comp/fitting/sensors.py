@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the bags say of the thermometers: noise, lag, ramps, detector; the causal thermal state.
+Owns the settings of thermometers and detector estimated from the bags, and the thermal states.
 
-Rates are taken here from both sides, over a minute each, which only a recording allows; what is
-learnt makes the causal thermometers and the detector expect what this chamber did.
+Rates are central differences over two minutes, which need a recording. The causal thermometers and
+the detector get the noise, lag and ramps of this chamber.
 """
 
 from __future__ import annotations
@@ -21,19 +21,10 @@ from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats
 from .reduction import NO_READINGS, Readings, ReducedBag
 
-# Below this no thermometer is worth believing, and the recursion would follow rounding errors.
-_SMALLEST_NOISE = 1e-4
-_BIN_S = 10.0
-_BINS_PER_SIDE = 6
-# Shares of readings that are no more than stray ones.
-_STRAY = (0.005, 0.995)
-_MINUTE_S = 60.0
-# A ramp is clear when its rate is this far above the noise of rates.
+# Interval of the grid of rates [s], and number of intervals on each side of a rate.
+_BIN_S, _BINS_PER_SIDE = 10.0, 6
+# Smallest rate of a ramp over the noise of the rates.
 _CLEAR = 5.0
-_LAG_RANGE_S = (30.0, 3600.0)
-_RIPPLE_RANGE_C = (0.02, 1.0)
-# The unit may meet ramps faster than the chamber's.
-_RAMP_MARGIN = 1.5
 
 
 @dataclass(frozen=True)
@@ -45,14 +36,14 @@ class Course:
 
     @property
     def is_resting(self) -> Bools:
-        """Where the chamber rests: no ramp for five minutes before and after."""
+        """Grid points without a ramp for five minutes before and after."""
         moving = np.abs(self.rate) > max(0.2 * self.fastest, _CLEAR * self.rate_sd)
         near = np.convolve(moving, np.ones(61))[30:-30] > 0.5
         return np.asarray(~near)
 
     @property
     def fastest(self) -> float:
-        """Rate that all but a hundredth of the course stays below [K/s]."""
+        """99 % quantile of the absolute rate [K/s]."""
         return float(np.quantile(np.abs(self.rate), 0.99))
 
 
@@ -81,32 +72,34 @@ def learn_thermometer(
     if not long:
         return base
     quantum = quantum_of(np.concatenate(long))
-    noise = max(_noise_of(long, quantum), _SMALLEST_NOISE)
+    # At least 0.1 mK: below it the recursion would follow rounding errors.
+    noise = max(_noise_of(long, quantum), 1e-4)
     courses = _courses(recorded, noise, quantum)
-    clear = [one for one in courses if one.fastest > _CLEAR * one.rate_sd]
+    clear = [course for course in courses if course.fastest > _CLEAR * course.rate_sd]
     if not clear:
         return replace(base, noise_sd_c=noise, quantum_c=quantum)
-    fastest = max(one.fastest for one in clear)
-    # A ramp begins through a lag with the acceleration ramp / lag; the means of a minute on
-    # either side see it when it is half a minute old, and spread it over the minute.
+    fastest = max(course.fastest for course in clear)
+    # At the beginning of a ramp the lagged temperature has the second derivative ramp / lag. It is
+    # estimated from the difference of two rates one minute apart.
     lags = []
     for one in clear:
         bend = np.abs(one.rate[_BINS_PER_SIDE:] - one.rate[:-_BINS_PER_SIDE])
         steepest = float(np.quantile(bend, 0.995)) / (_BIN_S * _BINS_PER_SIDE)
         if steepest > 0.0:
             lags.append(one.fastest / steepest)
-    lag = float(np.clip(np.median(lags), *_LAG_RANGE_S)) if lags else base.lag_s
+    lag = float(np.clip(np.median(lags), 30.0, 3600.0)) if lags else base.lag_s
     return replace(
         base,
         noise_sd_c=noise,
         quantum_c=quantum,
-        fastest_ramp_k_min=max(base.fastest_ramp_k_min, _RAMP_MARGIN * 60.0 * fastest),
+        # In use, ramps may be faster than those of the chamber: a margin of 1.5.
+        fastest_ramp_k_min=max(base.fastest_ramp_k_min, 1.5 * 60.0 * fastest),
         lag_s=round(lag, 1),
     )
 
 
 def quantum_of(values: Floats) -> float:
-    """Find the step of a rounded sensor in its readings, shape (n,)."""
+    """Find the quantum of a sensor's readings, shape (n,) [K]; 0 if they are not rounded."""
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):
         return 0.0
@@ -118,19 +111,19 @@ def quantum_of(values: Floats) -> float:
 
 
 def _noise_of(values: Sequence[Floats], quantum: float) -> float:
-    # A straight ramp has no second difference; white noise of sd s gives s sqrt(6).
+    # Second differences do not depend on a linear ramp; white noise of sd s gives s sqrt(6).
     second = np.concatenate([np.diff(value, 2) for value in values])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
-    # Rounded readings stand still most of the time, so a median would say 0: the mean square
-    # without the largest hundredth serves, less what rounding alone gives.
+    # Most rounded readings equal their neighbours, so the median is 0: use the mean square without
+    # the largest 1 %, less the variance of rounding.
     square = np.sort(second**2)[: max(1, int(0.99 * len(second)))]
     variance = max(float(square.mean()) / 6.0 - quantum**2 / 12.0, (0.1 * quantum) ** 2)
     return float(np.sqrt(variance))
 
 
 def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list[Course]:
-    """Rates of each bag that is long enough to have any."""
+    """Return the rates of each bag that is long enough."""
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:
@@ -140,7 +133,7 @@ def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list
         n_bins = int(time[-1] / _BIN_S)
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
-        # The mean over a bin is a difference of the integral at its edges.
+        # The mean over a bin is the difference of the integral between its edges.
         integral = np.concatenate(
             ([0.0], np.cumsum(0.5 * (readings.value[1:] + readings.value[:-1]) * np.diff(time)))
         )
@@ -148,14 +141,14 @@ def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list
         means = (edges[_BINS_PER_SIDE:] - edges[:-_BINS_PER_SIDE]) / side
         rate = (means[_BINS_PER_SIDE:] - means[:-_BINS_PER_SIDE]) / side
         per_side = max(1.0, side * (len(time) - 1) / time[-1])
-        # Rounding errors of neighbours are alike as long as the temperature stays in one step.
+        # Rounding errors are fully correlated while the temperature stays within a quantum.
         spread = np.sqrt(2.0 * (noise**2 / per_side + quantum**2 / 12.0))
         result.append(Course(rate, float(spread) / side))
     return result
 
 
 def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
-    """Seven tenths of the slowest long ramp [K/min], within reason."""
+    """Return 0.7 times the slowest ramp longer than 10 min, at least `RAMP_K_MIN` [K/min]."""
     slowest = usual / 0.7
     for one in courses:
         clear = np.abs(one.rate) > max(_CLEAR * one.rate_sd, 0.1 / 60.0)
@@ -168,21 +161,21 @@ def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
 
 
 def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
-    """Amplitude of the surroundings' ripple in soaks: through the lag it made the rates seen."""
-    rates = [one.rate[one.is_resting] for one in courses]
+    """Return the amplitude of the ambient ripple in soaks [K], from rates and lag."""
+    rates = [course.rate[course.is_resting] for course in courses]
     resting = np.concatenate(rates) if rates else np.zeros(0)
     if len(resting) < 60 or not courses:
         return usual
-    noise = float(np.median([one.rate_sd for one in courses]))
+    noise = float(np.median([course.rate_sd for course in courses]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
     clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
-    # A ripple within the noise of the rates is not seen: then the usual one may be there.
+    # A ripple below the noise of the rates is not detected: assume the default at most.
     hidden = min(usual, 3.0 * noise * lag_s)
-    return float(np.clip(max(clean * lag_s, hidden), *_RIPPLE_RANGE_C))
+    return float(np.clip(max(clean * lag_s, hidden), 0.02, 1.0))
 
 
 def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dict[str, float]:
-    """Find T_s - T_board of each sensor while the board's rate is 0: what its own heat makes."""
+    """Return T_sensor - T_board of each sensor at zero rate, from self-heating [K]."""
     result = {}
     for name in sensors:
         rate, gradient = [np.zeros(0)], [np.zeros(0)]
@@ -192,12 +185,12 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
                 continue
             first = max(board.stamp_ns[0], other.stamp_ns[0])
             last = min(board.stamp_ns[-1], other.stamp_ns[-1])
-            grid = np.arange(0.0, (last - first) * 1e-9, _MINUTE_S)
+            grid = np.arange(0.0, (last - first) * 1e-9, 60.0)
             at, beside = (
                 np.interp(grid, (one.stamp_ns - first) * 1e-9, one.value) for one in (board, other)
             )
             if len(grid) > 2:
-                rate.append(np.gradient(at, _MINUTE_S))
+                rate.append(np.gradient(at, 60.0))
                 gradient.append(beside - at)
         g, v = np.concatenate(gradient), np.concatenate(rate)
         moved = v - v.mean() if len(v) else v
@@ -208,7 +201,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 
 
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
-    """Leave out thermometers that repeat the board's readings in every bag; name them."""
+    """Remove thermometers that repeat the board's readings in every bag; return their names."""
     names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
     copies = [
         name
@@ -224,16 +217,20 @@ def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[s
 
 
 def board_span(bags: Sequence[ReducedBag], reference: float) -> tuple[float, float]:
-    """Return the board temperatures seen, from the reference [K], but for stray readings."""
+    """Return the 0.5 % and 99.5 % quantiles of the board temperature less the reference [K]."""
     values = np.concatenate([bag.board.value for bag in bags])
     if not len(values):
         return 0.0, 0.0
-    lower, upper = (np.quantile(values, _STRAY) - reference).tolist()
+    lower, upper = (np.quantile(values, (0.005, 0.995)) - reference).tolist()
     return lower, upper
 
 
 def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str, int, float]]:
-    """Thermometer, stamp and value of each reading; of equal stamps in the order of `inputs`."""
+    """
+    Return thermometer, stamp and value of each reading in the order of the stamps.
+
+    Readings with equal stamps are in the order of `inputs`.
+    """
     found: list[tuple[str, int, float]] = []
     for name in inputs:
         one = bag.temperatures.get(name, NO_READINGS)
@@ -244,7 +241,11 @@ def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str,
 def thermal_states(
     bag: ReducedBag, tracker: ThermalTracker, step_s: float
 ) -> tuple[float, Floats, Bools]:
-    """Sample a tracker: where the grid begins [s], states, which of them rest on readings."""
+    """
+    Run a tracker over a bag and sample it on a grid.
+
+    Returns the start of the grid [s], the states, and which of them have recent readings.
+    """
     readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
     reading = next(readings, None)
     step_ns = round(step_s * 1e9)
@@ -253,7 +254,7 @@ def thermal_states(
     board, *others = tracker.thermometers.values()
     limit_s, other_limit_s = tracker.config.temperature_timeout_s, tracker.config.case_timeout_s
     for stamp_ns in range(begin, max(bag.end_ns, begin) + step_ns, step_ns):
-        # Readings up to and including a grid stamp come first, as they do online.
+        # As online, a state includes the readings up to and including its stamp.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)

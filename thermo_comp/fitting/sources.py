@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the fit reads: blocks of accelerometer samples and temperature readings, by source.
+Owns the input of a fit: sources of blocks of accelerometer samples and temperature readings.
 
-Bags, tables and simulated runs provide the same blocks as to the compensator.
+Bags, tables and simulated runs provide the same blocks to the fit and to the compensator.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from ..recording.topics import Topics, is_called, shown
 from ..typing import Floats
 from .known_force import USUAL_FORCE, AskedForce, KnownForce, known_force
 
+# Topics that a recording must have.
 _SAMPLES: tuple[Role, ...] = ('accel',)
 
 
 def angular_velocity(block: object) -> Floats | None:
-    """Angular rate of a block that has one: a recording's, when its input is an Imu."""
+    """Return the angular rate of a block of Imu messages; None for other blocks."""
     imu = getattr(block, 'imu', None)
     if imu is None or (imu.angular_velocity_covariance[:, 0] == -1.0).any():
         return None
@@ -36,16 +37,18 @@ def angular_velocity(block: object) -> Floats | None:
 @dataclass(frozen=True)
 class FitSource:
     """
-    One bag (or what stands for one): `blocks` gives a fresh iterable in file order for each pass.
+    One bag, table, array or simulated run.
 
-    `reader` gives what read it last, which knows what was missing; None for arrays.
+    blocks: returns an iterable of the blocks in file order, a new one at each call
+    force: known |f|; None: gravity
+    reader: returns the last reader of the recording, or None for arrays
     """
 
     name: str
     blocks: Callable[[], Iterable[Block]]
     sha256: str | None = None
     serial: str | None = None
-    force: KnownForce | None = None  # None: at rest |f| is gravity
+    force: KnownForce | None = None
     reader: Callable[[], RecordingReader | None] = lambda: None
 
 
@@ -53,10 +56,10 @@ def fit_sources(
     paths: Sequence[str | Path], topics: Topics | None = None, force: AskedForce = USUAL_FORCE
 ) -> tuple[list[FitSource], Input]:
     """
-    Prepare recordings for a fit; each is opened once now, and streamed when the fit asks.
+    Make sources of recordings; each recording is opened once here and again by the fit.
 
-    Raises RecordingError if one cannot be read or lacks a topic; FitError if one is given
-    twice, or some hold counts and some Imu messages.
+    Raises RecordingError if a recording cannot be read or lacks a topic; FitError if a recording
+    is given twice, or if some have counts and some Imu messages.
     """
     sources: list[FitSource] = []
     kinds: dict[str, str] = {}
@@ -70,8 +73,8 @@ def fit_sources(
             raise FitError(f'{path}: is {twin} once more, and nothing may count twice')
     if len(kinds) > 1:
         raise FitError(
-            f'{kinds["counts"]} holds counts, {kinds["imu"]} Imu messages: leave one kind out, or '
-            'choose with --input where a bag has both'
+            f'{kinds["counts"]} has counts, {kinds["imu"]} has Imu messages: give recordings of '
+            'one kind, or choose with --input if a bag has both'
         )
     return sources, 'imu' if 'imu' in kinds else 'counts'
 
@@ -85,8 +88,9 @@ def recording_source(
     force: AskedForce = USUAL_FORCE,
 ) -> tuple[FitSource, RecordingInfo]:
     """
-    Make a source of a recording: looked at now, and opened anew for each pass. `force`: what the
-    user says of |f|, in place of the bag's metadata.
+    Make a source of a recording, which is opened here and again for each pass.
+
+    `force`: the user's options about |f|, which replace the bag's metadata
     """
     path = Path(path)
     with open_recording(path, topics, require=require) as reader:
@@ -106,14 +110,14 @@ def recording_source(
     wanted = topics or Topics()
     name = f'{shown_name(path)}{wanted.part}'
     if topic and not any(is_called(topic, one) for one in (wanted.counts, wanted.imu)):
-        name += f' ({shown(topic)})'  # every message then says which topic was taken
+        name += f' ({shown(topic)})'  # messages about this source then contain the topic
     serial = info.metadata.get('serial')
     known = known_force(path, info, force)
     return FitSource(name, blocks, serial=serial, force=known, reader=lambda: latest), info
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a bag: of a file, or of a directory's in the order of names."""
+    """Return the SHA-256 of a file, or of all files of a directory in the order of names."""
     total = hashlib.sha256()
     files = [path] if path.is_file() else sorted(p for p in path.rglob('*') if p.is_file())
     for name in files:

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the first guess: constant bias, scale, misalignment and attitudes from position means.
+Owns the initial triad: constant bias, scale and misalignment from the means of the positions.
 
-The mean of each position lies on an ellipsoid. It is fitted without temperature, first by its
-best box, then by least squares on ``|f| - g``; the full regression starts from there.
+These means lie on an ellipsoid. It is fitted without temperature by least squares on ``|f| - g``,
+from the box around the means.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from ..errors import FitError
 from ..typing import Floats, Ints
 from .unknowns import Windows
 
-# Even a cheap sensor that drifts over 60 K stays within this of an ellipsoid; motion does not.
+# Largest RMS distance from the ellipsoid over g: more than the drift of a cheap sensor over 60 K,
+# less than the error of a moving unit.
 _LARGEST_RMS = 0.05
 
 
@@ -31,7 +32,7 @@ class ConstantCalibration:
     misalignment: Floats
 
     def force(self, measured: Floats) -> Floats:
-        """Specific force of measured vectors, shape (n, 3)."""
+        """Return the specific force of measured vectors, shape (n, 3)."""
         return np.asarray(((measured - self.bias) / self.scale) @ self.misalignment.T)
 
 
@@ -39,14 +40,15 @@ def constant_calibration(
     means: Floats, gravity: float | Floats, with_misalignment: bool
 ) -> ConstantCalibration:
     """
-    Fit the triad to position means, shape (n, 3); FitError if they lie on no ellipsoid. Where |f|
-    of the positions differs, `gravity` is that of each, shape (n,).
+    Fit the triad to position means, shape (n, 3); FitError if they are on no ellipsoid.
+
+    `gravity`: |f| of all positions, or of each, shape (n,) [m/s^2]
     """
     if isinstance(gravity, np.ndarray):
         scale = np.full(3, float(np.median(np.linalg.norm(means, axis=1) / gravity)))
         found, rms = _refine(means, gravity, np.zeros(3), scale, with_misalignment)
         if not np.all(found.scale > 0.0) or not rms < _LARGEST_RMS * float(np.median(gravity)):
-            raise FitError('the readings do not follow |f| as stated: are its values right?')
+            raise FitError('the readings contradict the stated |f|: are its values right?')
         return found
     bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
     half = 0.5 * (means.max(axis=0) - means.min(axis=0))
@@ -58,7 +60,7 @@ def constant_calibration(
         scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
         tried.append(_refine(means, gravity, bias, scale, with_misalignment))
     calibration, rms = min(tried, key=lambda found: found[1])
-    # Scattered points are met best by a patch of a huge ellipsoid with its centre far away.
+    # The best ellipsoid of scattered points can be very large, with a remote centre: reject it.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < _LARGEST_RMS * gravity:
         raise FitError(
@@ -96,7 +98,7 @@ def _refine(
 
 
 def position_means(windows: Windows) -> Floats:
-    """Mean raw vector of each position, shape (n_positions, 3)."""
+    """Return the mean raw vector of each position, shape (n_positions, 3)."""
     first = np.searchsorted(windows.position, np.arange(windows.n_positions))
     total = np.add.reduceat(windows.weight, first)
     weighted = np.add.reduceat(windows.mean * windows.weight[:, None], first, axis=0)
@@ -104,7 +106,7 @@ def position_means(windows: Windows) -> Floats:
 
 
 def within_positions(measured: Floats, position: Ints) -> Floats:
-    """Take from what the windows measure, shape (n, 3), the mean of each position."""
+    """Subtract the mean of each position from the measured vectors of windows, shape (n, 3)."""
     _, where, count = np.unique(position, return_inverse=True, return_counts=True)
     total = np.zeros((len(count), 3))
     np.add.at(total, where, measured)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what the regression works on: the windows, the prior, the unknowns and their places."""
+"""Owns the data types of the regression: windows, prior, unknowns and their places."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ import numpy as np
 from ..typing import Bools, Floats, Ints
 from .forces import Forces
 
-#: Standard deviation of the bias of a unit whose data were not seen [m/s^2]: 100 mg.
+#: Built-in prior sd of a bias [m/s^2]: 100 mg, above the data sheets of consumer MEMS.
 BIAS_SD = 1.0
-#: The same of its relative scale factor.
+#: Built-in prior sd of a relative scale factor.
 SCALE_SD = 0.05
-#: The same of each element of its misalignment [rad].
+#: Built-in prior sd of an element of the misalignment [rad].
 MISALIGNMENT_SD = 1e-3
 
 
@@ -32,18 +32,17 @@ class Windows:
     time: time since the bag's first sample [s], shape (n,)
     weight: samples of the window over those of a typical one, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
-    columns: values of the columns, in their physical units, with start states at their prior mean,
-        shape (n, m)
+    columns: values of the columns in their physical units, with the initial lag states at their
+        prior mean, shape (n, m)
     groups: group of each column
-    kelvins: temperature change that the RMS of each column stands for [K], 0 for a column that
-        never moved, shape (m,)
-    lag: the lag whose start state moves a column; -1 for none, shape (m,)
-    start: derivative of each column by that state, shape (n, m)
-    start_covariance: prior of the start states [K^2], shape (n_lags, n_lags)
-    in_scale: which columns the scale may have as well as the bias, shape (m,)
-    tilt: temperatures that a support may tilt with, relative to their RMS, shape (n, k)
-    forces: what is known of |f| where it is not gravity in all positions, and the nonlinear terms;
-        None otherwise
+    kelvins: temperature change that corresponds to the RMS of each column [K], 0 for a constant
+        column, shape (m,)
+    lag: number of the lag of each column; -1 for none, shape (m,)
+    start: derivative of each column by the initial state of its lag, shape (n, m)
+    start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
+    in_scale: columns that the scale may have as well as the bias, shape (m,)
+    tilt: temperatures with which a support may tilt, over their RMS, shape (n, k)
+    forces: known |f| and nonlinear terms; None if |f| is gravity in all positions
     """
 
     position: Ints
@@ -74,7 +73,7 @@ class Windows:
 
     @property
     def parts(self) -> Bools:
-        """Which columns bias and scale may have, shape (2, m)."""
+        """Masks of the columns that may act on the bias and on the scale, shape (2, m)."""
         return np.stack((np.ones_like(self.in_scale), self.in_scale))
 
     @property
@@ -85,8 +84,10 @@ class Windows:
 
 class Noise(NamedTuple):
     """
-    Gauss-Markov part of the noise: its stationary variance over that of the white noise of a
-    typical window, 0 for none, and its correlation time [s].
+    Gauss-Markov part of the noise.
+
+    ratio: its stationary variance over the white variance of a typical window; 0 for none
+    time_s: its correlation time [s]
     """
 
     ratio: float = 0.0
@@ -94,7 +95,7 @@ class Noise(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Sd of the random walk that it is over short times, over the white sd [1/sqrt(s)]."""
+        """Rate of the equivalent random walk at short times over the white sd [1/sqrt(s)]."""
         return math.sqrt(2.0 * self.ratio / self.time_s)
 
 
@@ -105,10 +106,10 @@ WHITE = Noise()
 @dataclass(frozen=True)
 class InformativePrior:
     """
-    Prior of the unit's parameters in the order of `Layout`.
+    Gaussian prior of the unit's parameters in the order of `Layout`.
 
     mean: shape (n_unit,)
-    root: upper triangle R whose ``R.T @ R`` is the inverse covariance, shape (n_unit, n_unit)
+    root: upper triangular R with ``R.T @ R`` the inverse covariance, shape (n_unit, n_unit)
     """
 
     mean: Floats
@@ -123,23 +124,23 @@ class InformativePrior:
 @dataclass(frozen=True)
 class Prior:
     """
-    What is known beforehand; standard deviations, inf for nothing.
+    Standard deviations of the prior, and the noises.
 
-    bias_mean, bias_sd: [m/s^2], shape (3,)
-    scale_sd: of the scale ratio kappa, about 1
-    misalignment_sd: of the elements of M [rad]
-    column_sd: of the weights of each column, in units of its RMS, in the bias [m/s^2] and in the
-        scale (relative); 0 for a column that takes no part, shape (2, m)
-    offset_sd: of the bias offset of each position and axis [m/s^2]: mounting and turn-on
-    sigma: white noise of a typical window [m/s^2], shape (3,)
-    noise: its Gauss-Markov companion
-    offset_scale: scale of the half-Student prior of offset_sd [m/s^2]; 0 keeps offset_sd
-    tilt_sd: of a support's tilt [rad per RMS of a temperature that it follows]
-    start_share: variance of the start states over that of the run-time prior
-    nonlinear_sd: of the coefficients of the nonlinear terms, then of their changes per kelvin; 0
-        for what takes no part, shape (2 k,)
-    informative: takes the place of all the above for the unit's own parameters; column_sd then
-        only says which columns take part
+    bias_mean, bias_sd: mean and sd of the bias [m/s^2], shape (3,)
+    scale_sd: sd of the scale ratio kappa about 1
+    misalignment_sd: sd of the elements of M [rad]
+    column_sd: sd of the weights of each column in units of its RMS, in the bias [m/s^2] and in the
+        scale (relative); 0 for an inactive column, shape (2, m)
+    offset_sd: sd of the bias offset of each position and axis by mounting and turn-on [m/s^2]
+    sigma: sd of the white noise of a typical window [m/s^2], shape (3,)
+    noise: Gauss-Markov part of the noise
+    offset_scale: scale of the half-Student prior of offset_sd [m/s^2]; 0: offset_sd is constant
+    tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
+    start_share: variance of the initial lag states over that of the run-time prior
+    nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
+        inactive one, shape (2 k,)
+    informative: replaces the above for the unit's parameters; column_sd then only gives the active
+        columns
     """
 
     bias_mean: Floats
@@ -160,12 +161,18 @@ class Prior:
 @dataclass(frozen=True)
 class State:
     """
-    The unknowns: scale ratio kappa and bias, shape (3,); weights of columns in units of their RMS,
-    in bias and scale, shape (2, 3, m); misalignment of the inverse of M, shape (3,); attitudes
-    (n_positions, 3); offsets (n_positions, 3); support tilts along each attitude's tangents
-    (n_positions, k, 2); start states of each bag, in units of their sd (n_bags, r). Nonlinear
-    coefficients (3, 2 k) as in `Forces`; relative errors of a radius, shape (1,) or (0,), and of
-    the known |f| of each position (n_positions, 1) or (n_positions, 0).
+    The unknowns.
+
+    kappa, bias: scale ratio and bias [m/s^2], shape (3,)
+    weights: weights of the columns in bias and scale, in units of their RMS, shape (2, 3, m)
+    misalignment: elements of the inverse of M, shape (3,)
+    up: attitude of each position, shape (n_positions, 3)
+    offset: bias offset of each position [m/s^2], shape (n_positions, 3)
+    tilt: tilts of the support along the attitude's tangents, shape (n_positions, k, 2)
+    start: initial lag states of each bag, in units of their sd, shape (n_bags, r)
+    nonlinear: nonlinear coefficients in the order of `Forces`, shape (3, 2 k)
+    radius: relative error of the radius, shape (1,) or (0,)
+    stretch: relative error of the known |f|, shape (n_positions, 1) or (n_positions, 0)
     """
 
     kappa: Floats
@@ -187,18 +194,19 @@ class State:
 
     @cached_property
     def tangents(self) -> Floats:
-        """Return two unit vectors across each attitude, shape (n, 3, 2)."""
+        """Return two unit vectors perpendicular to each attitude, shape (n, 3, 2)."""
         return tangent_basis(self.up)
 
 
 @dataclass(frozen=True)
 class Layout:
     """
-    Places of the unknowns in the vector of parameters, those of the unit first.
+    Places of the unknowns in the vector of parameters; those of the unit come first.
 
     axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
-    weights: shape (2, 3, m); nonlinear: shape (3, 2 k); -1 for what takes no part
-    blocks: those of each bag
+    weights, nonlinear: shapes (2, 3, m) and (3, 2 k); -1 for an inactive unknown
+    n_unit, n: number of unknowns of the unit, and of all
+    blocks: unknowns of each bag
     """
 
     axis: Ints
@@ -227,12 +235,12 @@ class Layout:
 
     @property
     def shared(self) -> Ints:
-        """Places of the unit's unknowns that no axis has alone, the last of the unit's."""
+        """Places of radius and misalignment, which the axes share; the last of the unit."""
         return np.concatenate((self.radius, self.misalignment))
 
     @property
     def used(self) -> Bools:
-        """Which columns of bias and scale take part, shape (2, m)."""
+        """Active columns of bias and scale, shape (2, m)."""
         return np.asarray(self.weights[:, 0] >= 0)
 
 
@@ -245,8 +253,10 @@ def lay_out(
     forces: Forces | None = None,
 ) -> Layout:
     """
-    Give every unknown its place; `used`: columns of bias and scale, shape (2, m), `bends`:
-    nonlinear coefficients, shape (2 k,).
+    Assign a place to every unknown.
+
+    `used`: active columns of bias and scale, shape (2, m); `bends`: active nonlinear coefficients,
+    shape (2 k,)
     """
     n = 0
 
@@ -287,7 +297,7 @@ def lay_out(
 
 
 def tangent_basis(up: Floats) -> Floats:
-    """Two unit vectors across each given one, shape (n, 3, 2)."""
+    """Return two unit vectors perpendicular to each given one, shape (n, 3, 2)."""
     helper = np.zeros_like(up)
     helper[np.arange(len(up)), np.argmin(np.abs(up), axis=1)] = 1.0
     first = np.cross(up, helper)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the windows: reduced bags in, the regression's table of samples and columns out.
+Owns the table of windows and columns of the regression, made from reduced bags.
 
-The thermal tracker that the compensator runs is run here over the bags' readings, and the columns
-are those of `unit.columns`, so a regressor means in the fit what it means online.
+The thermal tracker of the compensator is run over the bags' readings, and the columns are those of
+`unit.columns`, so a column has the same values in the fit and online.
 """
 
 from __future__ import annotations
@@ -26,26 +26,22 @@ from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
 from .unknowns import Windows
 
-# Neighbouring windows of a position are merged up to this length [s].
-_WINDOW_S = 60.0
-#: Groups of the sets themselves, beside those of the response.
+#: Groups of the columns of the curve, of the difference of the sets, and of bends.
 CURVE, SET, BEND = 'curve', 'set', 'bend'
-#: A short rest still has so many windows: from less, no noise is learnt.
+#: Smallest number of windows of a short rest: fewer do not determine its noise.
 FEWEST_WINDOWS = 20
-#: A position is cut into so many sections of equal length; chamber programs repeat over bags, so
-#: these are sections of the program.
+#: Number of sections of equal length in a position. The bags repeat the chamber's program, so a
+#: section is the same part of the program in all positions.
 N_SECTIONS = 6
-# After this every lag has forgotten how it began [s].
-_EVER_S = 1e9
 
 
 @dataclass(frozen=True)
 class Sets:
     """
-    How the curves of the two sets are made.
+    The curves of the two sets.
 
-    static, dynamic: the families and their shapes; only `basis` counts
-    is_shared: whether the dynamic curve is the static one plus a difference: else each has its own
+    static, dynamic: families of the curves; their coefficients are not used
+    is_shared: whether the dynamic curve is the static one plus a difference; else it is separate
     """
 
     static: TemperatureFunction
@@ -61,12 +57,12 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Return the families of the two sets: a sum is of the higher order."""
+        """Families of the two sets; a sum has the family of the higher order."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
     def levels(self) -> list[tuple[str, bool]]:
-        """Group of each column, and whether it is a level."""
+        """Return the group of each column, and whether it is a level."""
         curve = [(CURVE, False)] * self.static.n_free
         return [*curve, (SET, True), *[(SET, False)] * self.dynamic.n_free]
 
@@ -74,10 +70,10 @@ class Sets:
 @dataclass(frozen=True)
 class Model:
     """
-    What is fitted: curves and columns, and how the states are told that they follow.
+    The model of a fit: curves and columns, and the settings of the thermal state.
 
-    name: for the provenance
-    sensors: thermometers beside the board; the first leads, the others stay where they are of use
+    name: name of the model in the provenance
+    sensors: thermometers other than the board's; the first is the case's
     """
 
     name: str
@@ -91,16 +87,17 @@ class Model:
 @dataclass(frozen=True)
 class ThermalWindows:
     """
-    The regression's windows, and what the calibration says of the states they were taken in.
+    The windows of a regression with their thermal states.
 
-    model: what the columns are of
-    data: samples and columns, for the regression
-    temperature, rate, weight: board temperature, its rate, weight of the dynamic set, shape (n,)
-    gradient: T - T_board of the sensor that leads, shape (n,)
-    raw: the response's columns before powers of t and ranges, shape (n, k)
-    angular_rate: mean of it [rad/s], shape (n, 3); (n, 0) where a bag lacks it
-    typical_count: samples in a typical window
-    rests: the bag and the interval of each position
+    model: model of the columns
+    data: samples and columns for the regression
+    temperature, rate, weight: board temperature [degC], its rate [K/s], weight of the dynamic set,
+        shape (n,)
+    gradient: T_case - T_board [K], shape (n,)
+    raw: columns of the response without powers of t and ranges, shape (n, k)
+    angular_rate: mean angular rate [rad/s], shape (n, 3); (n, 0) if a bag lacks it
+    typical_count: number of samples of a typical window
+    rests: bag and interval of each position
     """
 
     model: Model
@@ -116,22 +113,22 @@ class ThermalWindows:
 
     @property
     def was_measured(self) -> bool:
-        """Whether any temperature was recorded: else the first curve's column, t, is 0."""
+        """Whether the columns depend on a recorded temperature, even a constant one."""
         return self.has_temperature or bool(self.data.columns[:, 0].any())
 
     @property
     def has_temperature(self) -> bool:
-        """Whether any change of temperature was recorded."""
+        """Whether a change of temperature was recorded."""
         return bool(np.ptp(self.temperature) > 0.0)
 
 
 def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     """
-    Join the windows of all bags with the columns of their thermal state.
+    Combine the windows of all bags with the columns of their thermal states.
 
-    Windows before the board's first reading, while its estimate is still settling, and where a
-    thermometer is lost are left out. A bag without any temperature stands at the reference, where
-    no column says anything.
+    Windows are left out before the board's first reading, while its estimate settles, and while
+    readings of a thermometer are missing. A bag without any temperature is taken to be at the
+    reference, where all columns are 0.
     """
     sets, columns, reference = model.sets, model.columns, model.reference_temperature
     spec = memory_of(columns, model.sensors)
@@ -165,15 +162,17 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
             numbers.append((np.full(n, len(rests)), np.full(n, bag)))
             rests.append((reduced, interval))
         if not rests or rests[-1][0] is not reduced:
-            said = 'no temperatures while it rests: two clocks?'
-            raise FitError(f'{reduced.source.name}: {said}')
+            raise FitError(f'{reduced.source.name}: no temperatures during its rests: two clocks?')
     time, count, mean, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
     position, bag_of = (np.concatenate(part) for part in zip(*numbers, strict=True))
     k, m = len(columns), len(groups) + len(columns)
     moved_at, end = 4 + k + m, 4 + k + m + len(columns)
-    lag = [spec.lags.index(one.lag) if one.lag and one.kind != 'play' else -1 for one in columns]
+    lag = [
+        spec.lags.index(column.lag) if column.lag and column.kind != 'play' else -1
+        for column in columns
+    ]
     t, gradient = rows[:, 0] - reference, rows[:, 3]
-    # A support follows the chamber, linearly and not: partly the board, partly what is around it.
+    # A support tilts with board and case temperature, linearly and with the square of the latter.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
@@ -191,8 +190,8 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
         kelvins=_kelvins(sets, columns, values, rows[:, 4 : 4 + k], t, gradient),
         start=np.hstack((np.zeros((len(time), len(groups))), rows[:, moved_at:end])),
         start_covariance=start_covariance(spec.lags),
-        # Fc is 1 at the reference in either regime, so the scale has no level of its own there;
-        # a play or a bend in the scale has never been seen.
+        # Fc = 1 at the reference temperature in both regimes, so the scale has no level term.
+        # Hysteresis and bends of the scale are not modelled.
         in_scale=np.array(
             [not (group == SET and is_level) for group, is_level in sets.levels()]
             + [column.kind not in ('play', 'bend') for column in columns]
@@ -214,7 +213,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
 
 
 def _sections(position: Ints, time: Floats) -> Ints:
-    """Return the number of the section of each window in its position, shape (n,)."""
+    """Return the section number of each window in its position, shape (n,)."""
     first = np.searchsorted(position, np.arange(int(position[-1]) + 1))
     last = np.append(first[1:], len(position)) - 1
     begin, end = time[first][position], time[last][position]
@@ -226,8 +225,8 @@ def _kelvins(
     sets: Sets, columns: Sequence[Column], values: Floats, raw: Floats, t: Floats, gradient: Floats
 ) -> Floats:
     """
-    Say for which temperature change the RMS of each column stands [K], shape (m,): the RMS over
-    the steepest slope that the column has in these data. It is 0 where a column never moved.
+    Return the temperature change that corresponds to the RMS of each column [K], shape (m,): the
+    RMS over the largest slope of the column in these data; 0 for a column that is constant.
     """
     farthest = float(np.abs(t).max(initial=0.0))
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
@@ -235,22 +234,23 @@ def _kelvins(
     curves = sets.columns(grid, np.full_like(grid, 0.5))
     slopes = [float(np.abs(np.gradient(one, grid)).max()) for one in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
-    # The level of a set is of the size of what else tells ramps from soaks: a gradient.
+    # The level of the dynamic set corresponds to the RMS gradient, which also differs in ramps.
     levels = [is_level for _, is_level in sets.levels()]
     steepest = [1.0 / flow if lev else one for lev, one in zip(levels, slopes, strict=True)]
-    for column, own in zip(columns, raw.T, strict=True):
-        steepest.append(column.steepest(own, flow) * farthest**column.power)
+    for column, series in zip(columns, raw.T, strict=True):
+        steepest.append(column.steepest(series, flow) * farthest**column.power)
     slope = np.array(steepest)
     return np.where(slope > 0.0, rms / np.where(slope > 0.0, slope, 1.0), 0.0)
 
 
 def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[Floats, Floats, Bools]:
-    """Run the tracker: grid from its first reading, states, where they are known."""
+    """Return a time grid [s], the states of the tracker on it, and which of them are known."""
     if not len(bag.board.value):
-        # Nothing is known: a unit that has always been at the reference.
+        # Without a thermometer assume that the unit has been at the reference temperature for
+        # 1e9 s, so that all lags are 0.
         still = np.zeros((2, Layout(spec).width))
         still[:, BOARD] = model.reference_temperature
-        ends: Floats = np.array([-_EVER_S, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
+        ends: Floats = np.array([-1e9, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
         return ends, still, np.ones(2, dtype=bool)
     tracker = ThermalTracker(model.detector, MemorySpec(spec.sensors), ThermalConfig())
     shortest = min(
@@ -259,8 +259,7 @@ def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[Floats, Fl
     step_s = max(shortest / 5.0, 0.1)
     start_s, states, is_known = thermal_states(bag, tracker, step_s)
     grid = np.asarray(start_s + step_s * np.arange(len(states)), dtype=np.float64)
-    # The memory is the tracker's, on the grid at once: reading by reading it takes longer than all
-    # the rest of a fit.
+    # The lags are evaluated on the whole grid at once, which is much faster than at each reading.
     gradients = [states[:, GRADIENT + 2 * k] for k in range(len(spec.sensors))]
     memory = memory_on_grid(spec, step_s, states[:, BOARD], gradients)
     states = np.hstack((states, memory))
@@ -270,7 +269,7 @@ def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[Floats, Fl
 
 
 def _moved(table: ColumnTable, slopes: Floats, age_s: Floats) -> Floats:
-    """Differentiate each column by the start state of its lag, shape (k, n)."""
+    """Return the derivative of each column by the initial state of its lag, shape (k, n)."""
     result = np.zeros_like(slopes)
     for k, column in enumerate(table.columns):
         if column.lag and column.kind != 'play':
@@ -282,8 +281,8 @@ def _moved(table: ColumnTable, slopes: Floats, age_s: Floats) -> Floats:
 def _merged(
     time: Floats, count: Floats, mean: Floats, rows: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Count-weighted means of neighbours up to a length, or to a part of a short rest."""
-    window_s = min(_WINDOW_S, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or _WINDOW_S)
+    """Average neighbouring windows to 60 s, or less in a short rest, weighted by their counts."""
+    window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)
     slot = np.floor((time - time[0]) / window_s * (1.0 + 1e-9))
     first = np.flatnonzero(np.r_[True, np.diff(slot) != 0])
     total = np.add.reduceat(count, first)

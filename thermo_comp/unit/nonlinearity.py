@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the nonlinearity of the axes over specific force: its terms, their inverse, their variance.
+Owns the nonlinearity of the axes over specific force: terms, correction and variance.
 
-With x the reading of an axis less its bias, over its scale factor, and f the specific force along
-its sensitivity axis, both in g, as in IEEE Std 1293::
+x is the reading of an axis less bias, divided by the scale factor; f is the specific force along
+the sensitivity axis. Both are in g, as in IEEE Std 1293::
 
     x = f + K2 f^2 + Kq |f| f + K3 f^3,    K(t) = coefficient + per_kelvin t
 
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from .calibration import Calibration
 
 Kind = Literal['square', 'odd_square', 'cube']
-#: The terms in the order of a file, and the power of 1/g that makes each a coefficient.
+#: The terms in the order of a file, and the power of 1/g in the unit of their coefficient.
 POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
-#: Largest slope of the terms within full scale: beyond it the inverse is not exact to the noise.
+#: Largest slope of the terms within full scale, for which one step of the solver is sufficient.
 LARGEST_SLOPE = 0.2
 
 Real = TypeVar('Real', float, Floats)  # the value of one sample, or an array of many
@@ -58,8 +58,10 @@ class NonlinearTerm:
 @dataclass(frozen=True)
 class Nonlinearity:
     """
-    The nonlinearity of the three axes. Its polynomials continue beyond the forces that the fit has
-    seen, where an unknown square term of `beyond_sd_g_g2` from the edge on adds to the covariance.
+    The nonlinearity of the three axes.
+
+    Beyond the forces of the fit the polynomials continue, and the covariance is increased by an
+    unknown square term from the edge on, with the sd `beyond_sd_g_g2`.
     """
 
     force_range_m_s2: Annotated[
@@ -98,7 +100,7 @@ class Nonlinearity:
 
 
 def unit_of(kind: Kind) -> float:
-    """Return the unit of a term's coefficient: coefficient [g/g^n] over it is in m and s."""
+    """Return the divisor that converts a coefficient in g/g^n to m and s."""
     return float(STANDARD_GRAVITY ** POWERS[kind])
 
 
@@ -117,7 +119,7 @@ def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
 def corrected_nonlinear(
     line: Iterable[Real], constants: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
-    """Do what `online.compensator.corrected` does, for an instrument with a nonlinearity."""
+    """Correct a sample like `online.compensator.corrected`, for an axis with a nonlinearity."""
     (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
      ax, lx, qx, ay, ly, qy, az, lz, qz,
      k2x, kqx, k3x, dx, ex, fx, gx, k2y, kqy, k3y, dy, ey, fy, gy,
@@ -161,8 +163,8 @@ class ForceCorrection:
     """
     The nonlinearity of a calibration, prepared for the segments of a correction.
 
-    constants: largest |f| of the fit, and what `corrected_nonlinear` multiplies the fourth power
-        of twice the distance beyond it by
+    constants: largest |f| of the fit, and the factor of the fourth power of twice the distance
+        beyond it in `corrected_nonlinear`
     """
 
     def __init__(
@@ -178,7 +180,7 @@ class ForceCorrection:
         return hold(board, *self._span) - self._reference
 
     def linearise(self, x: Floats, board: Floats) -> Floats:
-        """Take the terms from readings of the axes, shape (n, 3), at board temperatures (n,)."""
+        """Remove the terms from readings of the axes (n, 3) at board temperatures (n,)."""
         k2, kq, k3 = self._of.coefficients(self.held(board))
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
@@ -202,11 +204,11 @@ class ForceCorrection:
         self, t: float, rows: Floats, rest: Floats, on_bias: Floats, on_scale: Floats
     ) -> list[float]:
         """
-        Return what the terms add to the coefficients of x^2 to x^6 in the variance of one axis.
+        Return the terms' contribution to the coefficients of x^2 to x^6 in an axis' variance.
 
-        `rows`: factor of the covariance of its coefficients (2 k, rank), `rest`: variances beside
-        it; `on_bias`, `on_scale`: the factor of bias and relative scale, shape (rank,). What |f| f
-        has in common with other parameters is left out, which overstates the variance.
+        `rows`, `rest`: factor of the covariance of the coefficients (2 k, rank), and variances
+        added to it; `on_bias`, `on_scale`: factors of bias and relative scale, (rank,). The
+        covariances of |f| f with other parameters are omitted, which overstates the variance.
         """
         kinds = [one.kind for one in self._of.terms]
         n = len(kinds)
