@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns bags of another environment: which bag contradicts the others, and what it adds to the claim.
+Owns the exclusion of bags from another environment, and the error that they add to the claim.
 
-In a chamber with a fan the board follows the case by one law. In still air it follows by another,
-and a part without a thermometer answers differently: no coefficients fit both. One such bag among
-many would spoil the correction where the many were recorded. So it takes no part in the fit, and
-the error of its correction becomes a lack of fit of the calibration.
+In a chamber with a fan the board temperature follows the case temperature by one law, in still air
+by another. The bias of a part without a thermometer then depends on the environment, and no set of
+coefficients describes both. One bag of still air would increase the error of the correction in the
+chamber. Therefore the fit excludes this bag, and its error becomes a lack of fit.
 """
 
 from __future__ import annotations
@@ -32,20 +32,21 @@ from .start import position_means
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State
 from .windows import Model, ThermalWindows, thermal_windows
 
-# Fewer bags have no majority that one of them could contradict.
+# Smallest number of bags with a majority that one bag can contradict.
 _FEWEST_BAGS = 4
-# The left-out drift of a bag contradicts the others from so many times their median RMS, and so
-# many times the white noise of a window.
-_TIMES = 5.0
-# Without such a bag the mean square of the others' left-out drift falls at least by this factor.
+# A bag contradicts the others if the RMS of its left-out drift exceeds their median, and the white
+# noise of a window, by this factor.
+_LEAST_RATIO = 5.0
+# The exclusion of the bag must decrease the mean square of the others' left-out drift by this.
 _LEAST_FACTOR = 2.0
-# Sd of the level of a bag [m/s^2]: 1 mg, more than a navigation sensor's turn-on.
+# Standard deviation of the level of a bag [m/s^2]: 1 mg, more than the turn-on of a navigation
+# sensor.
 _LEVEL_SD = 1e-2
-# What the root of a precision is multiplied with, so that parameters stay where they are.
-_FIXED = 1e4
+# Factor of the root of a precision that keeps the parameters at the mean of the prior.
+_PRECISION_FACTOR = 1e4
 
 
-def bag_at_odds(windows: ThermalWindows, selected: Selected) -> int | None:
+def contradicting_bag(windows: ThermalWindows, selected: Selected) -> int | None:
     """Find the bag whose left-out drift is far larger than that of all others; None if none is."""
     square = _square_of_bags(windows, selected.score)
     known = np.isfinite(square)
@@ -54,10 +55,10 @@ def bag_at_odds(windows: ThermalWindows, selected: Selected) -> int | None:
     worst = int(np.nanargmax(square))
     usual = float(np.median(square[known]))
     noise = float(np.mean(selected.prior.sigma**2))
-    return worst if square[worst] > _TIMES**2 * max(usual, noise) else None
+    return worst if square[worst] > _LEAST_RATIO**2 * max(usual, noise) else None
 
 
-def agree_better(
+def is_better_without(
     whole: tuple[ThermalWindows, Selected], rest: tuple[ThermalWindows, Selected], bag: int
 ) -> bool:
     """Whether the other bags' left-out drift falls once a bag takes no part in the fit."""
@@ -76,7 +77,9 @@ def _square_of_bags(windows: ThermalWindows, score: Score) -> Floats:
     return np.where(total > 0.0, weighted / np.maximum(total, 1.0), np.nan)
 
 
-def bags_against(windows: ThermalWindows, known: Calibration, options: FitOptions) -> list[int]:
+def bags_contradicting_prior(
+    windows: ThermalWindows, known: Calibration, options: FitOptions
+) -> list[int]:
     """
     Find the bags whose drift contradicts a calibration of the same unit: with the unit's
     parameters fixed, no start states and tilts of the bag explain it.
@@ -100,7 +103,7 @@ def bags_against(windows: ThermalWindows, known: Calibration, options: FitOption
         # The level may have moved by a turn-on or by ageing: only the drift is judged.
         offset_sd=_LEVEL_SD,
         sigma=np.maximum(sigma, 1e-9),
-        informative=replace(first, root=first.root * _FIXED),
+        informative=replace(first, root=first.root * _PRECISION_FACTOR),
     )
     found = regression.solve(state, prior, n_steps=4)
 
@@ -112,7 +115,7 @@ def bags_against(windows: ThermalWindows, known: Calibration, options: FitOption
     share = np.sum(left**2, axis=1) / np.sum(claimed + prior.sigma**2 + lack, axis=1)
     bag = data.bag
     mean = np.bincount(bag, share) / np.maximum(np.bincount(bag), 1)
-    found_bags: list[int] = np.flatnonzero(mean > _TIMES**2).tolist()
+    found_bags: list[int] = np.flatnonzero(mean > _LEAST_RATIO**2).tolist()
     return found_bags
 
 
@@ -125,7 +128,7 @@ def _state_of(known: Calibration, regression: Regression, up: Floats) -> State:
     return with_calibration(known, regression, begin)
 
 
-def with_doubt(
+def with_excluded_error(
     calibration: Calibration, bags: Sequence[ReducedBag], others: str
 ) -> tuple[Calibration, Finding]:
     """
@@ -151,7 +154,7 @@ def with_doubt(
     sets = []
     for one, rows in ((calibration.static, ~is_dynamic), (calibration.dynamic, is_dynamic)):
         square = np.mean(drift[rows if rows.any() else slice(None)] ** 2, axis=0)
-        sets.append(_doubted(one, square))
+        sets.append(_widened(one, square))
     static, dynamic = sets
     rms = float(np.sqrt(np.mean(drift**2))) / MICRO_G
     names = ', '.join(one_line(bag.source.name) for bag in bags)
@@ -165,7 +168,7 @@ def with_doubt(
     return replace(calibration, static=static, dynamic=dynamic), finding
 
 
-def _doubted(one: RegimeSet, square: Floats) -> RegimeSet:
+def _widened(one: RegimeSet, square: Floats) -> RegimeSet:
     points: Sequence[LackOfFit] = one.lack_of_fit
     if not points:
         points = (LackOfFit(float(np.mean(one.temperature_range_c)), (0.0, 0.0, 0.0)),)

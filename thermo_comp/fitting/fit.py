@@ -30,7 +30,12 @@ from .beginning import first_guess, regress
 from .claim import claim_of
 from .coverage import LeastKnown, least_known, rough_centre
 from .data_checks import Finding, enforce
-from .environments import agree_better, bag_at_odds, bags_against, with_doubt
+from .environments import (
+    bags_contradicting_prior,
+    contradicting_bag,
+    is_better_without,
+    with_excluded_error,
+)
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
@@ -111,12 +116,12 @@ def _fit_about_offset(
 ) -> FitResult:
     offset = find_offset(bags, options)
     if not offset.any():
-        return _fit_alike(bags, options, progress)
+        return _fit_one_environment(bags, options, progress)
     codes = ' '.join(f'{code:g}' for code in offset)
     note = f'zero force reads {codes} counts: the samples use an offset code'
     prior = options.prior and about(options.prior, -offset)
     centred_bags = [centred(bag, offset) for bag in bags]
-    result = _fit_alike(centred_bags, replace(options, prior=prior), progress)
+    result = _fit_one_environment(centred_bags, replace(options, prior=prior), progress)
     return replace(
         result,
         calibration=with_notes(about(result.calibration, offset), [f'offset: {note}']),
@@ -175,15 +180,17 @@ def with_notes(calibration: Calibration, notes: Sequence[str]) -> Calibration:
     return replace(calibration, provenance=replace(provenance, notes=(*provenance.notes, *notes)))
 
 
-def _fit_alike(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:
+def _fit_one_environment(
+    bags: Sequence[ReducedBag], options: FitOptions, tell: Progress
+) -> FitResult:
     """Fit the bags, without those of another environment, see `environments`."""
     whole = _fit(bags, options, tell)
     known = options.prior
     if known is None:
-        bag = bag_at_odds(whole.windows, whole.selected)
+        bag = contradicting_bag(whole.windows, whole.selected)
         gone = [] if bag is None else [bag]
     elif known.unit.serial == whole.calibration.unit.serial and not whole.windows.data.forces:
-        gone = bags_against(whole.windows, known, options)
+        gone = bags_contradicting_prior(whole.windows, known, options)
     else:
         gone = []
     if not gone:
@@ -193,13 +200,13 @@ def _fit_alike(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) 
     if kept:
         rest = _fit(kept, options, tell)
         pair = (whole.windows, whole.selected), (rest.windows, rest.selected)
-        if known is None and not agree_better(*pair, gone[0]):
+        if known is None and not is_better_without(*pair, gone[0]):
             return whole
     elif known is not None:
         # All bags contradict the prior, so none can update it.
         provenance = whole.calibration.provenance
         rest = replace(whole, calibration=replace(known, provenance=provenance))
-    calibration, finding = with_doubt(
+    calibration, finding = with_excluded_error(
         rest.calibration,
         [bags[k] for k in gone],
         'the other bags' if known is None else 'the prior',
