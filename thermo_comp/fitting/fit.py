@@ -332,7 +332,9 @@ def _regressed(
     closed = replace(model, detector=replace(model.detector, closes='case'))
     others = with_forces(thermal_windows(bags, closed), bags, options)
     again = regress(others, start, up, options, tell)
-    return (others, again) if is_better(result[1].score, again[1].score) else (windows, result)
+    # Both have the same columns: halves of the program, which limit their number, say nothing.
+    found = is_better(result[1].score, again[1].score, by_halves=False)
+    return (others, again) if found else (windows, result)
 
 
 def _unusable(error: ValueError) -> FitError:

@@ -345,12 +345,15 @@ def _simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
     return best
 
 
-def is_better(before: Score, after: Score) -> bool:
-    """Whether the second model is better on left-out data by more than the standard error."""
-    return _gain(before, after) > 0.0
+def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
+    """
+    Whether the second model is better on left-out data by more than the standard error. Halves of
+    the program limit the number of columns; they do not compare models of the same columns.
+    """
+    return _gain(before, after, by_halves=by_halves) > 0.0
 
 
-def _gain(before: Score, after: Score) -> float:
+def _gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
     Return the gain of a model if it exceeds its standard errors, else 0.
 
@@ -359,7 +362,7 @@ def _gain(before: Score, after: Score) -> float:
     """
     positions, sections, norms = _gains(before, after)
     drift = [one for one in (positions, sections) if one]
-    is_worse_by_halves = after.halves.rms > _MOST_BY_HALVES * before.halves.rms
+    is_worse_by_halves = by_halves and after.halves.rms > _MOST_BY_HALVES * before.halves.rms
     if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
         return 0.0
     total = sum(gain for gain, _ in drift)
