@@ -306,6 +306,9 @@ def _model_of(bags: Sequence[ReducedBag], options: FitOptions) -> Model:
         # Without a case thermometer the gradient is estimated from the board's rate, and its
         # columns are combinations of those of the board.
         columns = tuple(column for column in columns if not column.is_of_sensor)
+    if options.groups is not None:
+        asked = {*options.groups, *options.forced}
+        columns = tuple(column for column in columns if column.group in asked)
     return Model(options.model, sets_of(options, bags), columns, sensors, detector, reference)
 
 
