@@ -116,6 +116,7 @@ def _sink(arguments: argparse.Namespace) -> None:
     loop = WaitLoop(rclpy.create_node('sink'))
     imu = loop.subscribe(Imu, 'imu/data_raw', _qos(arguments.reliability))
     stamp = struct.Struct('<iI')
+    stamps: list[int] = []
     latencies: list[int] = []
     n_expected = round(arguments.rate * arguments.seconds)
     last = time.monotonic() + PATIENCE_S
@@ -129,11 +130,14 @@ def _sink(arguments: argparse.Namespace) -> None:
         for data, received in zip(messages, received_ns, strict=True):
             if data[16:23] != WARM_UP:
                 sec, nanosec = stamp.unpack_from(data, 4)
-                latencies.append(received - sec * 1_000_000_000 - nanosec)
+                stamps.append(sec * 1_000_000_000 + nanosec)
+                latencies.append(received - stamps[-1])
         if messages and latencies:
             last = time.monotonic()
     if not latencies:
         sys.exit('nothing came out of the relay')
+    if arguments.latencies:
+        np.save(arguments.latencies, np.array((stamps, latencies)))
     percentiles = np.percentile(latencies, (50, 99, 99.9)) * 1e-6
     figures = dict(zip(('p50_ms', 'p99_ms', 'p999_ms'), percentiles, strict=True))
     print(json.dumps({'n': len(latencies), **figures}), flush=True)
@@ -261,6 +265,7 @@ def main() -> None:
     parser.add_argument('--core', type=int, default=-1)
     parser.add_argument('--depth', type=int, required=True)
     parser.add_argument('--calibration', required=True)
+    parser.add_argument('--latencies', help='file for the stamp and latency [ns] of each sample')
     arguments = parser.parse_args()
     if arguments.role in ('naive', 'floor', 'node') and arguments.core >= 0:
         os.sched_setaffinity(0, {arguments.core})

@@ -1,21 +1,21 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Measures what the rest log costs the node: CPU time per sample with it and without.
+Measures what the rest log costs the node: CPU time per sample and latency, with it and without.
 
     python benchmarks/rest_log.py [--rates 400 1000 10000] [--seconds 60]
 
-The node runs in this process and a source of samples in another; the log is switched on and off
-every second. Neighbouring seconds are compared, because a shared machine changes its pace. The
-time of one block of sums, on the clock, is the longest that a sample can wait for it.
+The node runs in this process, source and sink of samples in two others; the log is on in even
+seconds of the clock and off in odd ones. Neighbouring seconds are compared, because a shared
+machine changes its pace. The latency runs from the source's publish call to the arrival in the
+sink's middleware. The time of one block of sums, on the clock, is the longest that a sample can
+wait for it.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -24,40 +24,56 @@ from pathlib import Path
 os.environ |= {'ROS_DOMAIN_ID': '87', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
 import numpy as np
-from node_relay import ROLES, ROOT, _calibration_for
+from node_relay import (
+    MEETING_S,
+    _calibration_for,
+    _cores_kept_awake,
+    _expect,
+    _line,
+    _process,
+    _say,
+)
 
 from thermo_comp.ros.node import CompensationNode, node_in_thread
 from thermo_comp.ros.relay import Relay
 from thermo_comp.ros.rest_log import RestKeeper
-
-MEETING_S = 6.0  # until source and node know each other [s]
+from thermo_comp.typing import Floats
 
 
 def cost(
     node: CompensationNode, relay: Relay, keeper: RestKeeper, seconds: int
-) -> tuple[list, list]:
+) -> tuple[list[float], list[float]]:
     """Return CPU time per sample [us] of seconds with the log, and without."""
-    found: tuple[list, list] = ([], [])
-    for second in range(seconds):
+    found: tuple[list[float], list[float]] = ([], [])
+    time.sleep(2.0 - time.time() % 2.0)
+    for _ in range(seconds):
+        begin = time.time()
+        is_off = int(begin) % 2
         relay.gather()
-        relay.rests, relay.waiting = (None, None) if second % 2 else (keeper, [])
+        relay.rests, relay.waiting = (None, None) if is_off else (keeper, [])
         n_before, before = node.counts()[0], time.process_time()
-        time.sleep(1.0)
+        time.sleep(int(begin) + 1.0005 - begin)
         used = time.process_time() - before
-        found[second % 2].append(used / (node.counts()[0] - n_before) * 1e6)
+        found[is_off].append(used / (node.counts()[0] - n_before) * 1e6)
     return found
+
+
+def tail_latencies(file: Path) -> tuple[Floats, Floats]:
+    """Return the p99 latency [ms] of each even second, with the log, and of each odd one."""
+    stamp_ns, latency_ns = np.load(file)
+    second = stamp_ns // 1_000_000_000
+    # Without the first and the last second, which are not whole.
+    seconds = np.unique(second)[1:-1]
+    tails = np.array([np.percentile(latency_ns[second == one], 99) for one in seconds]) * 1e-6
+    return tails[seconds % 2 == 0], tails[seconds % 2 == 1]
 
 
 def measure(rate: int, seconds: int, folder: Path) -> None:
     """Print the figures of one rate."""
     calibration = _calibration_for(rate, folder)
-    options = [f'--rate={rate}', '--reliability=best_effort', '--seconds=1', '--depth=100']
-    source = subprocess.Popen(
-        [sys.executable, str(ROLES), 'source', *options, f'--calibration={calibration}'],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-    )
+    latencies = folder / f'{rate}.npy'
+    options = [f'--rate={rate}', '--reliability=best_effort', f'--seconds={seconds + 4}']
+    options += ['--depth=100', f'--calibration={calibration}', f'--latencies={latencies}']
     blocks: list[float] = []
 
     class Timed(RestKeeper):
@@ -67,27 +83,40 @@ def measure(rate: int, seconds: int, folder: Path) -> None:
             blocks.append(1e3 * (time.perf_counter() - before))
 
     words = [f'calibration_file:={calibration}', f'rest_log:={folder}/{rate}']
-    try:
-        with node_in_thread(*[word for one in words for word in ('-p', one)]) as node:
-            relay = node._relay  # noqa: SLF001 - the log can be switched on at start only
-            keeper = relay.rests
-            keeper.__class__ = Timed
-            time.sleep(MEETING_S)
-            blocks.clear()
-            with_log, without = map(np.array, cost(node, relay, keeper, seconds))
-            relay.rests, relay.waiting = keeper, []
-    finally:
-        source.kill()
-        source.wait()
-    more = with_log - without
-    sd = more.std(ddof=1) / np.sqrt(len(more))
-    whole = float(without.mean())
+    with (
+        _cores_kept_awake(False),
+        node_in_thread(*[word for one in words for word in ('-p', one)]) as node,
+        _process('sink', options) as sink,
+        _process('source', options) as source,
+    ):
+        relay = node._relay  # noqa: SLF001 - the log can be switched on at start only
+        keeper = relay.rests
+        keeper.__class__ = Timed
+        _expect(sink, 'ready')
+        time.sleep(MEETING_S)
+        _say(source, 'go')
+        _expect(source, 'start')
+        blocks.clear()
+        with_log, without = map(np.array, cost(node, relay, keeper, seconds))
+        relay.rests, relay.waiting = keeper, []
+        _expect(source, 'end')
+        _line(sink)
     print(
-        f'{rate:6d} Hz: {whole:.1f} us per sample without, {more.mean():+.2f} +- {sd:.2f} us = '
-        f'{more.mean() / whole:+.1%} +- {sd / whole:.1%} with the log; a block takes '
-        f'{np.median(blocks):.2f} ms (median)',
+        f'{rate:6d} Hz: CPU {_compared(with_log, without, "us")}, '
+        f'p99 {_compared(*tail_latencies(latencies), "ms")}; '
+        f'a block takes {np.median(blocks):.2f} ms (median)',
         flush=True,
     )
+
+
+def _compared(with_log: Floats, without: Floats, unit: str) -> str:
+    """Describe the difference between neighbouring seconds and its standard error."""
+    n = min(len(with_log), len(without))
+    more, usual = with_log[:n] - without[:n], float(np.median(without))
+    # The median, as a second in which the host stops the machine has a latency of its own.
+    sd = 1.2533 * 1.4826 * float(np.median(np.abs(more - np.median(more)))) / np.sqrt(n)
+    away = float(np.median(more))
+    return f'{usual:.3g} {unit} without, {away / usual:+.1%} +- {sd / usual:.1%} with the log'
 
 
 def main() -> None:
