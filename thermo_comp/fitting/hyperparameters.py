@@ -152,6 +152,14 @@ def _offset_sd(posterior: Posterior, prior: Prior) -> tuple[float, float]:
     return new, float(np.abs(np.log(new / prior.offset_sd))) if effective > 1.0 else 0.0
 
 
+def log_density(posterior: Posterior, prior: Prior) -> float:
+    """Return the log evidence plus the log prior density of the sd of mounting offsets."""
+    if not prior.offset_scale:
+        return posterior.log_evidence
+    square = (prior.offset_sd / prior.offset_scale) ** 2
+    return posterior.log_evidence - (STUDENT_NU + 1.0) / 2.0 * float(np.log1p(square / STUDENT_NU))
+
+
 def temperature_rms(regression: Regression) -> float:
     """Return the RMS of the board temperature about the reference [K], at least 1."""
     return max(float(regression.windows.kelvins[0]), 1.0)

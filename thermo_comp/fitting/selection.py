@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..typing import Bools, Floats
-from .hyperparameters import downweigh, pruned, settle, white_noise
+from .hyperparameters import downweigh, log_density, pruned, settle, white_noise
 from .left_out import Score, score_of
 from .regression import Posterior, Regression
 from .unknowns import InformativePrior, Noise, Prior, State
@@ -333,7 +333,7 @@ class _Growth:
 
 
 def _likeliest(fits: Sequence[Trial]) -> Trial:
-    return max(fits, key=lambda fit: fit.posterior.log_evidence)
+    return max(fits, key=lambda fit: log_density(fit.posterior, fit.prior))
 
 
 def _simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
