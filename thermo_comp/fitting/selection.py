@@ -119,26 +119,29 @@ def select(
     if prior.offset_scale > 0.0:
         begun.append(replace(prior, offset_sd=float(prior.sigma.mean())))
     fits = [grow.fit(forced, state, one, candidates.typical) for one in begun]
-    constants = chosen = _likeliest(fits)
-    trials, round_number = [constants], 0
+    constants = chosen = _likelier(fits)
+    trials = [constants]
     if CURVE in asked:
         # The curve is added without a test: it may improve the score only with other groups.
         groups = *forced, CURVE
-        curve = _likeliest(
+        curve = _likelier(
             [grow.fit(groups, fit.posterior.state, fit.prior, fit.typical) for fit in fits]
         )
         downweigh(regression, curve.posterior, curve.prior)
         chosen = grow.fit(groups, curve.posterior.state, curve.prior, curve.typical)
         trials.append(chosen)
-    while True:
-        found = grow.trials(chosen, [name for name in asked if name not in chosen.groups])
-        trials += found
-        better = [one for one in found if is_better(chosen.score, one.score)]
-        round_number += 1
-        progress(1.0 - 0.6**round_number)
-        if not better:
-            break
-        chosen = _simplest_of_the_best(chosen, better)
+    begin = chosen
+    chosen, found = grow.added(chosen, asked, progress)
+    trials += found
+    if BEND in asked and BEND not in chosen.groups and not _is_at_noise(chosen):
+        # The slopes of a part that lags are seen only beside its lag, not beside a stand-in of
+        # products and squares.
+        bent = grow.bent(begin, asked)
+        if bent is not None:
+            bent, found = grow.added(bent, asked, progress)
+            trials += found
+            if is_better(chosen.score, bent.score):
+                chosen = bent
     if chosen is not constants and not is_better(constants.score, chosen.score):
         gain = chosen.posterior.log_evidence - constants.posterior.log_evidence
         if not _is_undecided(constants.score, chosen.score) or gain < TRIAL_GAIN:
@@ -283,6 +286,30 @@ class _Growth:
         score = score_of(self._regression, posterior, prior)
         return Trial(groups, score, posterior, prior, typical)
 
+    def added(
+        self, chosen: Trial, asked: Sequence[str], progress: Callable[[float], None]
+    ) -> tuple[Trial, list[Trial]]:
+        """Add groups as long as left-out data confirm it; return the last model and all tried."""
+        trials: list[Trial] = []
+        part = 1.0
+        while True:
+            found = self.trials(chosen, [name for name in asked if name not in chosen.groups])
+            trials += found
+            better = [one for one in found if is_better(chosen.score, one.score)]
+            part *= 0.6
+            progress(1.0 - part)
+            if not better:
+                return chosen, trials
+            chosen = _simplest_of_the_best(chosen, better)
+
+    def bent(self, begin: Trial, asked: Sequence[str]) -> Trial | None:
+        """Fit a model with all lags and the bends that it lacks; None if it lacks none."""
+        lags = tuple(name for name in LAGS if name in asked)
+        groups = (*begin.groups, *lags)
+        typical = self._typical(begin, lags, self._candidates.typical)
+        lagged = self.fit(groups, begin.posterior.state, begin.prior, typical)
+        return next(iter(self.trials(lagged, [BEND])), None)
+
     def trials(self, chosen: Trial, absent: list[str]) -> list[Trial]:
         """Fit the chosen model plus each group with a large possible gain in log evidence."""
         if not absent:
@@ -332,8 +359,26 @@ class _Growth:
         return np.where(np.isin(self._names, names), own, chosen.typical)
 
 
-def _likeliest(fits: Sequence[Trial]) -> Trial:
-    return max(fits, key=lambda fit: log_density(fit.posterior, fit.prior))
+def _likelier(fits: Sequence[Trial]) -> Trial:
+    """
+    Return of the fits begun with small and with large mountings the one better on left-out data,
+    or else the one with small mountings unless the other is likelier by `TRIAL_GAIN`.
+
+    Both explain the norms of few positions: mountings by themselves, or misalignments with small
+    mountings. Only the second predicts the norm of another position.
+    """
+    small, *others = fits
+    for large in others:
+        gain = log_density(large.posterior, large.prior) - log_density(small.posterior, small.prior)
+        is_likelier = gain > TRIAL_GAIN and not is_better(large.score, small.score)
+        if is_likelier or is_better(small.score, large.score):
+            return large
+    return small
+
+
+def _is_at_noise(trial: Trial) -> bool:
+    """Whether the left-out drift is at most twice the noise of a window."""
+    return trial.score.rms < 2.0 * float(trial.prior.sigma.mean())
 
 
 def _simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
