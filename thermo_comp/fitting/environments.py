@@ -47,15 +47,22 @@ _PRECISION_FACTOR = 1e4
 
 
 def contradicting_bag(windows: ThermalWindows, selected: Selected) -> int | None:
-    """Find the bag whose left-out drift is far larger than that of all others; None if none is."""
+    """
+    Find the bag that may be of another environment; None if none is suspect.
+
+    It is the one whose left-out drift is far larger than that of all others. A bag whose drift the
+    others do not determine is it if theirs is far above the noise.
+    """
     square = _square_of_bags(windows, selected.score)
     known = np.isfinite(square)
     if known.sum() < _FEWEST_BAGS:
         return None
-    worst = int(np.nanargmax(square))
     usual = float(np.median(square[known]))
-    noise = float(np.mean(selected.prior.sigma**2))
-    return worst if square[worst] > _LEAST_RATIO**2 * max(usual, noise) else None
+    limit = _LEAST_RATIO**2 * float(np.mean(selected.prior.sigma**2))
+    if (~known).sum() == 1 and usual > limit:
+        return int(np.argmin(known))
+    worst = int(np.nanargmax(square))
+    return worst if square[worst] > max(_LEAST_RATIO**2 * usual, limit) else None
 
 
 def is_better_without(

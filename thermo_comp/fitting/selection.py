@@ -43,6 +43,8 @@ _TOGETHER = (('product', 'square'), (*LAGS, 'product', 'gradient_x_temperature',
 LEAST_GAIN = 1.0
 # Logarithms of mean squares that differ by less than this count as equal: 5 % of an RMS.
 _EQUAL = 0.1
+# Largest left-out drift, relative to the chosen model's, of a model of bends that is continued.
+_PROMISING = 3.0
 # Largest factor by which the RMS error of the two halves may rise: two folds scatter by a quarter.
 _MOST_BY_HALVES = 1.25
 
@@ -67,6 +69,11 @@ class Trial:
     typical: Floats
     is_chosen: bool = False
     is_near: bool = False
+
+    @property
+    def log_density(self) -> float:
+        """Log evidence plus log prior density of the mounting's standard deviation."""
+        return log_density(self.posterior, self.prior)
 
 
 @dataclass(frozen=True)
@@ -137,7 +144,7 @@ def select(
         # The slopes of a part that lags are seen only beside its lag, not beside a stand-in of
         # products and squares.
         bent = grow.bent(begin, asked)
-        if bent is not None:
+        if bent is not None and bent.score.rms < _PROMISING * chosen.score.rms:
             bent, found = grow.added(bent, asked, progress)
             trials += found
             if is_better(chosen.score, bent.score):
@@ -361,15 +368,15 @@ class _Growth:
 
 def _likelier(fits: Sequence[Trial]) -> Trial:
     """
-    Return of the fits begun with small and with large mountings the one better on left-out data,
-    or else the one with small mountings unless the other is likelier by `TRIAL_GAIN`.
+    Choose between fits begun with small and with large mountings: the one better on left-out data.
 
-    Both explain the norms of few positions: mountings by themselves, or misalignments with small
-    mountings. Only the second predicts the norm of another position.
+    If neither is, the large mountings must be likelier by `TRIAL_GAIN`. Both explain the norms of
+    few positions, one by mountings, the other by misalignments; only the second predicts the norm
+    of another position.
     """
     small, *others = fits
     for large in others:
-        gain = log_density(large.posterior, large.prior) - log_density(small.posterior, small.prior)
+        gain = large.log_density - small.log_density
         is_likelier = gain > TRIAL_GAIN and not is_better(large.score, small.score)
         if is_likelier or is_better(small.score, large.score):
             return large
