@@ -26,8 +26,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..typing import Floats, Ints
+from .elimination import inverse_of
 from .equations import moved_by
-from .regression import Normal, Posterior, Reduced, Regression
+from .regression import Posterior, Regression
 from .unknowns import Prior, State
 
 # Largest ratio of the variance of a position's norm or drift without this position in the fit to
@@ -137,9 +138,10 @@ def _by_positions(
 ) -> tuple[Folds, Folds, Floats, Floats]:
     """Leave out each position; return folds of drift and norm, corrected windows and drift."""
     windows, state, layout = regression.windows, posterior.state, posterior.layout
-    tangent = regression.tangent(state, layout, regression.products(layout.used))
-    normal = regression.normal(tangent, regression.products(layout.used).whole, prior)
+    products = regression.products(layout.used)
+    tangent, normal = regression.linearised(state, layout, products.whole)
     reduced = regression.reduce(normal, prior, layout, state)
+    means = tangent.of(regression.at_starts(products.means[:, None], state, products.base))
     n_positions = windows.n_positions
     edges = np.searchsorted(windows.position, np.arange(n_positions + 1))
     counts = np.diff(edges).astype(np.float64)
@@ -147,9 +149,10 @@ def _by_positions(
     sizes = regression.norms(state)
     drift = np.full_like(force, np.nan)
     squares, norms = np.full(n_positions, np.nan), np.full(n_positions, np.nan)
-    for p in range(n_positions) if n_positions > 1 else ():
+    in_sigmas = normal / (prior.sigma**2)[:, None, None]
+    for p, matrix in enumerate(reduced.without_each(in_sigmas) if n_positions > 1 else ()):
         rows = slice(edges[p], edges[p + 1])
-        moved, covariance = _without_position(regression, posterior, prior, normal, reduced, p)
+        moved, covariance = _refitted(regression, posterior, prior, matrix)
         own = regression.force(moved, rows)
         weight = share[rows]
         level = np.average(own, axis=0, weights=weight)
@@ -159,33 +162,23 @@ def _by_positions(
             drift[rows] = away
             square = np.mean(away**2, axis=1)
             squares[p] = np.average(square, weights=weight)
-        if _is_norm_determined(regression, posterior, prior, tangent.derivatives, covariance, p):
+        if _is_norm_determined(regression, posterior, prior, means[p, :, 0], covariance, p):
             force[rows] = own
             error = np.linalg.norm(own, axis=1) - sizes[p]
             norms[p] = np.average(error**2, weights=weight)
     return Folds(squares, counts), Folds(norms, counts), force, drift
 
 
-def _without_position(
-    regression: Regression,
-    posterior: Posterior,
-    prior: Prior,
-    normal: Normal,
-    reduced: Reduced,
-    p: int,
+def _refitted(
+    regression: Regression, posterior: Posterior, prior: Prior, matrix: Floats
 ) -> tuple[State, Floats]:
-    """Return state and covariance of the fit without a position, to first order."""
+    """Return state and covariance of a fit with other normal equations, to first order."""
     state, layout = posterior.state, posterior.layout
-    bag = regression.bag_of_position[[p]]
-    rest = regression.reduce(normal, prior, layout, state, bag, without=p)
-    information, pull = reduced.whole
-    information = information - reduced.information[bag[0]] + rest.information[0]
-    pull = pull - reduced.pull[bag[0]] + rest.pull[0]
-    step, factor = regression.unit_step(information, pull, prior, layout, state)
+    pull = matrix[:-1, -1]
+    step, factor = regression.unit_step(matrix[:-1, :-1], pull, prior, layout, state)
     whole = np.zeros(layout.n)
     whole[: layout.n_unit] = step
-    inverse = np.linalg.inv(factor)
-    return moved_by(state, whole, layout), inverse.T @ inverse
+    return moved_by(state, whole, layout), inverse_of(factor)
 
 
 def _is_drift_determined(
@@ -216,21 +209,22 @@ def _is_norm_determined(
     regression: Regression,
     posterior: Posterior,
     prior: Prior,
-    derivatives: Floats,
+    means: Floats,
     covariance: Floats,
     p: int,
 ) -> bool:
-    """Whether `covariance`, that without this position, determines its norm."""
+    """
+    Whether `covariance`, that without this position, determines its norm; `means`: derivatives of
+    its mean reading, see `Tangent.of`.
+    """
     if not regression.gravity:
         return False
     state, layout = posterior.state, posterior.layout
-    own = layout.axis.shape[1] + len(layout.shared)
-    base = regression.products(layout.used).means[p]
     on_axes = np.linalg.inv(state.inverse).T @ state.up[p] / state.kappa
     along = np.zeros(layout.n_unit)
     for axis in range(3):
-        places = np.concatenate((layout.axis[axis], layout.shared))
-        along[places] += on_axes[axis] * (base @ derivatives[p, axis, :, :own])
+        places = layout.unit[axis, :-1]
+        along[places] += on_axes[axis] * means[axis, -1 - len(places) : -1]
     everything = along @ posterior.covariance @ along + prior.offset_sd**2
     return bool(along @ covariance @ along < _VARIANCE_RATIO * everything)
 

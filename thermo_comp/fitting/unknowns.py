@@ -205,8 +205,9 @@ class Layout:
 
     axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
     weights, nonlinear: shapes (2, 3, m) and (3, 2 k); -1 for an inactive unknown
+    own: unknowns of each position: up, stretch, offset, tilt, shape (n_positions, k)
+    bag: bag of each position
     n_unit, n: number of unknowns of the unit, and of all
-    blocks: unknowns of each bag
     """
 
     axis: Ints
@@ -219,8 +220,9 @@ class Layout:
     nonlinear: Ints
     radius: Ints
     stretch: Ints
+    own: Ints
+    bag: Ints
     n_unit: int
-    blocks: tuple[slice, ...]
     n: int
 
     @property
@@ -237,6 +239,19 @@ class Layout:
     def shared(self) -> Ints:
         """Places of radius and misalignment, which the axes share; the last of the unit."""
         return np.concatenate((self.radius, self.misalignment))
+
+    @cached_property
+    def unit(self) -> Ints:
+        """The unknowns of the unit that each axis has, and the place after them, shape (3, k)."""
+        common = np.append(self.shared, self.n_unit)
+        return np.hstack((self.axis, np.tile(common, (3, 1))))
+
+    @cached_property
+    def of_axis(self) -> Ints:
+        """The unknowns of a position that each axis has, as places in `own`, shape (3, k)."""
+        first = self.up.shape[1] + self.stretch.shape[1]
+        common = [*range(first)], [*range(first + 3, self.own.shape[1])]
+        return np.array([[*common[0], first + axis, *common[1]] for axis in range(3)])
 
     @property
     def used(self) -> Bools:
@@ -276,23 +291,17 @@ def lay_out(
     misalignment = take(3)
     n_unit = n
     n_positions, n_bags = len(bag_of_position), int(bag_of_position.max()) + 1
-    up = np.empty((n_positions, 2), dtype=np.int64)
-    offset = np.empty((n_positions, 3), dtype=np.int64)
-    tilt = np.empty((n_positions, n_tilts, 2), dtype=np.int64)
     n_stretches = int(forces is not None and bool(forces.sd.any()))
-    stretch = np.empty((n_positions, n_stretches), dtype=np.int64)
+    own = np.empty((n_positions, 2 + n_stretches + 3 + 2 * n_tilts), dtype=np.int64)
     start = np.empty((n_bags, n_starts), dtype=np.int64)
-    blocks = []
     for bag in range(n_bags):
-        first = n
         for p in np.flatnonzero(bag_of_position == bag):
-            up[p], stretch[p] = take(2), take(n_stretches)
-            offset[p], tilt[p] = take(3), take(n_tilts, 2)
+            own[p] = take(own.shape[1])
         start[bag] = take(n_starts)
-        blocks.append(slice(first, n))
+    up, stretch, offset, tilt = np.split(own, np.cumsum([2, n_stretches, 3]), axis=1)
     return Layout(
-        *(axis, weights, misalignment, up, offset, tilt, start),
-        *(nonlinear, radius, stretch, n_unit, tuple(blocks), n),
+        *(axis, weights, misalignment, up, offset, tilt.reshape(n_positions, n_tilts, 2), start),
+        *(nonlinear, radius, stretch, own, bag_of_position, n_unit, n),
     )
 
 

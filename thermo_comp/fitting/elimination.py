@@ -1,0 +1,270 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the elimination of the unknowns of positions and bags from the normal equations.
+
+Each position has unknowns (attitude, offsets, tilts) that occur in no other position; they are
+eliminated first, then the initial lag states of each bag. Normal equations for the unknowns of the
+unit remain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg.lapack import dpotri
+
+from ..typing import Floats
+from .unknowns import Layout
+
+# Relative jitters of a matrix that rounding may have made indefinite.
+_JITTERS, _LAST_JITTER = (1e-13, 1e-11, 1e-9), 1e-7
+
+
+def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
+    """
+    Return the lower Cholesky factors of matrices that are positive definite except for rounding,
+    shape (..., n, n).
+
+    The smallest jitter that suffices is added to the matrix scaled to a unit diagonal; with
+    `diagonal`, shape (..., n), to the matrix scaled by its root.
+    """
+    square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
+    root = np.sqrt(square)
+    scaled = matrix / (root[..., :, None] * root[..., None, :])
+    every = np.arange(matrix.shape[-1])
+    for jitter in _JITTERS:
+        scaled[..., every, every] += jitter
+        with suppress(np.linalg.LinAlgError):
+            return np.asarray(np.linalg.cholesky(scaled) * root[..., :, None])
+        if matrix.ndim > 2:
+            # Only the matrices that need more jitter get it.
+            return np.stack([factored(*one) for one in zip(matrix, square, strict=True)])
+    scaled[..., every, every] += _LAST_JITTER
+    return np.asarray(np.linalg.cholesky(scaled) * root[..., :, None])
+
+
+def inverse_of(factor: Floats) -> Floats:
+    """Return the inverse of the matrix with a lower Cholesky factor, shape (n, n)."""
+    lower, _ = dpotri(factor, lower=True)
+    lower = np.tril(lower)
+    return np.asarray(lower + np.tril(lower, -1).T)
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """
+    Eliminated blocks of equal size, those of all positions or of all bags.
+
+    root: inverse of the Cholesky factor of each block, shape (n, k, k)
+    turned: this inverse times the cross block with the remaining unknowns and, in the last column,
+        times the gradient, shape (n, k, m + 1)
+    """
+
+    root: Floats
+    turned: Floats
+
+    @classmethod
+    def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
+        """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
+        root = np.asarray(np.linalg.inv(factored(block, diagonal)), dtype=np.float64)
+        return cls(root, root @ cross)
+
+    @cached_property
+    def solved(self) -> Floats:
+        """Inverse of each block times its cross block and its gradient, shape (n, k, m + 1)."""
+        return np.asarray(np.swapaxes(self.root, 1, 2) @ self.turned)
+
+    @property
+    def inverse(self) -> Floats:
+        """Inverse of each block, shape (n, k, k)."""
+        return np.asarray(np.swapaxes(self.root, 1, 2) @ self.root)
+
+    @property
+    def log_determinant(self) -> float:
+        """Sum of the log determinants of the blocks."""
+        return -2.0 * float(np.log(np.einsum('nii->ni', self.root)).sum())
+
+    def square(self, first: int = 0) -> Floats:
+        """
+        Return what the elimination subtracts from the normal equations of the remaining unknowns
+        from the `first` on.
+        """
+        return _summed(self.turned[..., first:], self.turned[..., first:])
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """
+    The normal equations of the unit's n unknowns, with all others eliminated.
+
+    layout: places of the unknowns
+    starts_prior: precision of the initial lag states, and this times their value, (2, n_bags, r)
+    matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
+    positions: the blocks of the positions; the initial lag states of the bag, then the unknowns of
+        the unit remain
+    shares: contributions of the positions to the blocks of the bags with their cross blocks and
+        gradients, shape (n_positions, r, r + n + 1); and to the diagonals before the elimination
+        of the positions, shape (n_positions, r)
+    bags: the blocks of the bags
+    common: the prior on the sum of the initial lag states as a further block; None without it
+    """
+
+    layout: Layout
+    starts_prior: Floats
+    matrix: Floats
+    positions: Blocks
+    shares: tuple[Floats, Floats]
+    bags: Blocks
+    common: Blocks | None = None
+
+    @property
+    def whole(self) -> Floats:
+        """The matrix with the prior on the sum of the initial lag states."""
+        return self.matrix if self.common is None else self.matrix + self.common.square()
+
+    @property
+    def log_determinant(self) -> float:
+        """Sum of the log determinants of all blocks."""
+        blocks = [self.positions, self.bags, *([self.common] if self.common else [])]
+        return sum(one.log_determinant for one in blocks)
+
+    def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
+        """Add the prior on the sum of the initial lag states, now `total`, about 0."""
+        cross = self.bags.solved.sum(axis=0, keepdims=True)
+        cross[..., -1] += total
+        block = self.bags.inverse.sum(axis=0, keepdims=True) + variance * np.eye(len(total))
+        return replace(self, common=Blocks.of(block, cross))
+
+    def follow(self, step: Floats) -> tuple[Floats, Floats]:
+        """Return the steps of the unknowns of positions and bags, given that of the unit."""
+        r, solved = len(self.bags.root[0]), self.positions.solved
+        starts = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
+        if self.common is not None:
+            excess = self.common.solved[0, :, -1] - self.common.solved[0, :, :-1] @ step
+            starts -= self.bags.inverse @ excess
+        own = solved[..., -1] - solved[..., r:-1] @ step
+        own -= np.einsum('pkr,pr->pk', solved[..., :r], starts[self.layout.bag])
+        return own, starts
+
+    def variances(self, covariance: Floats) -> tuple[Floats, Floats]:
+        """
+        Return the variances of the unknowns of positions and bags, given the covariance of the
+        unit's, without the prior on the sum of the initial lag states.
+        """
+        bag, r, solved = self.layout.bag, len(self.bags.root[0]), self.positions.solved
+        by_unit, inverse = self.bags.solved[..., :-1], self.bags.inverse
+        starts = np.einsum('bii->bi', inverse) + _variance(by_unit, covariance)
+        by_starts = solved[..., :r]
+        own = np.sum(self.positions.root**2, axis=1) + _variance(by_starts, inverse[bag])
+        own += _variance(solved[..., r:-1] - by_starts @ by_unit[bag], covariance)
+        return own, starts
+
+    def without_each(self, normal: Floats) -> Iterator[Floats]:
+        """Yield `whole` without each position in turn, given the normal equations."""
+        bag, whole, r = self.layout.bag, self.whole, len(self.bags.root[0])
+        others = (bag[:, None] == bag) - np.eye(len(bag))
+        rest = _of_bags(others, self.shares, self.starts_prior[:, bag])
+        for p, own in enumerate(normal):
+            turned = self.positions.turned[p, :, r:]
+            before, after = self.bags.turned[bag[p]], rest.turned[p]
+            gone = _of_unit(own, self.layout) - turned.T @ turned
+            yield whole - gone + before.T @ before - after.T @ after
+
+    def beside(self, rows: Floats) -> tuple[Floats, Floats]:
+        """
+        Carry out the elimination for further unknowns of the unit, m of each axis.
+
+        `rows`: their normal equations with the unknowns of the fit and the residual, shape
+        (n_positions, 3, m, k + 1). Returns what the elimination subtracts from their Hessian,
+        shape (3 m, 3 m), and their cross block with the unit and their gradient after it, shape
+        (n + 1, 3 m).
+        """
+        layout, turned = self.layout, self.positions.turned
+        n_local, r = layout.of_axis.shape[1], layout.start.shape[1]
+        n_positions, _, m, _ = rows.shape
+        own = np.zeros((n_positions, turned.shape[1], m, 3))
+        starts = np.zeros((n_positions, r, m, 3))
+        unit = np.zeros((layout.n_unit + 1, m, 3))
+        for axis in range(3):
+            each = np.swapaxes(rows[:, axis], 1, 2)
+            own[..., axis][:, layout.of_axis[axis]] = each[:, :n_local]
+            starts[..., axis] = each[:, n_local : n_local + r]
+            unit[layout.unit[axis], :, axis] = each[:, n_local + r :].sum(axis=0)
+        own = self.positions.root @ own.reshape(n_positions, -1, 3 * m)
+        starts = starts.reshape(n_positions, r, 3 * m) - np.swapaxes(turned[..., :r], 1, 2) @ own
+        of_bags = self.bags.root @ np.tensordot(_membership(layout), starts, 1)
+        cross = unit.reshape(-1, 3 * m)
+        cross -= _summed(turned[..., r:], own) + _summed(self.bags.turned, of_bags)
+        return _summed(own, own) + _summed(of_bags, of_bags), cross
+
+
+def eliminate(normal: Floats, layout: Layout, precision: Floats, away: Floats) -> Reduced:
+    """
+    Eliminate the unknowns of positions and bags.
+
+    normal: the normal equations of each position and axis, see `Tangent.normal`, in units of the
+        noise
+    precision, away: inverse prior variances, and values less prior means, shape (n,)
+    """
+    n_positions, n_own = layout.own.shape
+    r, n_local = layout.start.shape[1], layout.of_axis.shape[1]
+    size = layout.n_unit + 1
+    block = np.zeros((n_positions, n_own, n_own))
+    cross = np.zeros((n_positions, n_own, r + size))
+    starts = np.zeros((n_positions, r, r + size))
+    for axis, at in enumerate(layout.unit):
+        own, out = layout.of_axis[axis], np.concatenate((np.arange(r), r + at))
+        block[:, own[:, None], own] += normal[:, axis, :n_local, :n_local]
+        cross[:, own[:, None], out] += normal[:, axis, :n_local, n_local:]
+        starts[:, :, out] += normal[:, axis, n_local : n_local + r, n_local:]
+    every = np.arange(n_own)
+    block[:, every, every] += precision[layout.own]
+    cross[..., -1] -= (precision * away)[layout.own]
+    # Attitudes without any information keep their value.
+    block[:, every, every] += np.einsum('pii->pi', block) <= 0.0
+    positions = Blocks.of(block, cross)
+    diagonal = np.einsum('pii->pi', starts[..., :r]).copy()
+    starts -= np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned
+    shares, prior = (starts, diagonal), np.stack((precision, precision * away))[:, layout.start]
+    bags = _of_bags(_membership(layout), shares, prior)
+    matrix = _of_unit(normal.sum(axis=0), layout) - positions.square(r) - bags.square()
+    return Reduced(layout, prior, matrix, positions, shares, bags)
+
+
+def _membership(layout: Layout) -> Floats:
+    """Return 1 for the positions of each bag, 0 for the others, shape (n_bags, n_positions)."""
+    return np.asarray(layout.bag == np.arange(len(layout.start))[:, None], dtype=np.float64)
+
+
+def _of_unit(normal: Floats, layout: Layout) -> Floats:
+    """Return the part of the unit in normal equations of the axes, (3, k + 1, k + 1)."""
+    result = np.zeros((layout.n_unit + 1, layout.n_unit + 1))
+    first = normal.shape[-1] - layout.unit.shape[1]
+    for own, at in zip(normal, layout.unit, strict=True):
+        result[at[:, None], at] += own[first:, first:]
+    return result
+
+
+def _of_bags(among: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blocks:
+    """Eliminate the initial lag states of bags, each with the positions `among` them, (m, n)."""
+    sums, diagonals = (np.tensordot(among, share, 1) for share in shares)
+    r = diagonals.shape[1]
+    block, cross = sums[..., :r], sums[..., r:]
+    block[:, np.arange(r), np.arange(r)] += prior[0]
+    cross[..., -1] -= prior[1]
+    return Blocks.of(block, cross, diagonals + prior[0])
+
+
+def _variance(derivatives: Floats, covariance: Floats) -> Floats:
+    """Return the variance of each row of derivatives, shape (n, k)."""
+    return np.asarray(np.sum((derivatives @ covariance) * derivatives, axis=-1))
+
+
+def _summed(left: Floats, right: Floats) -> Floats:
+    """Return the sum of the products of all rows of blocks, shape (k, m)."""
+    return np.asarray(left.reshape(-1, left.shape[2]).T @ right.reshape(-1, right.shape[2]))
