@@ -17,16 +17,36 @@ are linear combinations of the base series of the windows (`series`).
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
+from .last_result import last_result_kept
 from .series import Base, Series
 from .tangent import Tangent
 from .unknowns import Layout, Prior, State, Windows, lay_out
 
 #: Row and column of the unknown elements of M^-1.
 MISALIGNMENT_ROWS = ((1, 0), (2, 0), (2, 1))
+
+
+class Effects(NamedTuple):
+    """
+    The effect of a state at the reference temperature.
+
+    force: specific force along each axis in each position, shape (n_positions, 3)
+    across: derivative of the reading by a rotation of the attitude, shape (n_positions, 3, 2)
+    read: reading without the bias, shape (n_positions, 3)
+    bends: sums of the nonlinear terms at the reference and per kelvin, shape (2, n_positions, 3)
+    slopes: their derivatives by the force, of the same shape
+    """
+
+    force: Floats
+    across: Floats
+    read: Floats
+    bends: Floats
+    slopes: Floats
 
 
 class Equations(Series):
@@ -69,7 +89,7 @@ class Equations(Series):
 
     def along_axes(self, state: State) -> Floats:
         """Return the specific force along each axis in each position, shape (n_positions, 3)."""
-        return np.asarray(self._norm(state) * state.up @ state.inverse.T)
+        return self.effects(state).force
 
     def _norm(self, state: State) -> float | Floats:
         if self.forces is None:
@@ -95,63 +115,76 @@ class Equations(Series):
             )
         return self._layouts[key]
 
+    @last_result_kept
+    def effects(self, state: State) -> Effects:
+        """Return the specific force along each axis and its nonlinear terms."""
+        force = np.asarray(self._norm(state) * state.up @ state.inverse.T)
+        turned = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
+        sizes = np.reshape(self._norm(state), (-1, 1, 1))
+        across = sizes * (state.kappa[:, None] * turned)
+        if self.forces is None:
+            bends = np.zeros((2, 2, *force.shape))
+        else:
+            terms = np.stack(self.forces.terms(force))
+            bends = np.einsum('vpik,ijk->vjpi', terms, state.nonlinear.reshape(3, 2, -1))
+        return Effects(force, across, state.kappa * (force + bends[0, 0]), bends[0], bends[1])
+
+    @last_result_kept
     def tangent(self, state: State, layout: Layout, base: Base) -> Tangent:
         """Linearise the equations about a state."""
-        force, across = self.along_axes(state), self._across(state)
+        force, across, read, _, _ = self.effects(state)
         along = (state.kappa * force)[..., None]
-        read = (state.kappa * (force + self._bends(state)[0, 0]))[..., None]
-        one = np.ones_like(along)
         n_starts, n_stretches = layout.start.shape[1], layout.stretch.shape[1]
         scaled, by_kappa, by_force = (base.size + k for k in range(3))
         starts = base.size + 3 + np.arange(n_starts)
         in_bias, in_scale = (1 + np.flatnonzero(mask[base.columns]) for mask in layout.used)
-        by_radius = along[..., : layout.radius.size]
+        by_radius: Floats | float = 1.0
         if self.forces is not None:
-            by_radius = self.forces.by_radius(state.radius)[:, None, None] * by_radius
-        unknowns: list[tuple[Ints | list[int], Floats]] = [
+            by_radius = self.forces.by_radius(state.radius)[:, None, None] * along
+        unknowns: list[tuple[Ints | list[int], Floats | float]] = [
             ([by_force] * 2, across),
             ([by_force] * n_stretches, along),
-            ([0], one),
+            ([0], 1.0),
             (np.repeat(base.tilts, 2), np.tile(across, base.n_tilts)),
-            (starts, one),
-            ([by_kappa, 0], one),
-            (in_bias, one),
-            (in_scale, read),
+            (starts, 1.0),
+            ([by_kappa, 0], 1.0),
+            (in_bias, 1.0),
+            (in_scale, read[..., None]),
             self._by_coefficients(state, layout, base, scaled),
             ([by_force] * layout.radius.size, by_radius),
             ([by_force] * 3, self._by_misalignment(state)),
-            ([base.size + 3 + n_starts], one),
+            ([base.size + 3 + n_starts], 1.0),
         ]
-        place = np.concatenate([np.asarray(at, dtype=np.int64) for at, _ in unknowns])
-        many = force.shape
-        factor = [np.broadcast_to(value, (*many, len(at))) for at, value in unknowns]
-        combined = self._combined(state, base, n_starts)
-        return Tangent(combined, place, np.concatenate(factor, axis=2))
+        place = np.array([k for at, _ in unknowns for k in at], dtype=np.int64)
+        factor, first = np.empty((*force.shape, len(place))), 0
+        for at, value in unknowns:
+            factor[..., first : first + len(at)] = value
+            first += len(at)
+        return Tangent(self._combined(state, base, n_starts), place, factor)
 
     def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
         """
         Return the combinations of a tangent: 1 + S s, the derivatives by kappa, by the force along
         the axis and by the initial lag states, and the residual.
         """
-        (bend, bend_by_t), (slope, slope_by_t) = self._bends(state)
-        force, columns = self.along_axes(state), slice(1, 1 + len(base.columns))
+        force, _, read, (bend, bend_by_t), (slope, slope_by_t) = self.effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size, 4 + n_starts))
         result[:, :, 0, :3] = 1.0
-        result[:, :, columns, :3] = on_scale[..., None]
+        result[:, :, 1 : 1 + len(base.columns), :3] = on_scale[..., None]
         result[..., 1] *= (force + bend)[..., None]
         result[..., 2] *= (1.0 + slope)[..., None]
         result[:, :, base.t, 1] = bend_by_t[..., None]
         result[:, :, base.t, 2] = slope_by_t[..., None]
-        weight = on_bias + (state.kappa * (force + bend))[..., None] * on_scale
-        moved = weight[:, :, base.moved, None] * self.start_root[base.lag]
-        result[:, :, base.at_start, 3:-1] = moved[..., :n_starts]
+        if n_starts:
+            weight = (on_bias + read[..., None] * on_scale)[..., base.moved, None]
+            result[:, :, base.at_start, 3:-1] = weight * self.start_root[base.lag]
         result[..., -1] = self.misfit(state, base)
         return result
 
     def _by_coefficients(
         self, state: State, layout: Layout, base: Base, scaled: int
-    ) -> tuple[Ints, Floats]:
+    ) -> tuple[Ints, Floats | float]:
         """
         Return series and factor of the active nonlinear coefficients.
 
@@ -160,7 +193,7 @@ class Equations(Series):
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):
-            return active, np.zeros((*state.up.shape, 0))
+            return active, 1.0
         k = len(self.forces.kinds)
         value, _ = self.forces.terms(self.along_axes(state))
         place = np.where(active < k, scaled, base.t[0])
@@ -169,45 +202,27 @@ class Equations(Series):
     def _by_misalignment(self, state: State) -> Floats:
         """Differentiate the force along each axis by the misalignment, times kappa, (n, 3, 3)."""
         result = np.zeros((len(state.up), 3, len(MISALIGNMENT_ROWS)))
+        turned = self._norm(state) * state.up
         for k, (row, source) in enumerate(MISALIGNMENT_ROWS):
-            result[:, row, k] = (self._norm(state) * state.kappa[row] * state.up)[:, source]
+            result[:, row, k] = state.kappa[row] * turned[:, source]
         return result
-
-    def _bends(self, state: State) -> Floats:
-        """
-        Return the sum of the nonlinear terms at the reference and per kelvin, and the slopes of
-        both over the force, shape (2, 2, n_positions, 3).
-        """
-        force = self.along_axes(state)
-        if self.forces is None:
-            return np.zeros((2, 2, *force.shape))
-        terms = np.stack(self.forces.terms(force))
-        own = state.nonlinear.reshape(3, 2, -1)
-        return np.asarray(np.einsum('vpik,ijk->vjpi', terms, own))
-
-    def _across(self, state: State) -> Floats:
-        """Return the derivative of each axis by a rotation of each attitude, (n, 3, 2)."""
-        turned = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
-        sizes = np.reshape(self._norm(state), (-1, 1, 1))
-        return np.asarray(sizes * (state.kappa[:, None] * turned))
 
     def misfit(self, state: State, base: Base) -> Floats:
         """Measured minus predicted as combinations of the base, (n_positions, 3, n_base)."""
-        force, (bend, bend_by_t) = self.along_axes(state), self._bends(state)[0]
+        force, across, read, (_, bend_by_t), _ = self.effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
-        read = state.kappa * (force + bend)
         result = np.zeros((*force.shape, base.size))
         result[:, :, 0] = self.level - (read + state.bias + state.offset)
         result[:, :, 1 : 1 + len(base.columns)] = -(on_bias + read[..., None] * on_scale)
         result[:, :, base.t] = -(state.kappa * bend_by_t)[..., None]
-        result[:, :, base.tilts] = -np.einsum('pkt,pit->pik', state.tilt, self._across(state))
+        result[:, :, base.tilts] = -np.einsum('pkt,pit->pik', state.tilt, across)
         result[:, [0, 1, 2], base.measured] = 1.0
         return result
 
     def residual(self, state: State, layout: Layout) -> Floats:
         """Measured minus predicted, shape (n, 3) [m/s^2]."""
         base, position = self.products(layout.used).base, self.windows.position
-        series = self._taken(base, *self._plain)
+        series = self.of(base)
         series[:, 1 + base.moved] += self.starts(state, base)[position] * series[:, base.at_start]
         return np.asarray(np.einsum('nb,nib->ni', series, self.misfit(state, base)[position]))
 
@@ -220,6 +235,7 @@ class Equations(Series):
             along = self.forces.linearise(along, state.nonlinear, rows)
         return np.asarray(along @ np.linalg.inv(state.inverse).T)
 
+    @last_result_kept
     def precision(self, prior: Prior, layout: Layout) -> Floats:
         """Return inverse prior variances, shape (n,); 0 for those of an informative prior."""
         result = np.zeros(layout.n)
@@ -244,15 +260,16 @@ class Equations(Series):
         result[layout.up] = 0.0 if self.gravity else 1.0
         return result
 
-    def prior_mean(self, prior: Prior, layout: Layout) -> Floats:
-        """Mean of the prior; 0 for all but kappa and bias, shape (n,)."""
-        mean = np.zeros(layout.n)
+    @last_result_kept
+    def away(self, state: State, prior: Prior, layout: Layout) -> Floats:
+        """Return the unknowns less the mean of the prior, 0 for all but the unit's, (n,)."""
+        result = as_vector(state, layout)
         if prior.informative is not None:
-            mean[: layout.n_unit] = prior.informative.mean
-            return mean
-        mean[layout.kappa] = 1.0
-        mean[layout.bias] = prior.bias_mean
-        return mean
+            result[: layout.n_unit] -= prior.informative.mean
+        else:
+            result[layout.kappa] -= 1.0
+            result[layout.bias] -= prior.bias_mean
+        return result
 
 
 # Unknowns to which a step is added; attitudes move in their tangent planes.

@@ -174,8 +174,7 @@ def _refitted(
 ) -> tuple[State, Floats]:
     """Return state and covariance of a fit with other normal equations, to first order."""
     state, layout = posterior.state, posterior.layout
-    pull = matrix[:-1, -1]
-    step, factor = regression.unit_step(matrix[:-1, :-1], pull, prior, layout, state)
+    step, factor = regression.unit_step(matrix, prior, layout, state)
     whole = np.zeros(layout.n)
     whole[: layout.n_unit] = step
     return moved_by(state, whole, layout), inverse_of(factor)

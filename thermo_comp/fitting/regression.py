@@ -19,14 +19,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats
-from .elimination import Reduced, eliminate, factored, inverse_of
-from .equations import Equations, as_vector, moved_by, without_inactive
+from .elimination import Reduced, eliminate, factored, inverse_of, solved
+from .equations import Equations, moved_by, without_inactive
 from .inactive import Inactive
+from .last_result import last_result_kept
 from .tangent import Tangent
-from .unknowns import Layout, Prior, State, Windows
+from .unknowns import Layout, Prior, State
 
 # Prior sd of the mean over all bags of the initial lag states, over that of one bag. A non-zero
 # mean is a response of the unit, which other initial states would show as well.
@@ -63,59 +64,50 @@ class Posterior:
 class Regression(Equations):
     """Gauss-Newton on the measurement equations; see `Equations` for the parameters."""
 
-    def __init__(self, windows: Windows, gravity: float, nominal_scale: Floats) -> None:
-        super().__init__(windows, gravity, nominal_scale)
-        self._tangent: tuple[State, Layout, Tangent] | None = None
-        self._normal: tuple[Tangent, Floats, Floats] | None = None
-
+    @last_result_kept
     def linearised(self, state: State, layout: Layout, grams: Floats) -> tuple[Tangent, Floats]:
         """
         Return the equations linearised about a state, and the normal equations for products of the
-        base series in each position, see `Tangent.normal`. The last of both are kept, since a fit
-        often changes only the prior.
+        base series in each position, see `Tangent.normal`.
         """
         base = self.products(layout.used).base
-        if not self._tangent or self._tangent[0] is not state or self._tangent[1] is not layout:
-            self._tangent = state, layout, self.tangent(state, layout, base)
-        tangent = self._tangent[2]
-        if not self._normal or self._normal[0] is not tangent or self._normal[1] is not grams:
-            normal = tangent.normal(self.products_at(grams, state, base))
-            self._normal = tangent, grams, normal
-        return tangent, self._normal[2]
+        tangent = self.tangent(state, layout, base)
+        return tangent, tangent.normal(self.products_at(grams, state, base))
 
     def reduce(self, normal: Floats, prior: Prior, layout: Layout, state: State) -> Reduced:
         """Eliminate the unknowns of positions and bags from normal equations."""
-        in_sigmas = normal / (prior.sigma**2)[:, None, None]
-        away, r = as_vector(state, layout), layout.start.shape[1]
-        reduced = eliminate(in_sigmas, layout, self.precision(prior, layout), away)
-        if self.n_bags > 1 and r:
+        in_sigmas = normal * (prior.sigma**-2.0)[:, None, None]
+        precision, away = self.precision(prior, layout), self.away(state, prior, layout)
+        reduced = eliminate(in_sigmas, layout, precision, away)
+        if self.n_bags > 1 and layout.start.size:
             variance = (_COMMON_START * self.n_bags) ** 2 * prior.start_share
             reduced = reduced.with_prior_of_sum(state.start.sum(axis=0), variance)
         return reduced
 
-    def unit_prior(self, prior: Prior, layout: Layout) -> Floats:
-        """Return the prior precision of the unit's unknowns, shape (n_unit, n_unit)."""
-        if prior.informative is not None:
-            return prior.informative.precision
-        return np.diag(self.precision(prior, layout)[: layout.n_unit])
-
     def unit_step(
-        self, information: Floats, pull: Floats, prior: Prior, layout: Layout, state: State
+        self, matrix: Floats, prior: Prior, layout: Layout, state: State
     ) -> tuple[Floats, Floats]:
-        """Return the step of the unit's unknowns, and the Cholesky factor of their Hessian."""
-        known, n = self.unit_prior(prior, layout), layout.n_unit
-        away = (as_vector(state, layout) - self.prior_mean(prior, layout))[:n]
+        """
+        Return the step of the unit's unknowns, and the Cholesky factor of their Hessian, given
+        their normal equations, see `Reduced.matrix`.
+        """
+        n = layout.n_unit
+        information, pull, away = (
+            matrix[:n, :n],
+            matrix[:n, n],
+            self.away(state, prior, layout)[:n],
+        )
         if prior.informative is None:
-            factor = factored(information + known)
-            return cho_solve((factor, True), pull - known @ away, check_finite=False), factor
+            known = self.precision(prior, layout)[:n]
+            factor = factored(information + np.diag(known))
+            return solved(factor, pull - known * away), factor
         # In units of the prior's standard deviations the system is well conditioned.
         root = prior.informative.root
         turned = solve_triangular(root, information, trans='T')
         turned = solve_triangular(root, turned.T, trans='T')
         factor = factored((turned + turned.T) / 2.0 + np.eye(n))
         right = solve_triangular(root, pull, trans='T') - root @ away
-        step = solve_triangular(root, cho_solve((factor, True), right, check_finite=False))
-        return step, root.T @ factor
+        return solve_triangular(root, solved(factor, right)), root.T @ factor
 
     def step(
         self, state: State, prior: Prior, layout: Layout, grams: Floats, *, held: bool = False
@@ -129,9 +121,8 @@ class Regression(Equations):
         if held:
             normal = _held(normal, layout)
         reduced = self.reduce(normal, prior, layout, state)
-        whole = reduced.whole
-        step = np.zeros(layout.n)
-        unit, factor = self.unit_step(whole[:-1, :-1], whole[:-1, -1], prior, layout, state)
+        unit, factor = self.unit_step(reduced.whole, prior, layout, state)
+        step = np.empty(layout.n)
         step[: layout.n_unit] = unit
         step[layout.own], step[layout.start] = reduced.follow(unit)
         return step, reduced, factor
@@ -152,14 +143,11 @@ class Regression(Equations):
         return float(each.sum())
 
     def _away(self, state: State, prior: Prior, layout: Layout) -> float:
-        away = as_vector(state, layout) - self.prior_mean(prior, layout)
-        own = away[: layout.n_unit]
-        local = self.precision(prior, layout)[layout.n_unit :]
-        if prior.informative is None:
-            size = float(own @ self.unit_prior(prior, layout) @ own)
-        else:
-            size = float(np.sum((prior.informative.root @ own) ** 2))
-        size += float(local @ away[layout.n_unit :] ** 2)
+        away, precision = self.away(state, prior, layout), self.precision(prior, layout)
+        size = float(precision @ away**2)
+        if prior.informative is not None:
+            # The precision of the unit's unknowns is 0 in the diagonal form.
+            size += float(np.sum((prior.informative.root @ away[: layout.n_unit]) ** 2))
         if self.n_bags > 1 and layout.start.size:
             bound = (_COMMON_START * self.n_bags) ** 2 * prior.start_share
             size += float(np.sum(state.start.sum(axis=0) ** 2)) / bound
@@ -266,10 +254,8 @@ class Regression(Equations):
         S = -gone.reshape(len(part), 3, len(part), 3)
         for axis in range(3):
             S[:, axis, :, axis] += sums[axis, part[:, None], part, at[:, None], at]
-        whole = reduced.whole
-        step, factor = self.unit_step(whole[:n, :n], whole[:n, n], prior, layout, state)
-        solved = cho_solve((factor, True), cross[:n], check_finite=False)
-        S = S.reshape(gone.shape) - cross[:n].T @ solved
+        step, factor = self.unit_step(reduced.whole, prior, layout, state)
+        S = S.reshape(gone.shape) - cross[:n].T @ solved(factor, cross[:n])
         return Inactive(part, column, S, cross[n] - cross[:n].T @ step)
 
 

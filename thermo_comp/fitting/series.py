@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the base series of the windows, whitened for a noise model, and their products.
+Owns the base series of the windows, and their products whitened for a noise model.
 
 All terms of the measurement equation (`equations`) are linear combinations of a few base series.
 The products of the whitened base series of each position and section are therefore sufficient for
@@ -115,7 +115,7 @@ class Series:
         self.bag_of_position = windows.bag_of_position
         self.n_bags = int(windows.bag.max()) + 1
         # Derivatives below 1e-9 are set to 0, because arithmetic with denormal numbers is slow.
-        starts = np.where(np.abs(windows.start) < 1e-9, 0.0, windows.start) / self.rms
+        self._starts = np.where(np.abs(windows.start) < 1e-9, 0.0, windows.start) / self.rms
         values, vectors = np.linalg.eigh(windows.start_covariance)
         # The initial lag states are strongly correlated: few components have nearly all variance.
         kept = values > 1e-6 * values.max(initial=0.0)
@@ -124,7 +124,7 @@ class Series:
         self._first = np.searchsorted(windows.position, np.arange(windows.n_positions))
         self.level = self._averaged(self.measured)
         others = (t, windows.tilt, self.measured - self.level[windows.position])
-        self._plain = self.columns, starts, np.hstack((np.ones((len(starts), 1)), *others))
+        self._others = np.hstack((np.ones((len(t), 1)), *others))
         self._has_t = bool(t.shape[1])
         new_cell = np.diff(windows.position, prepend=-1) != 0
         new_cell |= np.diff(windows.section, prepend=-1) != 0
@@ -139,13 +139,12 @@ class Series:
         self._products: tuple[Bools, Products] | None = None
 
     def whiten(self, noise: Noise) -> None:
-        """Whiten all base series for a noise model, if the current one is another."""
+        """Use a noise model, to which the series are whitened."""
         if noise == self.noise:
             return
-        gains = self.whitener.gains(self.weight, noise)
+        self._gains = self.whitener.gains(self.weight, noise)
         self.noise, self._products = noise, None
-        self.noise_determinant = self.whitener.log_determinant(gains)
-        self._filtered = tuple(self.whitener.filter(one, gains) for one in self._plain)
+        self.noise_determinant = self.whitener.log_determinant(self._gains)
 
     def products(self, used: Bools) -> Products:
         """Return the products of the active columns, shape (2, m), for the current noise."""
@@ -156,10 +155,11 @@ class Series:
         moved = np.flatnonzero(self.windows.lag[columns] >= 0)
         lag, n_tilts = self.windows.lag[columns[moved]], self.windows.tilt.shape[1]
         base = Base(columns, moved, lag, self._has_t, n_tilts)
-        filtered = self._taken(base, *self._filtered)
+        series = self.of(base)
+        filtered = self.whitener.filter(series, self._gains)
         result = Products(
             base,
-            self._averaged(self._taken(base, *self._plain)),
+            self._averaged(series),
             np.stack([part.T @ part for part in np.split(filtered, self._cells[1:])]),
             np.searchsorted(self._cells, self._first),
             self.windows.section[self._cells],
@@ -172,11 +172,10 @@ class Series:
         Return the products of some columns with each other and with a base, in each position,
         shapes (n_positions, k, k) and (n_positions, k, n_base).
         """
-        own, series = self._filtered[0][:, columns], self._taken(base, *self._filtered)
-        both = np.hstack((own, series))
-        parts = zip(*(np.split(one, self._first[1:]) for one in (own, both)), strict=True)
-        products = np.stack([one.T @ other for one, other in parts])
+        series = np.hstack((self.columns[:, columns], self.of(base)))
+        parts = np.split(self.whitener.filter(series, self._gains), self._first[1:])
         k = len(columns)
+        products = np.stack([part[:, :k].T @ part for part in parts])
         return products[..., :k], products[..., k:]
 
     def _averaged(self, values: Floats) -> Floats:
@@ -184,11 +183,11 @@ class Series:
         count = np.diff(np.append(self._first, len(values)))[:, None]
         return np.asarray(np.add.reduceat(values, self._first, axis=0) / count)
 
-    @staticmethod
-    def _taken(base: Base, columns: Floats, starts: Floats, others: Floats) -> Floats:
+    def of(self, base: Base) -> Floats:
         """Return the series of a base, shape (n, n_base)."""
-        at_start = starts[:, base.columns[base.moved]]
-        return np.hstack((others[:, :1], columns[:, base.columns], at_start, others[:, 1:]))
+        one, others = self._others[:, :1], self._others[:, 1:]
+        at_start = self._starts[:, base.columns[base.moved]]
+        return np.hstack((one, self.columns[:, base.columns], at_start, others))
 
     def starts(self, state: State, base: Base) -> Floats:
         """Return the initial state of the lag of each moved column, (n_positions, n_moved) [K]."""
