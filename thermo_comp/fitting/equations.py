@@ -228,9 +228,10 @@ class Equations(Series):
 
     def force(self, state: State, rows: slice = slice(None)) -> Floats:
         """Correct windows as the compensator does, without mounting offsets, shape (n, 3)."""
-        columns = self.columns[rows]
-        along = self.measured[rows] - state.bias - columns @ state.weights[0].T
-        along /= state.kappa * (1.0 + columns @ state.weights[1].T)
+        active = np.flatnonzero(state.weights.any(axis=(0, 1)))
+        columns, (on_bias, on_scale) = self.columns[rows, active], state.weights[:, :, active]
+        along = self.measured[rows] - state.bias - columns @ on_bias.T
+        along /= state.kappa * (1.0 + columns @ on_scale.T)
         if self.forces is not None:
             along = self.forces.linearise(along, state.nonlinear, rows)
         return np.asarray(along @ np.linalg.inv(state.inverse).T)
