@@ -11,7 +11,6 @@ unit remain.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,8 +20,8 @@ from scipy.linalg.lapack import dpotrs, dtrtri
 from ..typing import Floats
 from .unknowns import Layout
 
-# Relative jitters of a matrix that rounding may have made indefinite.
-_JITTERS, _LAST_JITTER = (1e-13, 1e-11, 1e-9), 1e-7
+# Relative jitters of a matrix that rounding may have made indefinite; they add up.
+_JITTERS = (1e-13, 1e-11, 1e-9, 1e-7)
 
 
 def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
@@ -35,17 +34,23 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     """
     square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
     root = np.sqrt(square)
-    scaled = matrix / (root[..., :, None] * root[..., None, :])
+    scaled = matrix / root[..., None, :]
+    scaled /= root[..., :, None]
     every = np.arange(matrix.shape[-1])
     for jitter in _JITTERS:
         scaled[..., every, every] += jitter
-        with suppress(np.linalg.LinAlgError):
-            return np.asarray(np.linalg.cholesky(scaled) * root[..., :, None])
-        if matrix.ndim > 2:
-            # Only the matrices that need more jitter get it.
-            return np.stack([factored(*one) for one in zip(matrix, square, strict=True)])
-    scaled[..., every, every] += _LAST_JITTER
-    return np.asarray(np.linalg.cholesky(scaled) * root[..., :, None])
+        try:
+            factor = np.linalg.cholesky(scaled)
+        except np.linalg.LinAlgError:
+            if matrix.ndim > 2:
+                # Only the matrices that need more jitter get it.
+                return np.stack([factored(*one) for one in zip(matrix, square, strict=True)])
+            if jitter == _JITTERS[-1]:
+                raise
+        else:
+            break
+    factor *= root[..., :, None]
+    return np.asarray(factor, dtype=np.float64)
 
 
 def solved(factor: Floats, right: Floats) -> Floats:
@@ -75,7 +80,8 @@ class Blocks:
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
         """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        root = np.asarray(np.linalg.inv(factored(block, diagonal)), dtype=np.float64)
+        # `numpy.linalg.inv` of all factors at once does not use that they are triangular.
+        root = np.stack([dtrtri(factor.T)[0].T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)
 
     @cached_property
