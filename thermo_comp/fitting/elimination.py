@@ -195,18 +195,17 @@ class Reduced:
         (n + 1, 3 m).
         """
         layout, turned = self.layout, self.positions.turned
-        n_local, r = layout.of_axis.shape[1], layout.start.shape[1]
-        n_positions, _, m, _ = rows.shape
-        own = np.zeros((n_positions, turned.shape[1], m, 3))
-        starts = np.zeros((n_positions, r, m, 3))
+        n_positions, n_own, _ = turned.shape
+        n_local, r, m = layout.n_local, layout.start.shape[1], rows.shape[2]
+        local = np.zeros((n_positions, n_own + r, m, 3))
         unit = np.zeros((layout.n_unit + 1, m, 3))
-        for axis in range(3):
+        for axis, at in enumerate(layout.columns):
             each = np.swapaxes(rows[:, axis], 1, 2)
-            own[..., axis][:, layout.of_axis[axis]] = each[:, :n_local]
-            starts[..., axis] = each[:, n_local : n_local + r]
-            unit[layout.unit[axis], :, axis] = each[:, n_local + r :].sum(axis=0)
-        own = self.positions.root @ own.reshape(n_positions, -1, 3 * m)
-        starts = starts.reshape(n_positions, r, 3 * m) - np.swapaxes(turned[..., :r], 1, 2) @ own
+            local[..., axis][:, at[:n_local]] = each[:, :n_local]
+            unit[layout.unit[axis], :, axis] = each[:, n_local:].sum(axis=0)
+        local = local.reshape(n_positions, n_own + r, 3 * m)
+        own = self.positions.root @ local[:, :n_own]
+        starts = local[:, n_own:] - np.swapaxes(turned[..., :r], 1, 2) @ own
         of_bags = self.bags.root @ np.tensordot(_membership(layout), starts, 1)
         cross = unit.reshape(-1, 3 * m)
         cross -= _summed(turned[..., r:], own) + _summed(self.bags.turned, of_bags)
@@ -222,23 +221,23 @@ def eliminate(normal: Floats, layout: Layout, precision: Floats, away: Floats) -
     precision, away: inverse prior variances, and values less prior means, shape (n,)
     """
     n_positions, n_own = layout.own.shape
-    r, n_local = layout.start.shape[1], layout.of_axis.shape[1]
-    rows = np.zeros((n_positions, n_own, n_own + r + layout.n_unit + 1))
-    starts = np.zeros((n_positions, r, r + layout.n_unit + 1))
-    for axis, (own, columns) in enumerate(zip(layout.of_axis, layout.columns, strict=True)):
-        rows[:, own[:, None], columns] += normal[:, axis, :n_local]
-        if r:
-            of_starts = normal[:, axis, n_local : n_local + r, n_local:]
-            starts[:, :, columns[n_local:] - n_own] += of_starts
-    block, cross = rows[..., :n_own], rows[..., n_own:]
+    r, n_local = layout.start.shape[1], layout.n_local
+    rows = np.zeros((n_positions, n_own + r, n_own + r + layout.n_unit + 1))
+    for axis, at in enumerate(layout.columns):
+        rows[:, at[:n_local, None], at] += normal[:, axis, :n_local]
+    block, cross, starts = (
+        rows[:, :n_own, :n_own],
+        rows[:, :n_own, n_own:],
+        rows[:, n_own:, n_own:],
+    )
     every = np.arange(n_own)
     block[:, every, every] += precision[layout.own]
     cross[..., -1] -= (precision * away)[layout.own]
     # Attitudes without any information keep their value.
     block[:, every, every] += np.einsum('pii->pi', block) <= 0.0
     positions = Blocks.of(block, cross)
-    diagonal = np.einsum('pii->pi', starts[..., :r]).copy()
-    starts -= np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned
+    diagonal = np.einsum('pii->pi', starts[..., :r])
+    starts = starts - np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned
     shares, prior = (starts, diagonal), np.stack((precision, precision * away))[:, layout.start]
     bags = _of_bags(_membership(layout), shares, prior)
     matrix = _of_unit(normal.sum(axis=0), layout) - positions.square(r) - bags.square()

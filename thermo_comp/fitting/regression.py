@@ -262,8 +262,9 @@ class Regression(Equations):
 def _held(normal: Floats, layout: Layout) -> Floats:
     """Damp the nonlinear unknowns in normal equations."""
     result: Floats = normal.copy()
-    r, first, end = layout.start.shape[1], layout.of_axis.shape[1], normal.shape[-1] - 1
-    turned = [*range(2 + layout.stretch.shape[1]), *range(first, first + r + 1)]
-    at = [*turned, *range(end - len(layout.shared), end)]
+    directions = range(2 + layout.stretch.shape[1])
+    starts_and_kappa = range(layout.of_axis.shape[1], layout.n_local + 1)
+    end = normal.shape[-1] - 1
+    at = [*directions, *starts_and_kappa, *range(end - len(layout.shared), end)]
     result[..., at, at] *= 1e9
     return result

@@ -256,6 +256,11 @@ class Layout:
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 
+    @property
+    def n_local(self) -> int:
+        """Number of unknowns of each axis that are not the unit's."""
+        return len(self.of_axis[0]) + len(self.start[0])
+
     @cached_property
     def of_axis(self) -> Ints:
         """The unknowns of a position that each axis has, as places in `own`, shape (3, k)."""

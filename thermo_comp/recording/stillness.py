@@ -289,10 +289,9 @@ def still_runs(
         is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
         broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
         # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.
-        moved = ~quiet
-        near = moved.copy()
-        near[1:] |= moved[:-1] | broken
-        near[:-1] |= moved[1:] | broken
+        near = ~quiet
+        near[1:] |= ~quiet[:-1] | broken
+        near[:-1] |= ~quiet[1:] | broken
         edges = np.flatnonzero(np.diff(np.concatenate(([0], (~near).astype(np.int8), [0]))))
         result.append(list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)))
     return result
