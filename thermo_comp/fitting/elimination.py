@@ -10,7 +10,6 @@ unit remain.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +17,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrs, dtrtri
 
 from ..typing import Floats
+from .tangent import Normal
 from .unknowns import Layout
 
 # Relative jitters of a matrix that rounding may have made indefinite; they add up.
@@ -104,7 +104,8 @@ class Blocks:
         Return what the elimination subtracts from the normal equations of the remaining unknowns
         from the `first` on.
         """
-        return _summed(self.turned[..., first:], self.turned[..., first:])
+        flat = self.turned[..., first:].reshape(-1, self.turned.shape[2] - first)
+        return np.asarray(flat.T @ flat)
 
 
 @dataclass(frozen=True)
@@ -174,16 +175,19 @@ class Reduced:
         own += _variance(solved[..., r:-1] - by_starts @ by_unit[bag], covariance)
         return own, starts
 
-    def without_each(self, normal: Floats) -> Iterator[Floats]:
-        """Yield `whole` without each position in turn, given the normal equations."""
-        bag, whole, r = self.layout.bag, self.whole, len(self.bags.root[0])
+    @cached_property
+    def _rest(self) -> Blocks:
+        """The block of each position's bag without this position."""
+        bag = self.layout.bag
         others = (bag[:, None] == bag) - np.eye(len(bag))
-        rest = _of_bags(others, self.shares, self.starts_prior[:, bag])
-        for p, own in enumerate(normal):
-            turned = self.positions.turned[p, :, r:]
-            before, after = self.bags.turned[bag[p]], rest.turned[p]
-            gone = _of_unit(own, self.layout) - turned.T @ turned
-            yield whole - gone + before.T @ before - after.T @ after
+        return _of_bags(others, self.shares, self.starts_prior[:, bag])
+
+    def without(self, p: int, own: Normal) -> Floats:
+        """Return `whole` without a position, given the normal equations of this position."""
+        turned = self.positions.turned[p, :, len(self.bags.root[0]) :]
+        before, after = self.bags.turned[self.layout.bag[p]], self._rest.turned[p]
+        gone = _of_unit(own.unit, self.layout) - turned.T @ turned
+        return np.asarray(self.whole - gone + before.T @ before - after.T @ after)
 
     def beside(self, rows: Floats) -> tuple[Floats, Floats]:
         """
@@ -209,22 +213,22 @@ class Reduced:
         of_bags = self.bags.root @ np.tensordot(_membership(layout), starts, 1)
         cross = unit.reshape(-1, 3 * m)
         cross -= _summed(turned[..., r:], own) + _summed(self.bags.turned, of_bags)
-        return _summed(own, own) + _summed(of_bags, of_bags), cross
+        gone = Blocks(self.positions.root, own).square() + Blocks(self.bags.root, of_bags).square()
+        return gone, cross
 
 
-def eliminate(normal: Floats, layout: Layout, precision: Floats, away: Floats) -> Reduced:
+def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -> Reduced:
     """
     Eliminate the unknowns of positions and bags.
 
-    normal: the normal equations of each position and axis, see `Tangent.normal`, in units of the
-        noise
+    normal: the normal equations in units of the noise
     precision, away: inverse prior variances, and values less prior means, shape (n,)
     """
     n_positions, n_own = layout.own.shape
     r, n_local = layout.start.shape[1], layout.n_local
     rows = np.zeros((n_positions, n_own + r, n_own + r + layout.n_unit + 1))
     for axis, at in enumerate(layout.columns):
-        rows[:, at[:n_local, None], at] += normal[:, axis, :n_local]
+        rows[:, at[:n_local, None], at] += normal.local[:, axis]
     block, cross, starts = (
         rows[:, :n_own, :n_own],
         rows[:, :n_own, n_own:],
@@ -240,7 +244,7 @@ def eliminate(normal: Floats, layout: Layout, precision: Floats, away: Floats) -
     starts = starts - np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned
     shares, prior = (starts, diagonal), np.stack((precision, precision * away))[:, layout.start]
     bags = _of_bags(_membership(layout), shares, prior)
-    matrix = _of_unit(normal.sum(axis=0), layout) - positions.square(r) - bags.square()
+    matrix = _of_unit(normal.unit, layout) - positions.square(r) - bags.square()
     return Reduced(layout, prior, matrix, positions, shares, bags)
 
 
@@ -250,11 +254,10 @@ def _membership(layout: Layout) -> Floats:
 
 
 def _of_unit(normal: Floats, layout: Layout) -> Floats:
-    """Return the part of the unit in normal equations of the axes, (3, k + 1, k + 1)."""
+    """Arrange the equations of the unit's unknowns of each axis, shape (3, k, k)."""
     result = np.zeros((layout.n_unit + 1, layout.n_unit + 1))
-    first = normal.shape[-1] - layout.unit.shape[1]
     for own, at in zip(normal, layout.unit, strict=True):
-        result[at[:, None], at] += own[first:, first:]
+        result[at[:, None], at] += own
     return result
 
 

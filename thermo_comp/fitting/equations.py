@@ -160,7 +160,9 @@ class Equations(Series):
         for at, value in unknowns:
             factor[..., first : first + len(at)] = value
             first += len(at)
-        return Tangent(self._combined(state, base, n_starts), place, factor)
+        combined = self._combined(state, base, n_starts)
+        n_bias, n_scale = 1 + len(in_bias), len(in_scale)
+        return Tangent(combined, place, factor, layout.n_local, n_bias, n_scale, read)
 
     def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
         """

@@ -139,8 +139,7 @@ def _by_positions(
     """Leave out each position; return folds of drift and norm, corrected windows and drift."""
     windows, state, layout = regression.windows, posterior.state, posterior.layout
     products = regression.products(layout.used)
-    tangent, normal = regression.linearised(state, layout, products.whole)
-    reduced = regression.reduce(normal, prior, layout, state)
+    tangent, _ = regression.linearised(state, layout, products.whole)
     means = tangent.of(regression.at_starts(products.means[:, None], state, products.base))
     n_positions = windows.n_positions
     edges = np.searchsorted(windows.position, np.arange(n_positions + 1))
@@ -149,8 +148,8 @@ def _by_positions(
     sizes = regression.norms(state)
     drift = np.full_like(force, np.nan)
     squares, norms = np.full(n_positions, np.nan), np.full(n_positions, np.nan)
-    in_sigmas = normal / (prior.sigma**2)[:, None, None]
-    for p, matrix in enumerate(reduced.without_each(in_sigmas) if n_positions > 1 else ()):
+    matrices = regression.without_each(state, prior, layout) if n_positions > 1 else ()
+    for p, matrix in enumerate(matrices):
         rows = slice(edges[p], edges[p + 1])
         moved, covariance = _refitted(regression, posterior, prior, matrix)
         own = regression.force(moved, rows)

@@ -16,6 +16,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,7 @@ from .elimination import Reduced, eliminate, factored, inverse_of, solved
 from .equations import Equations, moved_by, without_inactive
 from .inactive import Inactive
 from .last_result import last_result_kept
-from .tangent import Tangent
+from .tangent import Normal, Tangent
 from .unknowns import Layout, Prior, State
 
 # Prior sd of the mean over all bags of the initial lag states, over that of one bag. A non-zero
@@ -65,24 +66,34 @@ class Regression(Equations):
     """Gauss-Newton on the measurement equations; see `Equations` for the parameters."""
 
     @last_result_kept
-    def linearised(self, state: State, layout: Layout, grams: Floats) -> tuple[Tangent, Floats]:
+    def linearised(self, state: State, layout: Layout, grams: Floats) -> tuple[Tangent, Normal]:
         """
         Return the equations linearised about a state, and the normal equations for products of the
-        base series in each position, see `Tangent.normal`.
+        base series in each position.
         """
         base = self.products(layout.used).base
         tangent = self.tangent(state, layout, base)
         return tangent, tangent.normal(self.products_at(grams, state, base))
 
-    def reduce(self, normal: Floats, prior: Prior, layout: Layout, state: State) -> Reduced:
+    def reduce(self, normal: Normal, prior: Prior, layout: Layout, state: State) -> Reduced:
         """Eliminate the unknowns of positions and bags from normal equations."""
-        in_sigmas = normal * (prior.sigma**-2.0)[:, None, None]
+        in_sigmas = normal.scaled(prior.sigma**-2.0)
         precision, away = self.precision(prior, layout), self.away(state, prior, layout)
         reduced = eliminate(in_sigmas, layout, precision, away)
         if self.n_bags > 1 and layout.start.size:
             variance = (_COMMON_START * self.n_bags) ** 2 * prior.start_share
             reduced = reduced.with_prior_of_sum(state.start.sum(axis=0), variance)
         return reduced
+
+    def without_each(self, state: State, prior: Prior, layout: Layout) -> Iterator[Floats]:
+        """Yield the normal equations of the unit without each position in turn."""
+        products = self.products(layout.used)
+        tangent, normal = self.linearised(state, layout, products.whole)
+        reduced = self.reduce(normal, prior, layout, state)
+        at_state = self.products_at(products.whole, state, products.base)
+        for p in range(self.windows.n_positions):
+            own = tangent.at(p).normal(at_state[[p]])
+            yield reduced.without(p, own.scaled(prior.sigma**-2.0))
 
     def unit_step(
         self, matrix: Floats, prior: Prior, layout: Layout, state: State
@@ -135,7 +146,7 @@ class Regression(Equations):
     def _square(self, state: State, layout: Layout, grams: Floats) -> Floats:
         """Return the sum of squares of the whitened residuals of each axis, shape (3,)."""
         _, normal = self.linearised(state, layout, grams)
-        return np.asarray(np.maximum(normal[:, :, -1, -1].sum(axis=0), 0.0))
+        return normal.square
 
     def _size(self, square: Floats, prior: Prior) -> float:
         n = len(self.weight)
@@ -259,12 +270,12 @@ class Regression(Equations):
         return Inactive(part, column, S, cross[n] - cross[:n].T @ step)
 
 
-def _held(normal: Floats, layout: Layout) -> Floats:
+def _held(normal: Normal, layout: Layout) -> Normal:
     """Damp the nonlinear unknowns in normal equations."""
-    result: Floats = normal.copy()
-    directions = range(2 + layout.stretch.shape[1])
-    starts_and_kappa = range(layout.of_axis.shape[1], layout.n_local + 1)
-    end = normal.shape[-1] - 1
-    at = [*directions, *starts_and_kappa, *range(end - len(layout.shared), end)]
-    result[..., at, at] *= 1e9
-    return result
+    local, unit = normal.local.copy(), normal.unit.copy()
+    at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
+    local[..., at, at] *= 1e9
+    end = unit.shape[-1] - 1
+    at = [0, *range(end - len(layout.shared), end)]
+    unit[..., at, at] *= 1e9
+    return Normal(local, unit)

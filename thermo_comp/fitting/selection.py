@@ -369,7 +369,9 @@ def _likelier(fits: Sequence[Trial]) -> Trial:
     """
     small, *others = fits
     for large in others:
-        gain = log_density(large.posterior, large.prior) - log_density(small.posterior, small.prior)
+        gain = log_density(large.posterior, large.prior) - log_density(
+            small.posterior, small.prior
+        )
         is_likelier = gain > TRIAL_GAIN and not is_better(large.score, small.score)
         if is_likelier or is_better(small.score, large.score):
             return large
