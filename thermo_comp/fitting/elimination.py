@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrs, dtrtri
 
 from ..typing import Floats
@@ -58,10 +59,12 @@ def solved(factor: Floats, right: Floats) -> Floats:
     return np.asarray(dpotrs(factor.T, right)[0])
 
 
-def inverse_of(factor: Floats) -> Floats:
-    """Return the inverse of the matrix with a lower Cholesky factor, shape (n, n)."""
-    upper, _ = dtrtri(factor.T)
-    return np.asarray(upper @ upper.T)
+def inverse_root(factor: Floats) -> Floats:
+    """
+    Return the upper triangular root of the inverse of a matrix, ``root @ root.T``, given the lower
+    Cholesky factor of the matrix, shape (n, n).
+    """
+    return np.asarray(dtrtri(factor.T)[0])
 
 
 @dataclass(frozen=True)
@@ -162,17 +165,17 @@ class Reduced:
         own -= np.einsum('pkr,pr->pk', solved[..., :r], starts[self.layout.bag])
         return own, starts
 
-    def variances(self, covariance: Floats) -> tuple[Floats, Floats]:
+    def variances(self, root: Floats) -> tuple[Floats, Floats]:
         """
-        Return the variances of the unknowns of positions and bags, given the covariance of the
-        unit's, without the prior on the sum of the initial lag states.
+        Return the variances of the unknowns of positions and bags, given an upper triangular root
+        of the covariance of the unit's, without the prior on the sum of the initial lag states.
         """
         bag, r, solved = self.layout.bag, len(self.bags.root[0]), self.positions.solved
-        by_unit, inverse = self.bags.solved[..., :-1], self.bags.inverse
-        starts = np.einsum('bii->bi', inverse) + _variance(by_unit, covariance)
-        by_starts = solved[..., :r]
-        own = np.sum(self.positions.root**2, axis=1) + _variance(by_starts, inverse[bag])
-        own += _variance(solved[..., r:-1] - by_starts @ by_unit[bag], covariance)
+        by_unit, by_starts = self.bags.solved[..., :-1], solved[..., :r]
+        starts = np.sum(self.bags.root**2, axis=1) + _variance(by_unit, root)
+        of_starts = by_starts @ np.swapaxes(self.bags.root[bag], 1, 2)
+        own = np.sum(self.positions.root**2, axis=1) + np.sum(of_starts**2, axis=2)
+        own += _variance(solved[..., r:-1] - by_starts @ by_unit[bag], root)
         return own, starts
 
     @cached_property
@@ -273,9 +276,11 @@ def _of_bags(among: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blo
     return Blocks.of(block, cross, diagonals + prior[0])
 
 
-def _variance(derivatives: Floats, covariance: Floats) -> Floats:
-    """Return the variance of each row of derivatives, shape (n, k)."""
-    return np.asarray(np.sum((derivatives @ covariance) * derivatives, axis=-1))
+def _variance(derivatives: Floats, root: Floats) -> Floats:
+    """Return the variances of linear functions of the unit's unknowns, shape (n, k)."""
+    rows = derivatives.reshape(-1, len(root))
+    turned = dtrmm(1.0, root, rows.T, trans_a=True)
+    return np.asarray(np.sum(turned**2, axis=0).reshape(derivatives.shape[:2]))
 
 
 def _summed(left: Floats, right: Floats) -> Floats:

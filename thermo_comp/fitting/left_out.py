@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..typing import Floats, Ints
-from .elimination import inverse_of
+from .elimination import inverse_root
 from .equations import moved_by
 from .regression import Posterior, Regression
 from .unknowns import Prior, State
@@ -151,17 +151,17 @@ def _by_positions(
     matrices = regression.without_each(state, prior, layout) if n_positions > 1 else ()
     for p, matrix in enumerate(matrices):
         rows = slice(edges[p], edges[p + 1])
-        moved, covariance = _refitted(regression, posterior, prior, matrix)
+        moved, root = _refitted(regression, posterior, prior, matrix)
         own = regression.force(moved, rows)
         weight = share[rows]
         level = np.average(own, axis=0, weights=weight)
         away = own - level
-        is_known = _is_drift_determined(regression, posterior, prior, covariance, rows)
+        is_known = _is_drift_determined(regression, posterior, prior, root, rows)
         if rows.stop - rows.start >= _FEWEST_WINDOWS and is_known:
             drift[rows] = away
             square = np.mean(away**2, axis=1)
             squares[p] = np.average(square, weights=weight)
-        if _is_norm_determined(regression, posterior, prior, means[p, :, 0], covariance, p):
+        if _is_norm_determined(regression, posterior, prior, means[p, :, 0], root, p):
             force[rows] = own
             error = np.linalg.norm(own, axis=1) - sizes[p]
             norms[p] = np.average(error**2, weights=weight)
@@ -171,18 +171,21 @@ def _by_positions(
 def _refitted(
     regression: Regression, posterior: Posterior, prior: Prior, matrix: Floats
 ) -> tuple[State, Floats]:
-    """Return state and covariance of a fit with other normal equations, to first order."""
+    """
+    Return the state of a fit with other normal equations, to first order, and the root of its
+    covariance, see `Posterior`.
+    """
     state, layout = posterior.state, posterior.layout
     step, factor = regression.unit_step(matrix, prior, layout, state)
     whole = np.zeros(layout.n)
     whole[: layout.n_unit] = step
-    return moved_by(state, whole, layout), inverse_of(factor)
+    return moved_by(state, whole, layout), inverse_root(factor)
 
 
 def _is_drift_determined(
-    regression: Regression, posterior: Posterior, prior: Prior, covariance: Floats, rows: slice
+    regression: Regression, posterior: Posterior, prior: Prior, root: Floats, rows: slice
 ) -> bool:
-    """Whether `covariance`, that without this position, determines its drift."""
+    """Whether a fit without this position, with this root, determines its drift."""
     state, layout = posterior.state, posterior.layout
     in_bias, in_scale = layout.used
     if not in_bias.any():
@@ -196,24 +199,18 @@ def _is_drift_determined(
     for axis in range(3):
         along = np.hstack((some[:, in_bias], force[axis] * some[:, in_scale]))
         at = layout.axis[axis, 2 : 2 + along.shape[1]]
-        where = np.ix_(at, at)
-        by_others += float(np.sum((along @ covariance[where]) * along))
-        everything += float(np.sum((along @ posterior.covariance[where]) * along))
+        by_others += float(np.sum((along @ root[at]) ** 2))
+        everything += float(np.sum((along @ posterior.root[at]) ** 2))
     noise = float(np.sum(prior.sigma**2)) * len(some)
     return by_others < _VARIANCE_RATIO * (everything + noise)
 
 
 def _is_norm_determined(
-    regression: Regression,
-    posterior: Posterior,
-    prior: Prior,
-    means: Floats,
-    covariance: Floats,
-    p: int,
+    regression: Regression, posterior: Posterior, prior: Prior, means: Floats, root: Floats, p: int
 ) -> bool:
     """
-    Whether `covariance`, that without this position, determines its norm; `means`: derivatives of
-    its mean reading, see `Tangent.of`.
+    Whether a fit without this position, with this root, determines its norm; `means`: derivatives
+    of its mean reading, see `Tangent.of`.
     """
     if not regression.gravity:
         return False
@@ -223,8 +220,8 @@ def _is_norm_determined(
     for axis in range(3):
         places = layout.unit[axis, :-1]
         along[places] += on_axes[axis] * means[axis, -1 - len(places) : -1]
-    everything = along @ posterior.covariance @ along + prior.offset_sd**2
-    return bool(along @ covariance @ along < _VARIANCE_RATIO * everything)
+    everything = float(np.sum((along @ posterior.root) ** 2)) + prior.offset_sd**2
+    return float(np.sum((along @ root) ** 2)) < _VARIANCE_RATIO * everything
 
 
 def _by_sections(

@@ -18,12 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats
-from .elimination import Reduced, eliminate, factored, inverse_of, solved
+from .elimination import Reduced, eliminate, factored, inverse_root, solved
 from .equations import Equations, moved_by, without_inactive
 from .inactive import Inactive
 from .last_result import last_result_kept
@@ -41,7 +42,7 @@ class Posterior:
     The Gaussian approximation of the posterior at its mode.
 
     determined: effective parameters of each unknown (MacKay's gamma), 0 .. 1, shape (n,)
-    covariance: covariance of the unit's unknowns, shape (n_unit, n_unit)
+    root: root of the covariance of the unit's unknowns, ``root @ root.T``, (n_unit, n_unit)
     variance: variances of all unknowns, shape (n,)
     square: sum of squares of the whitened residuals of each axis, shape (3,) [(m/s^2)^2]
     log_evidence: logarithm of the marginal likelihood, without a constant of the data
@@ -50,10 +51,15 @@ class Posterior:
     state: State
     layout: Layout
     determined: Floats
-    covariance: Floats
+    root: Floats
     variance: Floats
     square: Floats
     log_evidence: float
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Covariance of the unit's unknowns, shape (n_unit, n_unit)."""
+        return np.asarray(self.root @ self.root.T)
 
     @property
     def effective_parameters(self) -> Floats:
@@ -224,25 +230,25 @@ class Regression(Equations):
         factor: Floats,
         square: Floats,
     ) -> Posterior:
-        n, covariance = layout.n_unit, inverse_of(factor)
+        n, own_root = layout.n_unit, inverse_root(factor)
         precision = self.precision(prior, layout)
         everything = np.empty(layout.n)
-        everything[:n] = np.diag(covariance)
-        everything[layout.own], everything[layout.start] = reduced.variances(covariance)
+        everything[:n] = np.sum(own_root**2, axis=1)
+        everything[layout.own], everything[layout.start] = reduced.variances(own_root)
         determined = 1.0 - precision * everything
         of_prior = float(np.log(precision[n:][precision[n:] > 0.0]).sum())
         if prior.informative is None:
             of_prior += float(np.log(precision[:n]).sum())
         else:
             root = prior.informative.root
-            determined[:n] = 1.0 - np.sum(root * (root @ covariance), axis=0)
+            determined[:n] = 1.0 - np.sum(root * (root @ own_root @ own_root.T), axis=0)
             of_prior += 2.0 * float(np.log(np.diag(root)).sum())
         if reduced.common is not None:
             of_prior += layout.start.shape[1] * float(np.log(prior.start_share))
         log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
         size = self._size(square, prior) + self._away(state, prior, layout)
         evidence = -0.5 * (size + log_hessian - of_prior)
-        return Posterior(state, layout, determined, covariance, everything, square, evidence)
+        return Posterior(state, layout, determined, own_root, everything, square, evidence)
 
     def inactive(self, posterior: Posterior, prior: Prior, asked: Bools) -> Inactive:
         """Return sparsity and quality factors of inactive columns, (m,), at the mode."""
