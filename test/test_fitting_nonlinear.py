@@ -90,21 +90,22 @@ def test_derivatives_are_those_of_differences(rng):
     used = np.zeros((2, 6), dtype=bool)
     used[:, 0] = True
     regression.whiten(prior_of(Truth()).noise)
-    layout, products = regression.layout(used), regression.products(used)
-    tangent = regression.tangent(state, layout, products)
+    layout, base = regression.layout(used), regression.products(used).base
+    every = np.broadcast_to(np.eye(base.size), (24, base.size, base.size))
+    derivatives = regression.tangent(state, layout, base).of(every)
     for p in (1, 3):
         for axis in range(3):
-            places = [*layout.axis[axis], *layout.shared, *regression._local(layout, p, axis)]
-            assert len(places) == tangent.derivatives.shape[-1]
+            places = [*layout.own[p, layout.of_axis[axis]], *layout.unit[axis, :-1]]
+            assert len(places) == derivatives.shape[-1] - 1
             for column, place in enumerate(places):
                 step = np.zeros(layout.n)
                 step[place] = 1e-6
                 above, below = (
-                    regression.misfit(moved_by(state, sign * step, layout), products)[p, axis]
+                    regression.misfit(moved_by(state, sign * step, layout), base)[p, axis]
                     for sign in (1.0, -1.0)
                 )
                 expected = (below - above) / 2e-6
-                found = tangent.derivatives[p, axis, :, column]
+                found = derivatives[p, axis, :, column]
                 # Rounding of 1e-14 over 1e-6 of forces up to 95 m/s^2, and of cubes.
                 scale = np.abs(expected).max()
                 np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)

@@ -26,6 +26,7 @@ from fitting_truth import (
 from scipy.optimize import least_squares
 
 from thermo_comp.errors import FitError
+from thermo_comp.fitting.elimination import factored
 from thermo_comp.fitting.left_out import score_of
 from thermo_comp.fitting.regression import Posterior, Regression
 from thermo_comp.fitting.start import constant_calibration
@@ -109,14 +110,17 @@ class Dense:
         return np.column_stack(columns)
 
 
-@pytest.fixture(scope='module')
-def solved() -> tuple[Regression, Prior, Posterior]:
+@pytest.fixture(scope='module', params=[1, 4], ids=['a position per bag', 'up to 4'])
+def solved(request: pytest.FixtureRequest) -> tuple[Regression, Prior, Posterior]:
     rng = np.random.default_rng(5)
+    # The table draws a start for each position, but those of one bag have a common start: 0.
     truth = Truth(
-        start_sd=0.5, noise=Noise(4.0, 2000.0), offset_sd=2.0 * MICRO, tilt_sd=5e-6
+        start_sd=0.5 if request.param == 1 else 0.0, noise=Noise(4.0, 2000.0),
+        offset_sd=2.0 * MICRO, tilt_sd=5e-6,
     )  # fmt: skip
     windows, up = table_of(truth, 10, rng, n_windows=12, step_s=400.0)
-    windows = replace(windows, weight=rng.uniform(0.3, 1.0, len(windows.time)))
+    weight = rng.uniform(0.3, 1.0, len(windows.time))
+    windows = replace(windows, weight=weight, bag=windows.position // request.param)
     regression, state = begin(windows, up)
     prior = prior_of(truth, start_share=0.7)
     return regression, prior, mode_of(regression, state, prior)
@@ -401,6 +405,19 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise: Noise) -> None:
     assert np.array(GROUPS)[chosen].tolist() == ['board'] * (np.array(GROUPS) == 'board').sum()
     assert inactive.chosen(wide, asked, 4.0, 1).sum() == 1
     assert not inactive.chosen(wide, asked, 1e9, 9).any()
+
+
+def test_only_the_matrix_that_rounding_made_indefinite_gets_more_jitter(
+    rng: np.random.Generator,
+) -> None:
+    root = rng.standard_normal((3, 3))
+    good, bad = root @ root.T, np.ones((3, 3)) - 1e-10 * np.eye(3)
+    found = factored(np.stack((good, bad)))
+    np.testing.assert_array_equal(found[0], factored(good))
+    np.testing.assert_allclose(found[0] @ found[0].T, good, rtol=1e-11)
+    np.testing.assert_allclose(found[1] @ found[1].T, bad, atol=2e-9)
+    with pytest.raises(np.linalg.LinAlgError):
+        factored(np.stack((good, bad - 0.5 * np.eye(3))))
 
 
 def test_tangent_basis_is_orthonormal(rng: np.random.Generator) -> None:

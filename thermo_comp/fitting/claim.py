@@ -106,10 +106,9 @@ def _with_unseen(
     """
     groups = np.array(regression.windows.groups)
     inactive = regression.inactive(posterior, prior, np.isin(groups, LAGS) & typical.any(axis=0))
-    k = len(inactive.columns)
-    seen = np.diag(inactive.S).reshape(2, k, 3).mean(axis=2)
+    seen = np.diag(inactive.S).reshape(-1, 3).mean(axis=1)
     sd = np.zeros_like(typical)
-    sd[:, inactive.columns] = 1.0 / np.sqrt(np.maximum(seen, 1e-300))
+    sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(seen, 1e-300))
     for group in LAGS:
         # The lags of a group share one prior variance: their sum is bounded by that of one lag.
         own = np.isin(groups, group) & (sd > 0.0)

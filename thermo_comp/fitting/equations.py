@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the linearised measurement equation of the windows, and its products over the windows.
+Owns the measurement equation of the windows, and its linearisation.
 
 Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
 
@@ -10,77 +10,46 @@ Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
 
 B and S are columns of one table (`unit.columns`), each divided by its RMS. With g = 0 this is the
 equation of an angular rate: b, B beta and o_p remain. If |f| differs between positions it replaces
-g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added (`forces`).
-All terms are linear combinations of a few base series (1, columns, their derivatives by the
-initial lag states, t, temperatures of the support, the measured values). The products of the
-whitened base series of each position and section are therefore sufficient for the regression.
+g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added (`forces`). The terms
+are linear combinations of the base series of the windows (`series`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
-from .forces import Forces
-from .noise import Whitener
-from .unknowns import Layout, Noise, Prior, State, Windows, lay_out
+from .last_result import last_result_kept
+from .series import Base, Series
+from .tangent import Tangent
+from .unknowns import Layout, Prior, State, Windows, lay_out
 
 #: Row and column of the unknown elements of M^-1.
 MISALIGNMENT_ROWS = ((1, 0), (2, 0), (2, 1))
 
 
-@dataclass(frozen=True)
-class Products:
+class Effects(NamedTuple):
     """
-    Products of the base series of the columns in use.
+    The effect of a state at the reference temperature.
 
-    columns: the columns in use; moved: those of them with a lag; lag: number of that lag
-    means: mean of the base series in each position, shape (n_positions, n_base)
-    cells: products in each position and section, shape (n_cells, n_base, n_base)
-    first: first cell of each position; section: section of each cell
-    """
-
-    columns: Ints
-    moved: Ints
-    lag: Ints
-    means: Floats
-    cells: Floats
-    first: Ints
-    section: Ints
-
-    @cached_property
-    def whole(self) -> Floats:
-        """Products of each position, shape (n_positions, n_base, n_base)."""
-        return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
-
-    def without(self, sections: Ints) -> Floats:
-        """Products of each position without some sections, of the same shape as `whole`."""
-        result: Floats = self.whole.copy()
-        position = np.cumsum(np.isin(np.arange(len(self.cells)), self.first)) - 1
-        gone = np.isin(self.section, sections)
-        np.subtract.at(result, position[gone], self.cells[gone])
-        return result
-
-
-@dataclass(frozen=True)
-class Tangent:
-    """
-    The equations linearised about a state, as coefficients of the base series.
-
-    derivatives: derivatives by the unknowns, shape (n_positions, 3, n_base, n_unknowns); the
-        unknowns of an axis are kappa, bias, weights, nonlinear coefficients, radius, misalignment
-        (3), up (2), stretch, offset, tilts, initial lag states
-    residual: measured minus predicted, shape (n_positions, 3, n_base)
+    force: specific force along each axis in each position, shape (n_positions, 3)
+    across: derivative of the reading by a rotation of the attitude, shape (n_positions, 3, 2)
+    read: reading without the bias, shape (n_positions, 3)
+    bends: sums of the nonlinear terms at the reference and per kelvin, shape (2, n_positions, 3)
+    slopes: their derivatives by the force, of the same shape
     """
 
-    derivatives: Floats
-    residual: Floats
+    force: Floats
+    across: Floats
+    read: Floats
+    bends: Floats
+    slopes: Floats
 
 
-class Equations:
+class Equations(Series):
     """
     The measurement equations of a fit.
 
@@ -90,36 +59,11 @@ class Equations:
     """
 
     def __init__(self, windows: Windows, gravity: float, nominal_scale: Floats) -> None:
-        self.windows = windows
         self.gravity = gravity
         self.forces = windows.forces if gravity else None
-        self._t = np.zeros((len(windows.time), 0))
-        if self.forces is not None:
-            self._t = self.forces.t[:, None]
-        self.nominal_scale = nominal_scale
-        self.measured = windows.mean / nominal_scale
-        self.rms = np.sqrt(np.mean(windows.columns**2, axis=0))
-        self.rms[self.rms == 0.0] = 1.0
-        self.columns = windows.columns / self.rms
-        self.bag_of_position = windows.bag_of_position
-        self.n_bags = int(windows.bag.max()) + 1
-        # Derivatives below 1e-9 are set to 0, because arithmetic with denormal numbers is slow.
-        self._starts = np.where(np.abs(windows.start) < 1e-9, 0.0, windows.start) / self.rms
-        values, vectors = np.linalg.eigh(windows.start_covariance)
-        # The initial lag states are strongly correlated: few components have nearly all variance.
-        kept = values > 1e-6 * values.max(initial=0.0)
-        #: Initial lag states are this times standardised components, shape (n_lags, r).
-        self.start_root = vectors[:, kept] * np.sqrt(values[kept])
-        first = np.searchsorted(windows.position, np.arange(windows.n_positions))
-        level = np.add.reduceat(self.measured, first, axis=0)
-        level /= np.diff(np.append(first, len(windows.position)))[:, None]
-        self.level = level
-        self._centred = self.measured - level[windows.position]
-        new_cell = np.diff(windows.position, prepend=-1) != 0
-        new_cell |= np.diff(windows.section, prepend=-1) != 0
-        self._cells = np.flatnonzero(new_cell)
-        self.whitener = Whitener(windows.position, windows.time)
-        self.reweigh(windows.weight)
+        t = np.zeros((len(windows.time), 0)) if self.forces is None else self.forces.t[:, None]
+        super().__init__(windows, nominal_scale, t)
+        self._layouts: dict[bytes, Layout] = {}
 
     def initial_state(self, bias: Floats, misalignment: Floats, up: Floats) -> State:
         """Return a state with nominal scale factors and no effect of temperature."""
@@ -145,257 +89,156 @@ class Equations:
 
     def along_axes(self, state: State) -> Floats:
         """Return the specific force along each axis in each position, shape (n_positions, 3)."""
-        return np.asarray(self._norm(state) * state.up @ state.inverse.T)
+        return self.effects(state).force
 
     def _norm(self, state: State) -> float | Floats:
         if self.forces is None:
             return self.gravity
         return np.asarray(self.forces.norms(state.radius, state.stretch)[:, None])
 
-    def reweigh(self, weight: Floats) -> None:
-        """Set the weights of the windows, shape (n,)."""
-        self.weight = weight
-        self.noise: Noise | None = None
-        self._products: tuple[Bools, Products] | None = None
-
     def layout(self, used: Bools, bends: Bools | None = None) -> Layout:
         """
-        Assign a place to every unknown.
+        Assign a place to every unknown; the same object for the same unknowns.
 
         `used`: active columns of bias and scale, shape (2, m); `bends`: active nonlinear
         coefficients, shape (2 k,); None for all
         """
         if bends is None or self.forces is None:
             bends = np.ones(2 * len(self.forces.kinds) if self.forces else 0, dtype=bool)
-        moved = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
-        return lay_out(
-            used,
-            self.bag_of_position,
-            self.windows.tilt.shape[1],
-            self.start_root.shape[1] if moved else 0,
-            bends,
-            self.forces,
-        )
-
-    def whiten(self, noise: Noise) -> None:
-        """Whiten all base series for a noise model, if the current one is another."""
-        if noise == self.noise:
-            return
-        gains = self.whitener.gains(self.weight, noise)
-        self.noise, self._products = noise, None
-        self.noise_determinant = self.whitener.log_determinant(gains)
-        one = np.ones((len(self.weight), 1))
-        others = np.hstack((one, self._t, self.windows.tilt, self._centred))
-        self._filtered_columns = self.whitener.filter(self.columns, gains)
-        self._filtered_starts = self.whitener.filter(self._starts, gains)
-        self._filtered_others = self.whitener.filter(others, gains)
-
-    def products(self, used: Bools) -> Products:
-        """Return the products of the active columns, shape (2, m), for the current noise."""
-        taken: Bools = np.any(used, axis=0)
-        if self._products is not None and np.array_equal(self._products[0], taken):
-            return self._products[1]
-        columns = np.flatnonzero(taken)
-        moved = np.flatnonzero(self.windows.lag[columns] >= 0)
-        at_start = columns[moved]
-        filtered = self._filtered_others
-        base = np.hstack(
-            (
-                filtered[:, :1],
-                self._filtered_columns[:, columns],
-                self._filtered_starts[:, at_start],
-                filtered[:, 1:],
+        key = used.tobytes() + bends.tobytes()
+        if key not in self._layouts:
+            moved = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
+            n_starts = self.start_root.shape[1] if moved else 0
+            n_tilts = self.windows.tilt.shape[1]
+            self._layouts[key] = lay_out(
+                used, self.bag_of_position, n_tilts, n_starts, bends, self.forces
             )
-        )
-        ends = np.append(self._cells[1:], len(base))
-        cells = np.stack([base[a:b].T @ base[a:b] for a, b in zip(self._cells, ends, strict=True)])
-        position = self.windows.position[self._cells]
-        plain = np.hstack(
-            (
-                np.ones((len(base), 1)),
-                self.columns[:, columns],
-                self._starts[:, at_start],
-                self._t,
-                self.windows.tilt,
-                self._centred,
-            )
-        )
-        first = np.searchsorted(self.windows.position, np.arange(self.windows.n_positions))
-        count = np.diff(np.append(first, len(base)))[:, None]
-        result = Products(
-            columns,
-            moved,
-            self.windows.lag[at_start],
-            np.add.reduceat(plain, first, axis=0) / count,
-            cells,
-            np.flatnonzero(np.diff(position, prepend=-1) != 0),
-            self.windows.section[self._cells],
-        )
-        self._products = taken, result
-        return result
+        return self._layouts[key]
 
-    def absent_products(self, absent: Ints, used: Bools, p: int) -> tuple[Floats, Floats]:
-        """Return products of inactive columns in a position: mutual, and with the active base."""
-        a, b = np.searchsorted(self.windows.position, (p, p + 1))
-        present = self.products(used)
-        own, filtered = self._filtered_columns[a:b, absent], self._filtered_others[a:b]
-        base = np.hstack(
-            (
-                filtered[:, :1],
-                self._filtered_columns[a:b, present.columns],
-                self._filtered_starts[a:b, present.columns[present.moved]],
-                filtered[:, 1:],
-            )
-        )
-        return own.T @ own, own.T @ base
-
-    def tangent(self, state: State, layout: Layout, products: Products) -> Tangent:
-        """Linearise the equations about a state."""
-        used, columns = layout.used, products.columns
-        n_positions, n_columns = self.windows.n_positions, len(columns)
-        n_tilts, n_starts = self.windows.tilt.shape[1], layout.start.shape[1]
-        n_base = products.cells.shape[1]
-        force = self.along_axes(state)
-        effect = self._effect(state, products)
-        behind = 1 + n_columns + np.arange(len(products.moved))
-        on_bias, on_scale = state.weights[:, :, columns]
-        # Per axis: factor of kappa a as a combination of the base; the first base series is 1.
-        scaled = np.swapaxes(effect @ on_scale.T, 1, 2)
-        scaled[:, :, 0] = 1.0
-        first_tilt = n_base - 3 - n_tilts
-        across = self._across(state)
-        in_bias, in_scale = (np.flatnonzero(mask[columns]) for mask in used)
-        n_linear = 2 + len(in_bias) + len(in_scale)
-        n_own = layout.axis.shape[1]
-        at, n_stretches = n_own + layout.radius.size, layout.stretch.shape[1]
-        behind_up = at + 5 + n_stretches
-        n_all = behind_up + 1 + 2 * n_tilts + n_starts
-        T = np.zeros((n_positions, 3, n_base, n_all))
-        T[..., 0] = force[:, :, None] * scaled
-        T[:, :, 0, 1] = 1.0
-        T[..., 2 : 2 + len(in_bias)] = effect[:, None, :, in_bias]
-        times = (state.kappa * (force + self._bends(state, 0)))[:, :, None, None]
-        T[..., 2 + len(in_bias) : n_linear] = times * effect[:, None, :, in_scale]
-        # Derivative of the reading by the force along its axis.
-        answers = scaled
-        if self.forces is not None:
-            answers = self._bend(self.forces, state, layout, scaled, T)
-            along = (state.kappa * force)[:, :, None] * answers
-            T[..., at + 5 : behind_up] = along[..., None]
-            if layout.radius.size:
-                T[..., n_own] = self.forces.by_radius(state.radius)[:, None, None] * along
-        for k, (row, source) in enumerate(MISALIGNMENT_ROWS):
-            turned = (self._norm(state) * state.kappa[row] * state.up)[:, source]
-            T[:, row, :, at + k] = turned[:, None] * answers[:, row]
-        T[..., at + 3 : at + 5] = across[:, :, None, :] * answers[..., None]
-        T[:, :, 0, behind_up] = 1.0
-        for k in range(n_tilts):
-            first = behind_up + 1 + 2 * k
-            T[:, :, first_tilt + k, first : first + 2] = across
-        if n_starts:
-            weight = on_bias + times[..., 0] * on_scale
-            moved = weight[:, :, products.moved, None] * self.start_root[products.lag]
-            T[:, :, behind, n_all - n_starts :] = moved
-        return Tangent(T, self.misfit(state, products))
-
-    def _bend(
-        self, forces: Forces, state: State, layout: Layout, scaled: Floats, T: Floats
-    ) -> Floats:
-        """
-        Write the derivatives by the nonlinear coefficients into T; return the derivative of the
-        readings by force, which is `scaled` plus the slope of the nonlinear terms.
-        """
-        value, slope = forces.terms(self.along_axes(state))
-        # The scale's change multiplies the terms at the reference; its product with their change
-        # per kelvin is negligible.
-        over_t = np.zeros_like(scaled)
-        over_t[:, :, -4 - self.windows.tilt.shape[1]] = 1.0
-        each = np.concatenate((value, value), axis=2)
-        result: Floats = scaled.copy()
-        k = len(forces.kinds)
-        for term, places in enumerate(layout.nonlinear.T):
-            base = scaled if term < k else over_t
-            of_axis = state.nonlinear[:, term]
-            result += (slope[..., term % k] * of_axis)[:, :, None] * base
-            T[..., 0] += (each[..., term] * of_axis)[:, :, None] * base
-            if places[0] >= 0:
-                column = np.flatnonzero(layout.axis[0] == places[0])[0]
-                T[..., column] = (state.kappa * each[..., term])[:, :, None] * base
-        return result
-
-    def _bends(self, state: State, part: int) -> Floats | float:
-        """Evaluate the nonlinear terms: at the reference (part 0), or their change per kelvin."""
+    @last_result_kept
+    def effects(self, state: State) -> Effects:
+        """Return the specific force along each axis and its nonlinear terms."""
+        force = np.asarray(self._norm(state) * state.up @ state.inverse.T)
+        turned = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
+        sizes = np.reshape(self._norm(state), (-1, 1, 1))
+        across = sizes * (state.kappa[:, None] * turned)
         if self.forces is None:
-            return 0.0
+            bends = np.zeros((2, 2, *force.shape))
+        else:
+            terms = np.stack(self.forces.terms(force))
+            bends = np.einsum('vpik,ijk->vjpi', terms, state.nonlinear.reshape(3, 2, -1))
+        return Effects(force, across, state.kappa * (force + bends[0, 0]), bends[0], bends[1])
+
+    @last_result_kept
+    def tangent(self, state: State, layout: Layout, base: Base) -> Tangent:
+        """Linearise the equations about a state."""
+        force, across, read, _, _ = self.effects(state)
+        along = (state.kappa * force)[..., None]
+        n_starts, n_stretches = layout.start.shape[1], layout.stretch.shape[1]
+        scaled, by_kappa, by_force = (base.size + k for k in range(3))
+        starts = base.size + 3 + np.arange(n_starts)
+        in_bias, in_scale = (1 + np.flatnonzero(mask[base.columns]) for mask in layout.used)
+        by_radius: Floats | float = 1.0
+        if self.forces is not None:
+            by_radius = self.forces.by_radius(state.radius)[:, None, None] * along
+        unknowns: list[tuple[Ints | list[int], Floats | float]] = [
+            ([by_force] * 2, across),
+            ([by_force] * n_stretches, along),
+            ([0], 1.0),
+            (np.repeat(base.tilts, 2), np.tile(across, base.n_tilts)),
+            (starts, 1.0),
+            ([by_kappa, 0], 1.0),
+            (in_bias, 1.0),
+            (in_scale, read[..., None]),
+            self._by_coefficients(state, layout, base, scaled),
+            ([by_force] * layout.radius.size, by_radius),
+            ([by_force] * 3, self._by_misalignment(state)),
+            ([base.size + 3 + n_starts], 1.0),
+        ]
+        place = np.array([k for at, _ in unknowns for k in at], dtype=np.int64)
+        factor, first = np.empty((*force.shape, len(place))), 0
+        for at, value in unknowns:
+            factor[..., first : first + len(at)] = value
+            first += len(at)
+        combined = self._combined(state, base, n_starts)
+        n_bias, n_scale = 1 + len(in_bias), len(in_scale)
+        return Tangent(combined, place, factor, layout.n_local, n_bias, n_scale, read)
+
+    def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
+        """
+        Return the combinations of a tangent: 1 + S s, the derivatives by kappa, by the force along
+        the axis and by the initial lag states, and the residual.
+        """
+        force, _, read, (bend, bend_by_t), (slope, slope_by_t) = self.effects(state)
+        on_bias, on_scale = state.weights[:, :, base.columns]
+        result = np.zeros((*force.shape, base.size, 4 + n_starts))
+        result[:, :, 0, :3] = 1.0
+        result[:, :, 1 : 1 + len(base.columns), :3] = on_scale[..., None]
+        result[..., 1] *= (force + bend)[..., None]
+        result[..., 2] *= (1.0 + slope)[..., None]
+        result[:, :, base.t, 1] = bend_by_t[..., None]
+        result[:, :, base.t, 2] = slope_by_t[..., None]
+        if n_starts:
+            weight = (on_bias + read[..., None] * on_scale)[..., base.moved, None]
+            result[:, :, base.at_start, 3:-1] = weight * self.start_root[base.lag]
+        result[..., -1] = self.misfit(state, base)
+        return result
+
+    def _by_coefficients(
+        self, state: State, layout: Layout, base: Base, scaled: int
+    ) -> tuple[Ints, Floats | float]:
+        """
+        Return series and factor of the active nonlinear coefficients.
+
+        The scale's change multiplies the terms at the reference; its product with their change per
+        kelvin is negligible.
+        """
+        active = np.flatnonzero(layout.nonlinear[0] >= 0)
+        if self.forces is None or not len(active):
+            return active, 1.0
         k = len(self.forces.kinds)
         value, _ = self.forces.terms(self.along_axes(state))
-        own = state.nonlinear[:, part * k : (part + 1) * k]
-        return np.asarray(np.einsum('pik,ik->pi', value, own))
+        place = np.where(active < k, scaled, base.t[0])
+        return place, state.kappa[:, None] * value[..., active % k]
 
-    def misfit(self, state: State, products: Products) -> Floats:
+    def _by_misalignment(self, state: State) -> Floats:
+        """Differentiate the force along each axis by the misalignment, times kappa, (n, 3, 3)."""
+        result = np.zeros((len(state.up), 3, len(MISALIGNMENT_ROWS)))
+        turned = self._norm(state) * state.up
+        for k, (row, source) in enumerate(MISALIGNMENT_ROWS):
+            result[:, row, k] = state.kappa[row] * turned[:, source]
+        return result
+
+    def misfit(self, state: State, base: Base) -> Floats:
         """Measured minus predicted as combinations of the base, (n_positions, 3, n_base)."""
-        n_base, n_tilts = products.cells.shape[1], self.windows.tilt.shape[1]
-        force = self.along_axes(state)
-        on_bias, on_scale = state.weights[:, :, products.columns]
-        read = state.kappa * (force + self._bends(state, 0))
-        weight = on_bias + read[:, :, None] * on_scale
-        result = -weight @ np.swapaxes(self._effect(state, products), 1, 2)
+        force, across, read, (_, bend_by_t), _ = self.effects(state)
+        on_bias, on_scale = state.weights[:, :, base.columns]
+        result = np.zeros((*force.shape, base.size))
         result[:, :, 0] = self.level - (read + state.bias + state.offset)
-        if self.forces is not None:
-            result[:, :, n_base - 4 - n_tilts] = -state.kappa * self._bends(state, 1)
-        tilted = np.einsum('pkt,pit->pik', state.tilt, self._across(state))
-        result[:, :, n_base - 3 - n_tilts : n_base - 3] = -tilted
-        result[:, [0, 1, 2], n_base - 3 + np.arange(3)] = 1.0
-        return np.asarray(result)
-
-    def _across(self, state: State) -> Floats:
-        """Return the derivative of each axis by a rotation of each attitude, (n, 3, 2)."""
-        turned = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
-        if self.forces is None:
-            return np.asarray(self.gravity * state.kappa[:, None] * turned)
-        sizes = self.forces.norms(state.radius, state.stretch)
-        return np.asarray(sizes[:, None, None] * (state.kappa[:, None] * turned))
-
-    def _effect(self, state: State, products: Products) -> Floats:
-        """
-        Return each column as a combination of the base, (n_positions, n_base, n_columns): the
-        column itself plus the contribution of the bag's initial lag states.
-        """
-        n_columns = len(products.columns)
-        start = state.start[self.bag_of_position] @ self.start_root.T
-        effect = np.zeros((self.windows.n_positions, products.cells.shape[1], n_columns))
-        effect[:, 1 + np.arange(n_columns), np.arange(n_columns)] = 1.0
-        behind = 1 + n_columns + np.arange(len(products.moved))
-        effect[:, behind, products.moved] = start[:, products.lag]
-        return effect
+        result[:, :, 1 : 1 + len(base.columns)] = -(on_bias + read[..., None] * on_scale)
+        result[:, :, base.t] = -(state.kappa * bend_by_t)[..., None]
+        result[:, :, base.tilts] = -np.einsum('pkt,pit->pik', state.tilt, across)
+        result[:, [0, 1, 2], base.measured] = 1.0
+        return result
 
     def residual(self, state: State, layout: Layout) -> Floats:
         """Measured minus predicted, shape (n, 3) [m/s^2]."""
-        products = self.products(layout.used)
-        misfit = self.misfit(state, products)
-        at_start = products.columns[products.moved]
-        base = np.hstack(
-            (
-                np.ones((len(self.weight), 1)),
-                self.columns[:, products.columns],
-                self._starts[:, at_start],
-                self._t,
-                self.windows.tilt,
-                self._centred,
-            )
-        )
-        of_window = misfit[self.windows.position]
-        return np.asarray(np.einsum('nb,nib->ni', base, of_window))
+        base, position = self.products(layout.used).base, self.windows.position
+        series = self.of(base)
+        series[:, 1 + base.moved] += self.starts(state, base)[position] * series[:, base.at_start]
+        return np.asarray(np.einsum('nb,nib->ni', series, self.misfit(state, base)[position]))
 
     def force(self, state: State, rows: slice = slice(None)) -> Floats:
         """Correct windows as the compensator does, without mounting offsets, shape (n, 3)."""
-        columns = self.columns[rows]
-        along = self.measured[rows] - state.bias - columns @ state.weights[0].T
-        along /= state.kappa * (1.0 + columns @ state.weights[1].T)
+        active = np.flatnonzero(state.weights.any(axis=(0, 1)))
+        columns, (on_bias, on_scale) = self.columns[rows, active], state.weights[:, :, active]
+        along = self.measured[rows] - state.bias - columns @ on_bias.T
+        along /= state.kappa * (1.0 + columns @ on_scale.T)
         if self.forces is not None:
             along = self.forces.linearise(along, state.nonlinear, rows)
         return np.asarray(along @ np.linalg.inv(state.inverse).T)
 
+    @last_result_kept
     def precision(self, prior: Prior, layout: Layout) -> Floats:
         """Return inverse prior variances, shape (n,); 0 for those of an informative prior."""
         result = np.zeros(layout.n)
@@ -420,15 +263,16 @@ class Equations:
         result[layout.up] = 0.0 if self.gravity else 1.0
         return result
 
-    def prior_mean(self, prior: Prior, layout: Layout) -> Floats:
-        """Mean of the prior; 0 for all but kappa and bias, shape (n,)."""
-        mean = np.zeros(layout.n)
+    @last_result_kept
+    def away(self, state: State, prior: Prior, layout: Layout) -> Floats:
+        """Return the unknowns less the mean of the prior, 0 for all but the unit's, (n,)."""
+        result = as_vector(state, layout)
         if prior.informative is not None:
-            mean[: layout.n_unit] = prior.informative.mean
-            return mean
-        mean[layout.kappa] = 1.0
-        mean[layout.bias] = prior.bias_mean
-        return mean
+            result[: layout.n_unit] -= prior.informative.mean
+        else:
+            result[layout.kappa] -= 1.0
+            result[layout.bias] -= prior.bias_mean
+        return result
 
 
 # Unknowns to which a step is added; attitudes move in their tangent planes.
@@ -450,11 +294,19 @@ def as_vector(state: State, layout: Layout) -> Floats:
     return result[:-1]
 
 
+def without_inactive(state: State, layout: Layout) -> State:
+    """Set inactive weights and coefficients to 0; the same state if all of them are 0."""
+    kept = {name: getattr(layout, name) >= 0 for name in ('weights', 'nonlinear')}
+    if not any(getattr(state, name)[~active].any() for name, active in kept.items()):
+        return state
+    zeroed = {name: np.where(at, getattr(state, name), 0.0) for name, at in kept.items()}
+    return replace(state, **zeroed)
+
+
 def moved_by(state: State, step: Floats, layout: Layout) -> State:
     """Add a step to a state; inactive weights and coefficients are set to 0."""
     padded = np.append(step, 0.0)
     up = state.up + np.einsum('pij,pj->pi', state.tangents, padded[layout.up])
     moved = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}
-    for name in moved.keys() & {'weights', 'nonlinear'}:
-        moved[name] = np.where(getattr(layout, name) >= 0, moved[name], 0.0)
-    return replace(state, up=up / np.linalg.norm(up, axis=1, keepdims=True), **moved)
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    return without_inactive(replace(state, up=up, **moved), layout)

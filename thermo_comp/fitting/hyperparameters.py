@@ -184,7 +184,7 @@ def pruned(posterior: Posterior, prior: Prior, fixed: Bools, least_gain: float) 
     Drop columns with a log Bayes factor below `least_gain`, one at a time, the smallest first; the
     factors of the others are then those without it.
     """
-    state, covariance = posterior.state, posterior.covariance
+    state, covariance = posterior.state, posterior.covariance.copy()
     layout = posterior.layout
     mode = np.zeros(len(covariance))
     where = layout.weights >= 0
@@ -202,7 +202,7 @@ def pruned(posterior: Posterior, prior: Prior, fixed: Bools, least_gain: float) 
         at = places[least]
         gone = np.linalg.solve(covariance[np.ix_(at, at)], covariance[at])
         mode = mode - gone.T @ mode[at]
-        covariance = covariance - covariance[:, at] @ gone
+        covariance -= covariance[:, at] @ gone
     return replace(prior, column_sd=column_sd)
 
 

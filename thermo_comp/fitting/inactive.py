@@ -27,13 +27,13 @@ class Inactive:
     """
     Sparsity and quality factors of inactive columns, given the active ones [1]_.
 
-    columns: the inactive columns, shape (k,)
-    S: sparsity factor, information about their weights, shape (2 k 3, 2 k 3), in the order part
-        (bias, scale), column, axis
-    Q: quality factor, gradient by their weights, shape (2 k 3,)
+    part, column: part (0: bias, 1: scale) and column of each of k cases, shape (k,)
+    S: sparsity factor, information about their weights, shape (3 k, 3 k), in the order case, axis
+    Q: quality factor, gradient by their weights, shape (3 k,)
     """
 
-    columns: Ints
+    part: Ints
+    column: Ints
     S: Floats
     Q: Floats
 
@@ -44,8 +44,7 @@ class Inactive:
         It is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, S and q in units of the columns' prior sd,
         shape (2, m), at the best common factor of this sd.
         """
-        sd = column_sd[:, self.columns] * wanted[self.columns]
-        sd = np.repeat(sd[..., None], 3, axis=2).ravel()
+        sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
         at = np.flatnonzero(sd > 0.0)
         S, along = np.linalg.eigh(self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at]))
         square = _FACTORS[:, None] ** 2
@@ -59,23 +58,23 @@ class Inactive:
         The next column is that with the largest gain in log evidence given those chosen before;
         the selection ends when this gain is below `least`.
         """
-        k = len(self.columns)
-        sd = column_sd[:, self.columns] * wanted[self.columns]
-        sd = np.repeat(sd[..., None], 3, axis=2).ravel()
-        S, Q = self.S * np.outer(sd, sd), self.Q * sd
+        sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
+        at = np.flatnonzero(sd > 0.0)
+        column = np.repeat(self.column, 3)[at]
+        S, Q = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at]), self.Q[at] * sd[at]
         result = np.zeros_like(wanted)
-        for _ in range(most):
-            square = _FACTORS[:, None] ** 2
+        square = _FACTORS[:, None] ** 2
+        for _ in range(most if len(at) else 0):
             s, q2 = square * np.maximum(np.diag(S), 0.0), square * Q**2
-            each = 0.5 * (q2 / (1.0 + s) - np.log1p(s)).reshape(-1, 2, k, 3).sum(axis=(1, 3))
-            part, best = np.unravel_index(int(np.argmax(each)), each.shape)
-            if each[part, best] < least:
+            each = np.zeros((len(square), len(wanted)))
+            np.add.at(each.T, column, 0.5 * (q2 / (1.0 + s) - np.log1p(s)).T)
+            factor, best = np.unravel_index(int(np.argmax(each)), each.shape)
+            if each[factor, best] < least:
                 break
-            result[self.columns[best]] = True
-            at = np.arange(2 * k * 3).reshape(2, k, 3)[:, best].ravel()
-            at = at[sd[at] > 0.0]
-            block = S[np.ix_(at, at)] + np.eye(len(at)) / _FACTORS[part] ** 2
-            solved = np.linalg.solve(block, np.column_stack((S[at], Q[at])))
-            S, Q = S - S[:, at] @ solved[:, :-1], Q - S[:, at] @ solved[:, -1]
-            S[at], S[:, at], Q[at] = 0.0, 0.0, 0.0
+            result[best] = True
+            own = np.flatnonzero(column == best)
+            block = S[np.ix_(own, own)] + np.eye(len(own)) / square[factor]
+            solved = np.linalg.solve(block, np.column_stack((S[own], Q[own])))
+            S, Q = S - S[:, own] @ solved[:, :-1], Q - S[:, own] @ solved[:, -1]
+            S[own], S[:, own], Q[own] = 0.0, 0.0, 0.0
         return result

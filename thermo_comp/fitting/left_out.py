@@ -26,8 +26,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..typing import Floats, Ints
+from .elimination import inverse_root
 from .equations import moved_by
-from .regression import Normal, Posterior, Reduced, Regression
+from .regression import Posterior, Regression
 from .unknowns import Prior, State
 
 # Largest ratio of the variance of a position's norm or drift without this position in the fit to
@@ -137,9 +138,9 @@ def _by_positions(
 ) -> tuple[Folds, Folds, Floats, Floats]:
     """Leave out each position; return folds of drift and norm, corrected windows and drift."""
     windows, state, layout = regression.windows, posterior.state, posterior.layout
-    tangent = regression.tangent(state, layout, regression.products(layout.used))
-    normal = regression.normal(tangent, regression.products(layout.used).whole, prior)
-    reduced = regression.reduce(normal, prior, layout, state)
+    products = regression.products(layout.used)
+    tangent, _ = regression.linearised(state, layout, products.whole)
+    means = tangent.of(regression.at_starts(products.means[:, None], state, products.base))
     n_positions = windows.n_positions
     edges = np.searchsorted(windows.position, np.arange(n_positions + 1))
     counts = np.diff(edges).astype(np.float64)
@@ -147,51 +148,44 @@ def _by_positions(
     sizes = regression.norms(state)
     drift = np.full_like(force, np.nan)
     squares, norms = np.full(n_positions, np.nan), np.full(n_positions, np.nan)
-    for p in range(n_positions) if n_positions > 1 else ():
+    matrices = regression.without_each(state, prior, layout) if n_positions > 1 else ()
+    for p, matrix in enumerate(matrices):
         rows = slice(edges[p], edges[p + 1])
-        moved, covariance = _without_position(regression, posterior, prior, normal, reduced, p)
+        moved, root = _refitted(regression, posterior, prior, matrix)
         own = regression.force(moved, rows)
         weight = share[rows]
         level = np.average(own, axis=0, weights=weight)
         away = own - level
-        is_known = _is_drift_determined(regression, posterior, prior, covariance, rows)
+        is_known = _is_drift_determined(regression, posterior, prior, root, rows)
         if rows.stop - rows.start >= _FEWEST_WINDOWS and is_known:
             drift[rows] = away
             square = np.mean(away**2, axis=1)
             squares[p] = np.average(square, weights=weight)
-        if _is_norm_determined(regression, posterior, prior, tangent.derivatives, covariance, p):
+        if _is_norm_determined(regression, posterior, prior, means[p, :, 0], root, p):
             force[rows] = own
             error = np.linalg.norm(own, axis=1) - sizes[p]
             norms[p] = np.average(error**2, weights=weight)
     return Folds(squares, counts), Folds(norms, counts), force, drift
 
 
-def _without_position(
-    regression: Regression,
-    posterior: Posterior,
-    prior: Prior,
-    normal: Normal,
-    reduced: Reduced,
-    p: int,
+def _refitted(
+    regression: Regression, posterior: Posterior, prior: Prior, matrix: Floats
 ) -> tuple[State, Floats]:
-    """Return state and covariance of the fit without a position, to first order."""
+    """
+    Return the state of a fit with other normal equations, to first order, and the root of its
+    covariance, see `Posterior`.
+    """
     state, layout = posterior.state, posterior.layout
-    bag = regression.bag_of_position[[p]]
-    rest = regression.reduce(normal, prior, layout, state, bag, without=p)
-    information, pull = reduced.whole
-    information = information - reduced.information[bag[0]] + rest.information[0]
-    pull = pull - reduced.pull[bag[0]] + rest.pull[0]
-    step, factor = regression.unit_step(information, pull, prior, layout, state)
+    step, factor = regression.unit_step(matrix, prior, layout, state)
     whole = np.zeros(layout.n)
     whole[: layout.n_unit] = step
-    inverse = np.linalg.inv(factor)
-    return moved_by(state, whole, layout), inverse.T @ inverse
+    return moved_by(state, whole, layout), inverse_root(factor)
 
 
 def _is_drift_determined(
-    regression: Regression, posterior: Posterior, prior: Prior, covariance: Floats, rows: slice
+    regression: Regression, posterior: Posterior, prior: Prior, root: Floats, rows: slice
 ) -> bool:
-    """Whether `covariance`, that without this position, determines its drift."""
+    """Whether a fit without this position, with this root, determines its drift."""
     state, layout = posterior.state, posterior.layout
     in_bias, in_scale = layout.used
     if not in_bias.any():
@@ -205,34 +199,29 @@ def _is_drift_determined(
     for axis in range(3):
         along = np.hstack((some[:, in_bias], force[axis] * some[:, in_scale]))
         at = layout.axis[axis, 2 : 2 + along.shape[1]]
-        where = np.ix_(at, at)
-        by_others += float(np.sum((along @ covariance[where]) * along))
-        everything += float(np.sum((along @ posterior.covariance[where]) * along))
+        by_others += float(np.sum((along @ root[at]) ** 2))
+        everything += float(np.sum((along @ posterior.root[at]) ** 2))
     noise = float(np.sum(prior.sigma**2)) * len(some)
     return by_others < _VARIANCE_RATIO * (everything + noise)
 
 
 def _is_norm_determined(
-    regression: Regression,
-    posterior: Posterior,
-    prior: Prior,
-    derivatives: Floats,
-    covariance: Floats,
-    p: int,
+    regression: Regression, posterior: Posterior, prior: Prior, means: Floats, root: Floats, p: int
 ) -> bool:
-    """Whether `covariance`, that without this position, determines its norm."""
+    """
+    Whether a fit without this position, with this root, determines its norm; `means`: derivatives
+    of its mean reading, see `Tangent.of`.
+    """
     if not regression.gravity:
         return False
     state, layout = posterior.state, posterior.layout
-    own = layout.axis.shape[1] + len(layout.shared)
-    base = regression.products(layout.used).means[p]
     on_axes = np.linalg.inv(state.inverse).T @ state.up[p] / state.kappa
     along = np.zeros(layout.n_unit)
     for axis in range(3):
-        places = np.concatenate((layout.axis[axis], layout.shared))
-        along[places] += on_axes[axis] * (base @ derivatives[p, axis, :, :own])
-    everything = along @ posterior.covariance @ along + prior.offset_sd**2
-    return bool(along @ covariance @ along < _VARIANCE_RATIO * everything)
+        places = layout.unit[axis, :-1]
+        along[places] += on_axes[axis] * means[axis, -1 - len(places) : -1]
+    everything = float(np.sum((along @ posterior.root) ** 2)) + prior.offset_sd**2
+    return float(np.sum((along @ root) ** 2)) < _VARIANCE_RATIO * everything
 
 
 def _by_sections(

@@ -250,9 +250,10 @@ def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds at which they determine the triad best."""
     found: list[list[tuple[int, int]]] = []
+    of_ratios = stillness.still_runs(cells, still_sd, _VARIANCE_RATIOS)
     for shortest in _MIN_RESTS_S if min_rest_s is None else (min_rest_s,):
-        for ratio in _VARIANCE_RATIOS:
-            ranges = stillness.still_intervals(cells, shortest, still_sd, ratio)
+        for runs in of_ratios:
+            ranges = stillness.long_enough(cells, runs, shortest)
             if ranges not in found:
                 found.append(ranges)
     weighted = cells.mean * cells.count[:, None]

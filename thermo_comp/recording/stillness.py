@@ -13,6 +13,7 @@ more than its noise, and does not rotate.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -250,38 +251,50 @@ def still_intervals(
     Find the runs of still cells: half-open ranges of cell numbers, in order. `still_sd` is the
     largest scatter at rest [g], `ratio` that of a cell's variance to the quiet level.
     """
+    return long_enough(cells, still_runs(cells, still_sd, (ratio,))[0], min_rest_s)
+
+
+def long_enough(
+    cells: Cells, runs: Sequence[tuple[int, int]], min_rest_s: float
+) -> list[tuple[int, int]]:
+    """Select the runs of cells that last for `min_rest_s` at least."""
+    min_cells = max(1, int(np.ceil(min_rest_s / cells.cell_s - 1e-9))) if runs else 1
+    return [(start, stop) for start, stop in runs if stop - start >= min_cells]
+
+
+def still_runs(
+    cells: Cells, still_sd: float, ratios: Sequence[float]
+) -> list[list[tuple[int, int]]]:
+    """Find the runs of still cells of any length, with each ratio; see `still_intervals`."""
     full = _is_full(cells)
     believable = full & is_under(cells, still_sd) & ~_is_turning(cells)
     if not believable.any():
-        return []
-    # A sensor that repeats one number does not show its noise: toggling between two adjacent
-    # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
-    # variance is a little below its mean; 1.3 covers it for cells of 32 samples.
+        return [[] for _ in ratios]
     drift = _drift(cells, believable)
     level = np.quantile(cells.variance[believable], 0.1, axis=0)
     wider = spread_of_variances(cells, believable, level)
-    limit = ratio * np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
+    # A sensor that repeats one number does not show its noise: toggling between two adjacent
+    # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
+    # variance is a little below its mean; 1.3 covers it for cells of 32 samples.
+    usual = np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice that allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
-    limit = limit + within**2 / 6.0 if len(within) else limit
-    quiet = believable & (cells.variance <= limit).all(axis=1)
-    roughest = roughest_at_rest(cells, quiet, wider > 1.0, ratio)
-    quiet &= (cells.roughness <= roughest).all(axis=1)
-    # A single change of this many sd has the roughness of a whole cell.
-    is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
-    broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
-    # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.
-    moved = ~quiet
-    near = moved.copy()
-    near[1:] |= moved[:-1] | broken
-    near[:-1] |= moved[1:] | broken
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], (~near).astype(np.int8), [0]))))
-    min_cells = max(1, int(np.ceil(min_rest_s / cells.cell_s - 1e-9)))
-    return [
-        (int(start), int(stop))
-        for start, stop in zip(edges[::2], edges[1::2], strict=True)
-        if stop - start >= min_cells
-    ]
+    by_drift = within**2 / 6.0 if len(within) else 0.0
+    result = []
+    for ratio in ratios:
+        quiet = believable & (cells.variance <= ratio * usual + by_drift).all(axis=1)
+        roughest = roughest_at_rest(cells, quiet, wider > 1.0, ratio)
+        quiet &= (cells.roughness <= roughest).all(axis=1)
+        # A single change of this many sd has the roughness of a whole cell.
+        is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
+        broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
+        # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.
+        near = ~quiet
+        near[1:] |= ~quiet[:-1] | broken
+        near[:-1] |= ~quiet[1:] | broken
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], (~near).astype(np.int8), [0]))))
+        result.append(list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)))
+    return result
 
 
 def without_rotation(cells: Cells) -> Cells:

@@ -1,0 +1,288 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the elimination of the unknowns of positions and bags from the normal equations.
+
+Each position has unknowns (attitude, offsets, tilts) that occur in no other position; they are
+eliminated first, then the initial lag states of each bag. Normal equations for the unknowns of the
+unit remain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg.blas import dtrmm
+from scipy.linalg.lapack import dpotrs, dtrtri
+
+from ..typing import Floats
+from .tangent import Normal
+from .unknowns import Layout
+
+# Relative jitters of a matrix that rounding may have made indefinite; they add up.
+_JITTERS = (1e-13, 1e-11, 1e-9, 1e-7)
+
+
+def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
+    """
+    Return the lower Cholesky factors of matrices that are positive definite except for rounding,
+    shape (..., n, n).
+
+    The smallest jitter that suffices is added to the matrix scaled to a unit diagonal; with
+    `diagonal`, shape (..., n), to the matrix scaled by its root.
+    """
+    square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
+    root = np.sqrt(square)
+    scaled = matrix / root[..., None, :]
+    scaled /= root[..., :, None]
+    every = np.arange(matrix.shape[-1])
+    for jitter in _JITTERS:
+        scaled[..., every, every] += jitter
+        try:
+            factor = np.linalg.cholesky(scaled)
+        except np.linalg.LinAlgError:
+            if matrix.ndim > 2:
+                # Only the matrices that need more jitter get it.
+                return np.stack([factored(*one) for one in zip(matrix, square, strict=True)])
+            if jitter == _JITTERS[-1]:
+                raise
+        else:
+            break
+    factor *= root[..., :, None]
+    return np.asarray(factor, dtype=np.float64)
+
+
+def solved(factor: Floats, right: Floats) -> Floats:
+    """Solve equations, given the lower Cholesky factor of their matrix; `cho_solve` is slower."""
+    return np.asarray(dpotrs(factor.T, right)[0])
+
+
+def inverse_root(factor: Floats) -> Floats:
+    """
+    Return the upper triangular root of the inverse of a matrix, ``root @ root.T``, given the lower
+    Cholesky factor of the matrix, shape (n, n).
+    """
+    return np.asarray(dtrtri(factor.T)[0])
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """
+    Eliminated blocks of equal size, those of all positions or of all bags.
+
+    root: inverse of the Cholesky factor of each block, shape (n, k, k)
+    turned: this inverse times the cross block with the remaining unknowns and, in the last column,
+        times the gradient, shape (n, k, m + 1)
+    """
+
+    root: Floats
+    turned: Floats
+
+    @classmethod
+    def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
+        """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
+        # `numpy.linalg.inv` of all factors at once does not use that they are triangular.
+        root = np.stack([dtrtri(factor.T)[0].T for factor in factored(block, diagonal)])
+        return cls(root, root @ cross)
+
+    @cached_property
+    def solved(self) -> Floats:
+        """Inverse of each block times its cross block and its gradient, shape (n, k, m + 1)."""
+        return np.asarray(np.swapaxes(self.root, 1, 2) @ self.turned)
+
+    @property
+    def inverse(self) -> Floats:
+        """Inverse of each block, shape (n, k, k)."""
+        return np.asarray(np.swapaxes(self.root, 1, 2) @ self.root)
+
+    @property
+    def log_determinant(self) -> float:
+        """Sum of the log determinants of the blocks."""
+        return -2.0 * float(np.log(np.einsum('nii->ni', self.root)).sum())
+
+    def square(self, first: int = 0) -> Floats:
+        """
+        Return what the elimination subtracts from the normal equations of the remaining unknowns
+        from the `first` on.
+        """
+        flat = self.turned[..., first:].reshape(-1, self.turned.shape[2] - first)
+        return np.asarray(flat.T @ flat)
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """
+    The normal equations of the unit's n unknowns, with all others eliminated.
+
+    layout: places of the unknowns
+    starts_prior: precision of the initial lag states, and this times their value, (2, n_bags, r)
+    matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
+    positions: the blocks of the positions; the initial lag states of the bag, then the unknowns of
+        the unit remain
+    shares: contributions of the positions to the blocks of the bags with their cross blocks and
+        gradients, shape (n_positions, r, r + n + 1); and to the diagonals before the elimination
+        of the positions, shape (n_positions, r)
+    bags: the blocks of the bags
+    common: the prior on the sum of the initial lag states as a further block; None without it
+    """
+
+    layout: Layout
+    starts_prior: Floats
+    matrix: Floats
+    positions: Blocks
+    shares: tuple[Floats, Floats]
+    bags: Blocks
+    common: Blocks | None = None
+
+    @property
+    def whole(self) -> Floats:
+        """The matrix with the prior on the sum of the initial lag states."""
+        return self.matrix if self.common is None else self.matrix + self.common.square()
+
+    @property
+    def log_determinant(self) -> float:
+        """Sum of the log determinants of all blocks."""
+        blocks = [self.positions, self.bags, *([self.common] if self.common else [])]
+        return sum(one.log_determinant for one in blocks)
+
+    def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
+        """Add the prior on the sum of the initial lag states, now `total`, about 0."""
+        cross = self.bags.solved.sum(axis=0, keepdims=True)
+        cross[..., -1] += total
+        block = self.bags.inverse.sum(axis=0, keepdims=True) + variance * np.eye(len(total))
+        return replace(self, common=Blocks.of(block, cross))
+
+    def follow(self, step: Floats) -> tuple[Floats, Floats]:
+        """Return the steps of the unknowns of positions and bags, given that of the unit."""
+        r, solved = len(self.bags.root[0]), self.positions.solved
+        starts = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
+        if self.common is not None:
+            excess = self.common.solved[0, :, -1] - self.common.solved[0, :, :-1] @ step
+            starts -= self.bags.inverse @ excess
+        own = solved[..., -1] - solved[..., r:-1] @ step
+        own -= np.einsum('pkr,pr->pk', solved[..., :r], starts[self.layout.bag])
+        return own, starts
+
+    def variances(self, root: Floats) -> tuple[Floats, Floats]:
+        """
+        Return the variances of the unknowns of positions and bags, given an upper triangular root
+        of the covariance of the unit's, without the prior on the sum of the initial lag states.
+        """
+        bag, r, solved = self.layout.bag, len(self.bags.root[0]), self.positions.solved
+        by_unit, by_starts = self.bags.solved[..., :-1], solved[..., :r]
+        starts = np.sum(self.bags.root**2, axis=1) + _variance(by_unit, root)
+        of_starts = by_starts @ np.swapaxes(self.bags.root[bag], 1, 2)
+        own = np.sum(self.positions.root**2, axis=1) + np.sum(of_starts**2, axis=2)
+        own += _variance(solved[..., r:-1] - by_starts @ by_unit[bag], root)
+        return own, starts
+
+    @cached_property
+    def _rest(self) -> Blocks:
+        """The block of each position's bag without this position."""
+        bag = self.layout.bag
+        others = (bag[:, None] == bag) - np.eye(len(bag))
+        return _of_bags(others, self.shares, self.starts_prior[:, bag])
+
+    def without(self, p: int, own: Normal) -> Floats:
+        """Return `whole` without a position, given the normal equations of this position."""
+        turned = self.positions.turned[p, :, len(self.bags.root[0]) :]
+        before, after = self.bags.turned[self.layout.bag[p]], self._rest.turned[p]
+        gone = _of_unit(own.unit, self.layout) - turned.T @ turned
+        return np.asarray(self.whole - gone + before.T @ before - after.T @ after)
+
+    def beside(self, rows: Floats) -> tuple[Floats, Floats]:
+        """
+        Carry out the elimination for further unknowns of the unit, m of each axis.
+
+        `rows`: their normal equations with the unknowns of the fit and the residual, shape
+        (n_positions, 3, m, k + 1). Returns what the elimination subtracts from their Hessian,
+        shape (3 m, 3 m), and their cross block with the unit and their gradient after it, shape
+        (n + 1, 3 m).
+        """
+        layout, turned = self.layout, self.positions.turned
+        n_positions, n_own, _ = turned.shape
+        n_local, r, m = layout.n_local, layout.start.shape[1], rows.shape[2]
+        local = np.zeros((n_positions, n_own + r, m, 3))
+        unit = np.zeros((layout.n_unit + 1, m, 3))
+        for axis, at in enumerate(layout.columns):
+            each = np.swapaxes(rows[:, axis], 1, 2)
+            local[..., axis][:, at[:n_local]] = each[:, :n_local]
+            unit[layout.unit[axis], :, axis] = each[:, n_local:].sum(axis=0)
+        local = local.reshape(n_positions, n_own + r, 3 * m)
+        own = self.positions.root @ local[:, :n_own]
+        starts = local[:, n_own:] - np.swapaxes(turned[..., :r], 1, 2) @ own
+        of_bags = self.bags.root @ np.tensordot(_membership(layout), starts, 1)
+        cross = unit.reshape(-1, 3 * m)
+        cross -= _summed(turned[..., r:], own) + _summed(self.bags.turned, of_bags)
+        gone = Blocks(self.positions.root, own).square() + Blocks(self.bags.root, of_bags).square()
+        return gone, cross
+
+
+def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -> Reduced:
+    """
+    Eliminate the unknowns of positions and bags.
+
+    normal: the normal equations in units of the noise
+    precision, away: inverse prior variances, and values less prior means, shape (n,)
+    """
+    n_positions, n_own = layout.own.shape
+    r, n_local = layout.start.shape[1], layout.n_local
+    rows = np.zeros((n_positions, n_own + r, n_own + r + layout.n_unit + 1))
+    for axis, at in enumerate(layout.columns):
+        rows[:, at[:n_local, None], at] += normal.local[:, axis]
+    block, cross, starts = (
+        rows[:, :n_own, :n_own],
+        rows[:, :n_own, n_own:],
+        rows[:, n_own:, n_own:],
+    )
+    every = np.arange(n_own)
+    block[:, every, every] += precision[layout.own]
+    cross[..., -1] -= (precision * away)[layout.own]
+    # Attitudes without any information keep their value.
+    block[:, every, every] += np.einsum('pii->pi', block) <= 0.0
+    positions = Blocks.of(block, cross)
+    diagonal = np.einsum('pii->pi', starts[..., :r])
+    starts = starts - np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned
+    shares, prior = (starts, diagonal), np.stack((precision, precision * away))[:, layout.start]
+    bags = _of_bags(_membership(layout), shares, prior)
+    matrix = _of_unit(normal.unit, layout) - positions.square(r) - bags.square()
+    return Reduced(layout, prior, matrix, positions, shares, bags)
+
+
+def _membership(layout: Layout) -> Floats:
+    """Return 1 for the positions of each bag, 0 for the others, shape (n_bags, n_positions)."""
+    return np.asarray(layout.bag == np.arange(len(layout.start))[:, None], dtype=np.float64)
+
+
+def _of_unit(normal: Floats, layout: Layout) -> Floats:
+    """Arrange the equations of the unit's unknowns of each axis, shape (3, k, k)."""
+    result = np.zeros((layout.n_unit + 1, layout.n_unit + 1))
+    for own, at in zip(normal, layout.unit, strict=True):
+        result[at[:, None], at] += own
+    return result
+
+
+def _of_bags(among: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blocks:
+    """Eliminate the initial lag states of bags, each with the positions `among` them, (m, n)."""
+    if not shares[0].size:
+        return Blocks(np.zeros((len(among), 0, 0)), np.zeros((len(among), *shares[0].shape[1:])))
+    sums, diagonals = (np.tensordot(among, share, 1) for share in shares)
+    r = diagonals.shape[1]
+    block, cross = sums[..., :r], sums[..., r:]
+    block[:, np.arange(r), np.arange(r)] += prior[0]
+    cross[..., -1] -= prior[1]
+    return Blocks.of(block, cross, diagonals + prior[0])
+
+
+def _variance(derivatives: Floats, root: Floats) -> Floats:
+    """Return the variances of linear functions of the unit's unknowns, shape (n, k)."""
+    rows = derivatives.reshape(-1, len(root))
+    turned = dtrmm(1.0, root, rows.T, trans_a=True)
+    return np.asarray(np.sum(turned**2, axis=0).reshape(derivatives.shape[:2]))
+
+
+def _summed(left: Floats, right: Floats) -> Floats:
+    """Return the sum of the products of all rows of blocks, shape (k, m)."""
+    return np.asarray(left.reshape(-1, left.shape[2]).T @ right.reshape(-1, right.shape[2]))

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns the linearised measurement equation, and the normal equations that follow from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..typing import Floats, Ints
+
+
+class Normal(NamedTuple):
+    """
+    Normal equations of each axis without any prior, in the order of `Tangent`.
+
+    local: those of the unknowns of positions and bags, with all unknowns and with the residual,
+        shape (n_positions, 3, n_local, k + 1)
+    unit: those of the unknowns of the unit and of the residual with each other, sum over the
+        positions, shape (3, n, n)
+    """
+
+    local: Floats
+    unit: Floats
+
+    def scaled(self, factor: Floats) -> Normal:
+        """Multiply the equations of each axis by a factor, shape (3,)."""
+        return Normal(self.local * factor[:, None, None], self.unit * factor[:, None, None])
+
+    @property
+    def square(self) -> Floats:
+        """Sum of squares of the residuals of each axis, shape (3,)."""
+        return np.asarray(np.maximum(self.unit[:, -1, -1], 0.0))
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """
+    The equations linearised about a state, as coefficients of the base series at this state.
+
+    Most derivatives are one base series times a factor; the others are one of a few combinations
+    of them. The derivative of axis i in position p by unknown u is ``factor[p, i, u]`` times the
+    series ``place[u]``, in the order base series, combinations. The unknowns of an axis are those
+    of the position: up (2), stretch, offset, tilts; of the bag: initial lag states; of the unit:
+    kappa, bias, weights, nonlinear coefficients, radius, misalignment (3). The last "unknown" is
+    the residual, measured minus predicted.
+
+    combined: the combinations, shape (n_positions, 3, n_base, n_combined)
+    place: series of each unknown, shape (k + 1,)
+    factor: shape (n_positions, 3, k + 1)
+    n_local: number of unknowns of position and bag
+    n_bias: number of unknowns with factor 1 after kappa: bias and its weights
+    n_scale: number of weights of the scale, which follow
+    scale: factor of the weights of the scale, shape (n_positions, 3)
+    """
+
+    combined: Floats
+    place: Ints
+    factor: Floats
+    n_local: int
+    n_bias: int
+    n_scale: int
+    scale: Floats
+
+    def normal(self, products: Floats) -> Normal:
+        """
+        Return the normal equations, given the products of the base series at the state, shape
+        (n_positions, n_base, n_base).
+        """
+        first, turned = self.n_local, products[:, None] @ self.combined
+        # Sums over the positions of the products times powers of the factor of the scale.
+        bias = slice(first + 1, first + 1 + self.n_bias)
+        scale = slice(bias.stop, bias.stop + self.n_scale)
+        powers = np.stack([self.scale**k for k in range(3)])
+        sums = np.tensordot(powers.transpose(2, 0, 1), products, 1)
+        n = len(self.place) - first
+        unit = np.empty((3, n, n))
+        for rows, columns, k in ((bias, bias, 0), (bias, scale, 1), (scale, scale, 2)):
+            block = sums[:, k, self.place[rows, None], self.place[columns]]
+            at, beside = (slice(one.start - first, one.stop - first) for one in (rows, columns))
+            unit[:, at, beside] = block
+            unit[:, beside, at] = np.swapaxes(block, 1, 2)
+        others = np.array([0, *range(scale.stop - first, n)])
+        rows_of = self._rows(np.append(np.arange(first), first + others), products, turned)
+        of_others = rows_of[:, :, first:, first:].sum(axis=0)
+        unit[:, others] = of_others
+        unit[:, :, others] = np.swapaxes(of_others, 1, 2)
+        return Normal(rows_of[:, :, :first], unit)
+
+    def _rows(self, unknowns: Ints, products: Floats, turned: Floats) -> Floats:
+        """Return the normal equations of some unknowns, (n_positions, 3, m, k + 1)."""
+        n, series = products.shape[-1], self.place[unknowns]
+        base, combined = np.flatnonzero(series < n), np.flatnonzero(series >= n)
+        every = np.empty((*turned.shape[:2], len(series), n + turned.shape[-1]))
+        of_combined = self.combined[..., series[combined] - n]
+        every[:, :, base, :n] = products[:, None, series[base]]
+        every[:, :, base, n:] = turned[:, :, series[base]]
+        every[:, :, combined, :n] = np.swapaxes(turned[..., series[combined] - n], 2, 3)
+        every[:, :, combined, n:] = np.swapaxes(of_combined, 2, 3) @ turned
+        result = every.take(self.place, axis=3)
+        result *= self.factor[:, :, unknowns, None]
+        result *= self.factor[:, :, None]
+        return np.asarray(result)
+
+    def at(self, p: int) -> Tangent:
+        """Return the tangent of one position."""
+        return replace(
+            self, combined=self.combined[[p]], factor=self.factor[[p]], scale=self.scale[[p]]
+        )
+
+    def of(self, rows: Floats) -> Floats:
+        """
+        Apply the derivatives to linear functions of the base series, such as their means, shape
+        (n_positions, m, n_base); return their derivatives, shape (n_positions, 3, m, k + 1).
+        """
+        combined = rows[:, None] @ self.combined
+        own = np.broadcast_to(rows[:, None], (*combined.shape[:3], rows.shape[2]))
+        every = np.concatenate((own, combined), axis=3)
+        return np.asarray(every[..., self.place] * self.factor[:, :, None])
