@@ -43,6 +43,8 @@ _TOGETHER = (('product', 'square'), (*LAGS, 'product', 'gradient_x_temperature',
 LEAST_GAIN = 1.0
 # Logarithms of mean squares that differ by less than this count as equal: 5 % of an RMS.
 _EQUAL = 0.1
+# Largest left-out drift, relative to the noise, of a model that lacks nothing.
+_AT_NOISE = 2.0
 # Largest left-out drift, relative to the chosen model's, of a model of bends that is continued.
 _PROMISING = 3.0
 # Largest factor by which the RMS error of the two halves may rise: two folds scatter by a quarter.
@@ -140,11 +142,13 @@ def select(
     begin = chosen
     chosen, found = grow.added(chosen, asked, progress)
     trials += found
-    if BEND in asked and BEND not in chosen.groups and not _is_at_noise(chosen):
+    noise = float(chosen.prior.sigma.mean())
+    if BEND in asked and BEND not in chosen.groups and chosen.score.rms > _AT_NOISE * noise:
         # The slopes of a part that lags are seen only beside its lag, not beside a stand-in of
         # products and squares.
         bent = grow.bent(begin, asked)
         if bent is not None and bent.score.rms < _PROMISING * chosen.score.rms:
+            trials.append(bent)
             bent, found = grow.added(bent, asked, progress)
             trials += found
             if is_better(chosen.score, bent.score):
@@ -381,11 +385,6 @@ def _likelier(fits: Sequence[Trial]) -> Trial:
         if is_likelier or is_better(small.score, large.score):
             return large
     return small
-
-
-def _is_at_noise(trial: Trial) -> bool:
-    """Whether the left-out drift is at most twice the noise of a window."""
-    return trial.score.rms < 2.0 * float(trial.prior.sigma.mean())
 
 
 def _simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
