@@ -102,14 +102,6 @@ class Blocks:
         """Sum of the log determinants of the blocks."""
         return -2.0 * float(np.log(np.einsum('nii->ni', self.root)).sum())
 
-    def square(self, first: int = 0) -> Floats:
-        """
-        Return what the elimination subtracts from the normal equations of the remaining unknowns
-        from the `first` on.
-        """
-        flat = self.turned[..., first:].reshape(-1, self.turned.shape[2] - first)
-        return np.asarray(flat.T @ flat)
-
 
 @dataclass(frozen=True)
 class Reduced:
@@ -139,7 +131,7 @@ class Reduced:
     @property
     def whole(self) -> Floats:
         """The matrix with the prior on the sum of the initial lag states."""
-        return self.matrix if self.common is None else self.matrix + self.common.square()
+        return self.matrix if self.common is None else self.matrix + _square(self.common.turned)
 
     @property
     def log_determinant(self) -> float:
@@ -216,8 +208,7 @@ class Reduced:
         of_bags = self.bags.root @ np.tensordot(_membership(layout), starts, 1)
         cross = unit.reshape(-1, 3 * m)
         cross -= _summed(turned[..., r:], own) + _summed(self.bags.turned, of_bags)
-        gone = Blocks(self.positions.root, own).square() + Blocks(self.bags.root, of_bags).square()
-        return gone, cross
+        return _square(own, of_bags), cross
 
 
 def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -> Reduced:
@@ -247,7 +238,8 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -
     starts = starts - np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned
     shares, prior = (starts, diagonal), np.stack((precision, precision * away))[:, layout.start]
     bags = _of_bags(_membership(layout), shares, prior)
-    matrix = _of_unit(normal.unit, layout) - positions.square(r) - bags.square()
+    matrix = _of_unit(normal.unit, layout)
+    matrix -= _square(positions.turned[..., r:], bags.turned)
     return Reduced(layout, prior, matrix, positions, shares, bags)
 
 
@@ -281,6 +273,12 @@ def _variance(derivatives: Floats, root: Floats) -> Floats:
     rows = derivatives.reshape(-1, len(root))
     turned = dtrmm(1.0, root, rows.T, trans_a=True)
     return np.asarray(np.sum(turned**2, axis=0).reshape(derivatives.shape[:2]))
+
+
+def _square(*turned: Floats) -> Floats:
+    """Return what the elimination of blocks subtracts from the remaining equations, (k, k)."""
+    rows = np.concatenate([one.reshape(-1, one.shape[2]) for one in turned])
+    return np.asarray(rows.T @ rows)
 
 
 def _summed(left: Floats, right: Floats) -> Floats:

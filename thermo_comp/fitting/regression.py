@@ -116,7 +116,9 @@ class Regression(Equations):
         )
         if prior.informative is None:
             known = self.precision(prior, layout)[:n]
-            factor = factored(information + np.diag(known))
+            hessian: Floats = information.copy()
+            hessian[np.diag_indices(n)] += known
+            factor = factored(hessian)
             return solved(factor, pull - known * away), factor
         # In units of the prior's standard deviations the system is well conditioned.
         root = prior.informative.root
