@@ -301,8 +301,7 @@ def _model_of(bags: Sequence[ReducedBag], options: FitOptions) -> Model:
     columns = ()
     if options.model != 'golovach':
         rests = gradients_at_rest(bags, sensors)
-        longest_s = max(bag.end_ns - bag.start_ns for bag in bags) * 1e-9
-        columns = bank(sensors, rests, board_span(bags, reference), longest_s)
+        columns = bank(sensors, rests, board_span(bags, reference))
     if not any(len(bag.case.value) for bag in bags):
         # Without a case thermometer the gradient is estimated from the board's rate, and its
         # columns are combinations of those of the board.

@@ -189,23 +189,13 @@ def bank(
     sensors: Sequence[str] = ('case',),
     at_rest: Mapping[str, float] | None = None,
     span_k: tuple[float, float] = (0.0, 0.0),
-    longest_s: float = math.inf,
 ) -> tuple[Column, ...]:
     """
-    Return all columns that a response may have, without limits of range.
-
-    at_rest: gradient of each sensor at rest [K]
-    span_k: the temperatures seen, from the reference [K]
-    longest_s: length of the longest bag [s]. A lag settles to 5 % in three time constants; the end
-        of a slower lag would be extrapolated, and it can hardly be told from the curve.
+    Return all columns that a response may have, without limits of range; `at_rest` is the gradient
+    of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K].
     """
-    slowest_s = max(longest_s / 3.0, FINE_TAUS[0])
     gradient = [Column('gradient', 'gradient', sensor, range=UNBOUNDED) for sensor in sensors]
-    board = [
-        Column('board', 'board', tau_s=tau, range=UNBOUNDED)
-        for tau in FINE_TAUS
-        if tau <= slowest_s
-    ]
+    board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in FINE_TAUS]
     lagged_gradient = [
         replace(column, group='gradient_lag', kind='gradient_lag', sensor=sensor)
         for sensor in sensors
@@ -246,14 +236,12 @@ def bank(
     play = [
         Column('play', 'play', tau_s=tau, width_k=width, range=UNBOUNDED)
         for tau in PLAY_TAUS
-        if tau <= slowest_s
         for width in PLAY_WIDTHS
     ]
     n_knees = min(int((span_k[1] - span_k[0]) / LEAST_KNEE_K), MOST_KNEES)
     bend = [
         Column('bend', 'bend', tau_s=tau, knee_k=knee, range=UNBOUNDED)
         for tau in BEND_TAUS
-        if tau <= slowest_s
         for knee in np.linspace(*span_k, n_knees + 2)[1:-1].round(3).tolist()
     ]
     return (*gradient, *board, *lagged_gradient, *product, *mixed, *square, *even, *play, *bend)
