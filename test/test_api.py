@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builders import GRAVITY, SECOND_NS, calibration, rich_calibration, thermal_calibration
+from builders import GRAVITY, calibration, rich_calibration, thermal_calibration
 from readme_helpers import FENCE, README
 from test_layers import loaded_after
 
@@ -20,8 +20,6 @@ from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.replay import replay
-
-UNIQUE = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 
 @pytest.fixture(scope='module')
@@ -70,20 +68,6 @@ def test_arrays_have_the_bits_of_a_replayed_bag(
     changes = np.flatnonzero(np.diff(out.dynamic)) + 1
     switches = [stamp for stamp, _ in result.switches[1:]]
     np.testing.assert_array_equal(changes, np.searchsorted(stamps, switches))
-
-
-def test_arrays_have_the_bits_of_the_compensator(arrays: dict[str, np.ndarray]) -> None:
-    unit = rich_calibration()
-    out = unit.correct(**arrays)
-    compensator = tc.Compensator(unit)
-    for k, stamp in enumerate(np.rint(arrays['time_s'] * SECOND_NS).astype(int).tolist()):
-        for name in ('board', 'case'):
-            if not np.isnan(arrays[name][k]):
-                compensator.push(name, stamp, float(arrays[name][k]))
-        row = compensator.process(stamp, *arrays['counts'][k].tolist())
-        assert row is not None
-        np.testing.assert_array_equal(out.specific_force[k], row[:3])
-        np.testing.assert_array_equal(out.covariance[k][UNIQUE], row[3:])
 
 
 def test_no_reading_is_lost_however_many(rng: np.random.Generator) -> None:
@@ -142,20 +126,6 @@ def test_any_origin_and_any_kind_of_array_will_do(arrays: dict[str, np.ndarray])
         same = unit.correct(**given)
         np.testing.assert_array_equal(same.specific_force, out.specific_force)
         np.testing.assert_array_equal(same.covariance, out.covariance)
-
-
-def test_objects_of_pandas_and_xarray(arrays: dict[str, np.ndarray]) -> None:
-    pandas = pytest.importorskip('pandas')
-    unit = rich_calibration()
-    out = unit.correct(**arrays)
-    frame = pandas.DataFrame(arrays['counts'], columns=list('xyz'))
-    frame['board'], frame['case'] = arrays['board'], arrays['case']
-    frame.index = pandas.to_timedelta(arrays['time_s'], unit='s')
-    same = unit.correct(frame.index, frame[list('xyz')], board=frame['board'], case=frame['case'])
-    np.testing.assert_array_equal(same.specific_force, out.specific_force)
-    xarray = pytest.importorskip('xarray')
-    data = {name: xarray.DataArray(value) for name, value in arrays.items()}
-    np.testing.assert_array_equal(unit.correct(**data).specific_force, out.specific_force)
 
 
 def test_data_are_no_exceptions_but_rows_of_nan(arrays: dict[str, np.ndarray]) -> None:

@@ -162,23 +162,6 @@ def test_one_state_has_the_bits_of_many(boards):
         np.testing.assert_array_equal(table.values(states[:, [k]])[:, 0], many[:, k])
 
 
-def test_lags_of_a_gradient_in_a_ramp():
-    # The gradient of a sensor that departs from the board at r K/s: L = r (t - tau (1 - e)).
-    rate, n = 0.002, 3000
-    columns = [Column('gradient_lag', 'gradient_lag', 'tip', tau, **WIDE) for tau in BANK_TAUS]
-    spec = memory_of(columns, ('case', 'tip'))
-    tracker = ThermalTracker(DetectorSettings(), spec)
-    for second in range(n + 1):
-        tracker.read('board', second * SECOND_NS, 20.0)
-        tracker.read('case', second * SECOND_NS, 20.0)
-        tracker.read('tip', second * SECOND_NS, 20.0 + rate * second)
-    state = np.array(tracker.sample(n * SECOND_NS))[:, np.newaxis]
-    found = ColumnTable(columns, spec, 20.0).values(state)[:, 0]
-    expected = [rate * (n - tau * -math.expm1(-n / tau)) for tau in BANK_TAUS]
-    # The thermometer needs some readings to follow the ramp: a few mK.
-    assert found == pytest.approx(expected, abs=0.02)
-
-
 @pytest.mark.parametrize(
     ('keys', 'message'),
     [

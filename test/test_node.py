@@ -24,7 +24,6 @@ from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, 
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
-from thermo_comp.online.compensator import Compensator
 from thermo_comp.ros.player import lossless
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.unit.calibration import Calibration, Unit
@@ -73,62 +72,6 @@ def diagnosis(peer: Peer) -> Callable[[Callable[[DiagnosticStatus, dict[str, str
         return found[0]
 
     return wait
-
-
-def test_publishes_the_compensators_values_under_the_inputs_stamps(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
-    unit = rich_calibration()
-    with node_in_thread(*saved(unit)) as node:
-        heard = peer.listen(Imu, 'imu/data_raw')
-        driver = drive(peer, node)
-        compensator = Compensator(unit)
-        expected = []
-        for k in range(300):
-            stamp_ns = START_NS + k * CYCLE_NS + 123
-            if k % 10 == 0:
-                driver.temperatures(stamp_ns - 50, 20.0 + 0.001 * k, 21.0 + 0.002 * k)
-                compensator.push('board', stamp_ns - 50, 20.0 + 0.001 * k)
-                compensator.push('case', stamp_ns - 50, 21.0 + 0.002 * k)
-            driver.counts(stamp_ns, 100.0 + k, -5.0 * k, 2900.0, frame_id='accel_link')
-            expected.append((stamp_ns, compensator.process(stamp_ns, 100.0 + k, -5.0 * k, 2900.0)))
-        peer.wait_for(lambda: len(heard) == 300, '300 samples')
-    for imu, (stamp_ns, values) in zip(heard, expected, strict=True):
-        assert stamp_of(imu) == stamp_ns
-        assert imu.header.frame_id == 'accel_link'
-        force = imu.linear_acceleration
-        assert (force.x, force.y, force.z) == values[:3]
-        c00, c01, c02, c11, c12, c22 = values[3:]
-        full = [c00, c01, c02, c01, c11, c12, c02, c12, c22]
-        assert imu.linear_acceleration_covariance.tolist() == full
-        assert imu.orientation_covariance[0] == imu.angular_velocity_covariance[0] == -1.0
-
-
-def test_a_reading_that_comes_late_counts_from_the_next_sample(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
-    # WHY: the node takes all waiting samples before the readings between them. WHAT: order of
-    # arrival decides, as in a bag; a reading never applies to earlier samples.
-    unit = rich_calibration()
-    with node_in_thread(*saved(unit), *lossless()) as node:
-        heard = peer.listen(Imu, 'imu/data_raw')
-        driver = drive(peer, node)
-        compensator = Compensator(unit)
-        expected = []
-        for k in range(2000):
-            stamp_ns = START_NS + k * CYCLE_NS
-            driver.counts(stamp_ns, *standing(k))
-            expected.append(compensator.process(stamp_ns, *standing(k)))
-            if k % 7 == 0:
-                # Its stamp is that of three samples before the one that it follows.
-                late = stamp_ns - 3 * CYCLE_NS
-                driver.temperatures(late, 20.0 + 0.01 * k, 22.0 + 0.01 * k)
-                compensator.push('board', late, 20.0 + 0.01 * k)
-                compensator.push('case', late, 22.0 + 0.01 * k)
-        expected = [values for values in expected if values is not None]
-        peer.wait_for(lambda: len(heard) == len(expected), f'{len(expected)} samples')
-    found = [(m.linear_acceleration.x, m.linear_acceleration.y) for m in heard]
-    assert found == [values[:2] for values in expected]
 
 
 def test_imu_input_with_frame_and_switch_of_the_input(

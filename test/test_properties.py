@@ -13,13 +13,12 @@ import contextlib
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from builders import calibration, rich_calibration
+from builders import rich_calibration
 from fault_rig import unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -31,7 +30,6 @@ from thermo_comp.online.trial import is_sound_sample, tried
 from thermo_comp.quantities import QUANTITIES
 from thermo_comp.unit.calibration import Calibration, RegimeSet
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
-from thermo_comp.unit.functions import Polynomial
 
 START_NS = 1_767_225_600_000_000_000
 UNITS = (rich_calibration(), unit())
@@ -303,32 +301,3 @@ def test_any_messages_give_sound_numbers(
 
 
 finite = st.floats(-1e3, 1e3)
-
-
-@settings(deadline=None)
-@given(
-    st.lists(st.floats(-1e-3, 1e-3), min_size=6, max_size=6),
-    st.lists(finite, min_size=6, max_size=6),
-    st.text(st.characters(codec='utf-8', exclude_categories=['Cc', 'Cs']), min_size=1, max_size=9),
-)
-def test_any_calibration_survives_its_file(
-    small: list[float], numbers: list[float], serial: str
-) -> None:
-    plain = calibration()
-    axis = replace(
-        plain.static.x,
-        delta=numbers[0],
-        bias_function=Polynomial((0.0, *numbers[1:4])),
-        scale_function=Polynomial((1.0, small[0], small[4] * 1e-3)),
-    )
-    try:
-        value = replace(
-            plain,
-            static=replace(plain.static, x=axis),
-            misalignment=((1.0, 0.0, 0.0), (small[1], 1.0, 0.0), (small[2], small[3], 1.0)),
-            unit=replace(plain.unit, serial=serial),
-        )
-        text = dump_calibration(value)
-    except (ValueError, CalibrationError):
-        return  # a file that the reader would refuse is not written
-    assert parse_calibration(text.encode()) == value

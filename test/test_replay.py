@@ -126,7 +126,7 @@ def output_of(path: Path) -> tuple[Block, list[tuple[int, bool]]]:
 
 
 def test_equals_the_stream_bit_for_bit(tmp_path: Path) -> None:
-    bag = thermal_test(tmp_path / 'bag')
+    bag = thermal_test(tmp_path / 'bag', rate_hz=3.0)
     calibration = rich_calibration()
     result = replay(bag, calibration, tmp_path / 'out')
     published, flags = one_by_one(read_recording(bag).columns, calibration)
@@ -211,22 +211,6 @@ def test_inputs_are_copied_as_they_are(tmp_path: Path) -> None:
     assert copies == messages
 
 
-def test_time_outs_and_lost_temperatures_are_counted(tmp_path: Path) -> None:
-    bag = tmp_path / 'bag'
-    with BagWriter(bag) as writer:
-        stamps = START_NS + np.arange(2000) * 100_000_000
-        writer.write_temperature(TOPICS.board, [START_NS + 10 * SECOND_NS], [20.0])
-        # Magnitude of about 1 g, never constant.
-        counts = 1700.0 + np.arange(2000)[:, None] % 2 + np.zeros(3)
-        writer.write_counts(TOPICS.counts, stamps, counts)
-    result = replay(bag, rich_calibration(), tmp_path / 'out')
-    # No output before the first reading at 10 s, nor later than 60 s after the only one.
-    assert result.counters.n_no_temperature == 100
-    assert result.counters.n_stale == 2000 - 100 - 601
-    assert result.counters.n_out == 601
-    assert result.n_flags == 0
-
-
 def test_another_unit_is_refused_unless_the_user_says_so(tmp_path: Path) -> None:
     bag = thermal_test(tmp_path / 'bag', minutes=1.0, serial='T-2')
     calibration = rich_calibration()
@@ -247,33 +231,17 @@ def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path: Path) -> None:
         replay(bag, rich_calibration(), tmp_path / 'out')
 
 
-def test_an_output_is_not_overwritten_unasked(tmp_path: Path) -> None:
-    bag = thermal_test(tmp_path / 'bag', minutes=1.0)
-    replay(bag, rich_calibration(), tmp_path / 'out')
-    with pytest.raises(OutputError, match='exists already'):
-        replay(bag, rich_calibration(), tmp_path / 'out')
-    replay(bag, rich_calibration(), tmp_path / 'out', overwrite=True)
-
-
-def test_progress_goes_from_nothing_to_all(tmp_path: Path) -> None:
-    bag = thermal_test(tmp_path / 'bag', minutes=1.0)
-    parts: list[float] = []
-    replay(bag, rich_calibration(), tmp_path / 'out', progress=parts.append)
-    assert parts == sorted(parts)
-    assert parts[-1] == 1.0
-
-
 def test_memory_does_not_grow_with_the_bag(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The short bag has many blocks, too; the unit converts at this rate, or its samples would be
     # dropped as too fast.
-    monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 13)
+    monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 12)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)
     calibration = dataclasses.replace(calibration, unit=unit)
     peaks, held = [], []
-    for name, minutes in (('short', 4.0), ('long', 12.0)):
+    for name, minutes in (('short', 2.0), ('long', 6.0)):
         bag = thermal_test(tmp_path / name, minutes=minutes, rate_hz=500.0)
         held.clear()
         tracemalloc.start()
