@@ -219,26 +219,6 @@ def test_six_faces_leave_misalignment_at_its_prior() -> None:
     assert np.abs(pulls(result, PLAIN)).max() < 4.0
 
 
-def test_one_position_tells_the_bias_along_gravity_over_temperature() -> None:
-    result = fitted(PLAIN, np.array([[0.0, 0.0, 1.0]]), 3)
-    _, scale_sd, M_sd = claimed(result.calibration)
-    # One equation for two unknowns per axis: the scale stays at its prior, 5 %.
-    assert scale_sd.max() == pytest.approx(0.05, rel=0.3)
-    np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
-    assert any(one.name == 'positions' and one.level == 'advice' for one in result.findings)
-    assert np.isfinite(result.positions[0].left_out_rms)
-    # The recorded drift is corrected all the same.
-    assert result.residuals[-1].fitted.rms / MICRO_G < 1.0
-
-
-def test_no_temperature_gives_nine_parameters() -> None:
-    records = records_of(replace(PLAIN, drift=()), positions(12, 1), 4)
-    result = fit(sources_of(records, False), FitOptions(gravity=STANDARD_GRAVITY))
-    assert result.calibration.response == ()
-    assert any(one.name == 'temperature' for one in result.findings)
-    assert np.abs(pulls(result, replace(PLAIN, drift=()))).max() < 4.0
-
-
 def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(
     rng: np.random.Generator,
 ) -> None:
@@ -299,11 +279,6 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> No
     assert moved.max() / MICRO_G < 1.01 * max(1.0, size.max() / MICRO_G / 300.0)
 
 
-def test_no_source_is_refused() -> None:
-    with pytest.raises(FitError, match='no bag was given'):
-        fit([], FitOptions(gravity=STANDARD_GRAVITY))
-
-
 def short_block(accel: np.ndarray, board: np.ndarray) -> ArrayBlock:
     stamps = np.arange(len(accel), dtype=np.int64) * 10_000_000
     readings = np.arange(len(board), dtype=np.int64) * 1_000_000_000
@@ -353,10 +328,3 @@ def test_saturated_samples_are_refused(rng: np.random.Generator) -> None:
     options = FitOptions(gravity=9.81, input='m/s^2', full_scale=9.815)
     with pytest.raises(FitError, match='samples are at the full scale'):
         fit(sources, options)
-
-
-def test_bags_of_two_units_are_refused(rng: np.random.Generator) -> None:
-    bags = [replace(source, serial=f's{k % 2}') for k, source in enumerate(faces(9.81, 0.0, rng))]
-    options = FitOptions(gravity=9.81, input='m/s^2')
-    with pytest.raises(FitError, match='different units: face4 of s0, face5 of s1'):
-        fit(bags, options)

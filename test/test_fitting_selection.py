@@ -51,7 +51,12 @@ def selected_of(
 ) -> tuple[Regression, Selected]:
     regression, state = begin(windows, up)
     candidates = candidates_of(windows, forced)
-    return regression, select(regression, state, constants(truth), candidates)
+    parts: list[float] = []
+    found = select(regression, state, constants(truth), candidates, parts.append)
+    # Progress rises.
+    assert parts == sorted(parts)
+    assert 0.0 < parts[0] <= parts[-1] <= 1.0
+    return regression, found
 
 
 def chosen_groups(found: Selected) -> set[str]:
@@ -271,16 +276,6 @@ def test_means_of_few_values_are_no_knocks() -> None:
     changed = regression.weight / before
     assert changed[100] < 0.02
     np.testing.assert_array_equal(np.delete(changed, 100), 1.0)
-
-
-def test_progress_rises() -> None:
-    windows, up = table_of(Truth(), 9, np.random.default_rng(2), n_windows=20)
-    regression, state = begin(windows, up)
-    parts: list[float] = []
-    select(regression, state, constants(Truth()), candidates_of(windows), parts.append)
-    assert parts
-    assert parts == sorted(parts)
-    assert 0.0 < parts[0] <= parts[-1] <= 1.0
 
 
 def test_of_two_columns_that_are_almost_one_the_better_stays() -> None:

@@ -118,20 +118,6 @@ class TestRow:
         assert '03.mcap: the file is cut off at byte' in row['reservations']
         assert row['n_positions'] == 7
 
-    def test_what_the_fit_refuses(self, tmp_path: Path) -> None:
-        write_unit(tmp_path / 'u', 1, 4, is_exchanged=True)
-        outcome = processed(tmp_path)
-        assert outcome.row['verdict'] == 'refused'
-        assert 'the board temperature leads the case' in outcome.row['problem']
-        assert outcome.is_final
-        assert outcome.calibration == ''
-
-    def test_nothing_but_damage(self, tmp_path: Path) -> None:
-        (path,) = write_unit(tmp_path / 'u', 1, 1)
-        damage(path)
-        row = processed(tmp_path).row
-        assert (row['verdict'], row['problem']) == ('failed', 'none of its bags can be used')
-
     def test_bags_of_two_units_in_one_folder(self, tmp_path: Path) -> None:
         write_unit(tmp_path / 'u', 1, 1)
         write_unit(tmp_path / 'u', 2, 1, names=['x.mcap'])

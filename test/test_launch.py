@@ -49,10 +49,6 @@ class TestEveryFile:
         text = re.sub(r'<!--.*?-->', '', path.read_text(), flags=re.DOTALL)
         assert set(re.findall(r'\$\(var ([\w]+)\)', text)) == declared(root)
 
-    def test_arguments_read_well_in_show_args(self, path: Path) -> None:
-        for one in parse(path).findall('arg'):
-            assert one.get('description', '').endswith('.'), one.get('name')
-
     def test_files_of_the_package_exist(self, path: Path) -> None:
         found = re.findall(r'\$\(find-pkg-share thermo_comp\)/([^"]+)"', path.read_text())
         assert found

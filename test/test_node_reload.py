@@ -19,7 +19,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 import rclpy
-from builders import axis_set, calibration, regime_set
+from builders import calibration
 from node_process import NodeProcess
 from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
@@ -160,25 +160,6 @@ def test_reload_while_samples_flow(peer: Peer, tmp_path: Path) -> None:
     biases = [flow.bias(index) for index in range(len(stamps))]
     changes = [b for a, b in pairwise(biases) if a != b]
     assert (biases[0], changes) == (1.0, [2.0, 3.0])
-
-
-def test_a_reload_keeps_the_thermal_state(peer: Peer, tmp_path: Path) -> None:
-    # WHY: a new calibration with the same sensors must not reset the node for minutes.
-    bias = regime_set(*[axis_set(bias=(0.0, 10.0))] * 3)
-    plain, biased = tmp_path / 'plain.yaml', tmp_path / 'biased.yaml'
-    save_calibration(of_bias(1.0), plain)
-    save_calibration(of_bias(1.0, static=bias, dynamic=bias), biased)
-    with node_in_thread(*lossless(), '-p', f'calibration_file:={plain}'):
-        flow = Flow(peer)
-        flow.more(50)
-        assert peer.set_parameters(calibration_file=str(biased))[0].successful
-        assert peer.set_parameters(calibration_file=str(plain))[0].successful
-        flow.more(50)
-        flow.stop()
-    stamps = [stamp_of(message) for message in flow.heard]
-    assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
-    # At the reference, 20 degC, the bias function is 0 for any slope.
-    assert {flow.bias(index) for index in range(len(stamps))} == {1.0}
 
 
 class _Stop(BaseException):

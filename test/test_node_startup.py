@@ -85,21 +85,6 @@ def test_one_topic_for_two_thermometers(unit: Path, capfd: pytest.CaptureFixture
     )
 
 
-def test_bad_start_as_a_process_is_one_line_too(tmp_path: Path) -> None:
-    finished = subprocess.run(
-        [sys.executable, '-m', 'thermo_comp.ros.node', *arguments('calibration_file:=none')[1:]],
-        cwd=Path(__file__).parents[1],
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT,
-        check=False,
-    )
-    assert finished.returncode == 1
-    assert finished.stderr == (
-        'thermo_comp_node: none: cannot be read: No such file or directory\n'
-    )
-
-
 @pytest.mark.parametrize(
     ('name', 'value', 'text'),
     [

@@ -32,7 +32,7 @@ from recording_helpers import (
 
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.blocks import Recording
-from thermo_comp.recording.reader import inspect_recording, open_recording, read_recording
+from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 
@@ -306,32 +306,6 @@ def test_a_bare_database_and_one_without_metadata(tmp_path: Path) -> None:
     assert 'metadata.yaml is missing' in str(recording.info.truncated)
     shutil.copy(tmp_path / 'bag' / 'bag.db3', tmp_path / 'bare.db3')
     assert_columns(read(tmp_path / 'bare.db3').columns, messages)
-
-
-def test_info_is_known_before_the_messages_are_read(tmp_path: Path) -> None:
-    messages = regular_messages(40)
-    write_mcap(tmp_path / 'bag.mcap', [*messages, Message(OTHER, START_NS + 10**9)])
-    info = inspect_recording(tmp_path / 'bag.mcap')
-    assert info.topics == {
-        ACCEL: ('geometry_msgs/msg/Vector3Stamped', 40),
-        BOARD: ('sensor_msgs/msg/Temperature', 5),
-        CASE: ('sensor_msgs/msg/Temperature', 5),
-        OTHER: ('std_msgs/msg/String', 1),
-    }
-    assert (info.start_ns, info.end_ns) == (START_NS, START_NS + 10**9)
-    assert info.input == 'counts'
-    assert info.n_messages == 51
-
-
-def test_auto_prefers_counts_that_are_there(tmp_path: Path) -> None:
-    both = [*regular_messages(8), *regular_messages(8, IMU_IN)]
-    write_mcap(tmp_path / 'both.mcap', both)
-    write_mcap(tmp_path / 'imu.mcap', regular_messages(8, IMU_IN))
-    assert read(tmp_path / 'both.mcap').info.input == 'counts'
-    assert read(tmp_path / 'imu.mcap').info.input == 'imu'
-    chosen = read_recording(tmp_path / 'both.mcap', Topics(input='imu'))
-    assert chosen.info.input == 'imu'
-    assert chosen.columns.imu is not None
 
 
 def test_a_topic_is_found_under_its_namespace(tmp_path: Path) -> None:

@@ -209,8 +209,3 @@ def test_torn_bags_of_other_storages_are_one_line(tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match='cannot be read') as caught:
             read(path)
         assert '\n' not in str(caught.value)
-
-
-def test_wire_sizes_are_as_the_layout_says() -> None:
-    # 4 encapsulation + align8(12 + 6) = 24 + 3 * 8: the sizes used by the tests above.
-    assert len(serialize(Message(ACCEL, 0, 0, 'accel', (1.0, 2.0, 3.0)))) == 52

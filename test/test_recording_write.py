@@ -5,13 +5,7 @@
 from __future__ import annotations
 
 import os
-import resource
-import signal
-import subprocess
-import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -256,33 +250,6 @@ def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path: Path) -
         BagWriter(tmp_path / 'folder.mcap', overwrite=True)
 
 
-@contextmanager
-def limited_file_size(n_bytes: int) -> Iterator[None]:
-    """Limit the size of files of this process, which has the effect of a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, handler)
-
-
-@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_a_full_disk_is_one_clear_error(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    small(path, 1.0)
-    bag = BagWriter(path, overwrite=True, compression='none')
-    rng = np.random.default_rng(1)
-    stamps = START_NS + STEP_NS * np.arange(50_000)
-    bag.write_counts('accel/counts', stamps, rng.normal(size=(50_000, 3)))
-    with limited_file_size(100_000), pytest.raises(OutputError, match=r'bag.*: cannot be wri'):
-        bag.close()
-    assert [p.name for p in tmp_path.iterdir()] == [name]
-    assert len(read_recording(path, require=()).columns) == 5
-
-
 def test_an_output_may_be_a_link(tmp_path: Path) -> None:
     for name in ('bag', 'bag.mcap'):
         small(tmp_path / 'disk' / name, 1.0)
@@ -304,31 +271,6 @@ def test_a_target_that_cannot_be_made(tmp_path: Path) -> None:
         (tmp_path / 'locked').mkdir(mode=0o500)
         with pytest.raises(OutputError, match='cannot be written: Permission denied'):
             BagWriter(tmp_path / 'locked' / 'bag.mcap')
-
-
-@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_a_killed_writer_leaves_the_old_output_and_a_readable_rest(
-    tmp_path: Path, name: str
-) -> None:
-    path = tmp_path / name
-    small(path, 1.0)
-    script = (
-        'import os, signal, sys, numpy as np\n'
-        'from thermo_comp.recording.writer import BagWriter\n'
-        'bag = BagWriter(sys.argv[1], overwrite=True)\n'
-        'stamps = np.arange(90_000) * 2_500_000\n'
-        "bag.write_counts('accel/counts', stamps, np.zeros((90_000, 3)))\n"
-        'bag.flush()\n'
-        'os.kill(os.getpid(), signal.SIGKILL)\n'
-    )
-    killed = subprocess.run([sys.executable, '-c', script, str(path)], check=False)
-    assert killed.returncode == -signal.SIGKILL
-    assert float(read_recording(path, require=()).columns.accel[0, 0]) == 1.0
-    (rest,) = (entry for entry in tmp_path.iterdir() if entry != path)
-    recovered = read_recording(rest, require=())
-    assert recovered.info.truncated is not None
-    # The chunk that is being filled is lost, of 14 000 messages.
-    assert 76_000 <= len(recovered.columns) <= 90_000
 
 
 def test_arguments_that_do_not_fit(tmp_path: Path) -> None:

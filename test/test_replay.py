@@ -240,18 +240,23 @@ def test_memory_does_not_grow_with_the_bag(
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)
     calibration = dataclasses.replace(calibration, unit=unit)
-    peaks, held = [], []
+    peaks, held, parts = [], [], []
     for name, minutes in (('short', 2.0), ('long', 6.0)):
         bag = thermal_test(tmp_path / name, minutes=minutes, rate_hz=500.0)
         held.clear()
         tracemalloc.start()
         result = replay(
             *(bag, calibration, tmp_path / f'{name}.mcap'),
-            progress=lambda _: held.append(tracemalloc.get_traced_memory()[0]),
+            progress=lambda part: (
+                parts.append(part),
+                held.append(tracemalloc.get_traced_memory()[0]),
+            ),
         )
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         assert result.counters.n_out == minutes * 60.0 * 500.0
+    assert parts[len(parts) - len(held) :] == sorted(parts[len(parts) - len(held) :])
+    assert parts[-1] == 1.0
     # Three times the messages: memory only grows by the flags of the bag, one per case reading.
     assert peaks[1] < 1.1 * peaks[0]
     third = len(held) // 3

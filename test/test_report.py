@@ -17,7 +17,7 @@ from report_helpers import LEFT_OUT_RMS, RATE_HZ, certificate, evidence, fitted,
 from simulation_helpers import ideal_regime
 
 from thermo_comp import __version__
-from thermo_comp.errors import CalibrationError, OutputError, RecordingError
+from thermo_comp.errors import OutputError
 from thermo_comp.fitting.reduction import Readings, ReducedBag
 from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.recording.writer import BagWriter
@@ -284,24 +284,3 @@ def test_verdict_and_its_colour(opened):
     page = words_of(strict)
     assert '<section class="verdict poor"' in page.source
     assert spelt(strict.judgement.reason) in page.text
-
-
-def test_another_units_calibration_is_refused(opened):
-    calibration = fitted().calibration
-    other = replace(calibration, unit=replace(calibration.unit, serial='other'))
-    with pytest.raises(CalibrationError, match='other'):
-        evidence_of_bags(opened, other)
-    assert evidence_of_bags(opened, other, serial='').serial == 'other'
-
-
-def test_refusals(tmp_path):
-    with pytest.raises(RecordingError, match='no such file'):
-        open_bags([tmp_path / 'none.mcap'])
-
-
-def test_command(cli, bag, tmp_path):
-    page = tmp_path / 'page.html'
-    shown = cli('report', bag, '-o', page, '--figures', tmp_path)
-    assert 'no calibration was judged' in shown.stdout
-    assert '<svg' in page.read_text()
-    assert (tmp_path / '1_temperatures.png').exists()

@@ -16,10 +16,8 @@ from hypothesis import strategies as st
 from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.errors import ThermoCompError
-from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.report.certificate import budget, combined, conformity, over_temperature, results
-from thermo_comp.report.evidence import evidence_of_bags
 from thermo_comp.report.html import rounded
 from thermo_comp.report.page import render_report
 from thermo_comp.report.statements import CertificateInfo, load_certificate_info
@@ -267,13 +265,6 @@ def test_conformity_is_stated_to_a_limit_alone():
         said, rule = conformity(replace(evidence(), judgement=judged))
         assert said == ''
         assert 'o statement of conformity is made' in rule
-
-
-def test_simulated_bags_mark_every_page(tmp_path):
-    calibration = fitted().calibration
-    simulated = evidence_of_bags(open_bags([write_bag(tmp_path / 'sim.mcap')]), calibration)
-    assert 'class="simulated"' in render_report(simulated, figures=[])
-    assert 'class="simulated"' not in render_report(evidence_of_bags([], calibration), figures=[])
 
 
 @pytest.mark.usefixtures('no_figures')

@@ -16,7 +16,7 @@ from report_helpers import evidence, fitted
 
 from thermo_comp.report import figures_bags as of_bags
 from thermo_comp.report import figures_unit as of_unit
-from thermo_comp.report.html import label_text, number
+from thermo_comp.report.html import number
 from thermo_comp.report.page import figures_of, position_error, schuler_peak
 from thermo_comp.report.states import curves
 from thermo_comp.report.style import drawing, svg
@@ -145,17 +145,6 @@ def test_figures_are_legible_in_black_and_white(draw):
 )  # fmt: skip
 def test_numbers_are_spelt_for_readers(value, text):
     assert number(value) == text
-
-
-def test_names_of_others_fit_a_figure():
-    assert label_text('a\nb\x00c ') == 'a b c'
-    assert label_text('x' * 60) == 'x' * 39 + '…'
-
-
-def test_every_figure_asks_a_question():
-    for one in figures_of(evidence()):
-        assert one.question.endswith('?')
-        assert one.reading.endswith('.')
 
 
 def test_label_of_a_drawing_is_escaped():

@@ -8,17 +8,7 @@ import numpy as np
 import pytest
 from simulation_helpers import rates_k_min
 
-from thermo_comp.simulation.campaign import CYCLOGRAM_NAMES, parse_cyclogram
-
-
-@pytest.mark.parametrize('name', [name for name in CYCLOGRAM_NAMES if name != 'soak'])
-def test_presets_heat_and_cool_within_the_papers_range(name: str) -> None:
-    program = parse_cyclogram(name)
-    air = np.array(program.temperature_c)
-    assert air.min() >= 5.0
-    assert air.max() <= 35.0
-    assert air.max() - air.min() >= 20.0
-    assert rates_k_min(program).max() > 0.0 > rates_k_min(program).min()
+from thermo_comp.simulation.campaign import parse_cyclogram
 
 
 def test_paper_covers_its_range_in_ramps_and_soaks() -> None:
@@ -27,12 +17,6 @@ def test_paper_covers_its_range_in_ramps_and_soaks() -> None:
     assert max(program.temperature_c) == 35.0
     ramps = rates_k_min(program)[rates_k_min(program) != 0.0]
     np.testing.assert_allclose(np.abs(ramps), 0.5)
-
-
-def test_presets_span_the_ramp_rates_a_detector_meets() -> None:
-    rates = np.abs(np.concatenate([rates_k_min(parse_cyclogram(n)) for n in CYCLOGRAM_NAMES]))
-    assert rates[rates > 0.0].min() == pytest.approx(0.1)
-    assert rates.max() == pytest.approx(3.0)
 
 
 def test_a_typed_program_is_read_as_written() -> None:

@@ -76,12 +76,6 @@ def test_still_air_is_another_law_of_the_hidden_node() -> None:
     assert abs(shares[1] - shares[0]) > 0.3
 
 
-def test_samples_of_a_perfect_unit_are_the_force() -> None:
-    bag = record(unit(), program(20, 10), LEVEL, rng_of('perfect'))
-    assert bag.samples == pytest.approx(np.broadcast_to(bag.force, bag.samples.shape), abs=1e-12)
-    assert np.linalg.norm(bag.force) == pytest.approx(GRAVITY)
-
-
 def test_noise_bias_scale_and_misalignment_follow_their_definition() -> None:
     # corrected = M (measured - bias) / scale must give the force, except for white noise.
     given = unit(
@@ -204,38 +198,6 @@ def test_turn_on_draws_its_positions_and_its_shifts(recorded) -> None:
         sd, n = float(label.split()[2]), np.size(shifts)
         # The sd of an sd over n draws is 1 / sqrt(2 n).
         assert np.std(shifts) == pytest.approx(sd, rel=5.0 / np.sqrt(2 * n), abs=1e-12)
-
-
-def test_mems_are_as_the_issue_of_a_data_sheet(recorded) -> None:
-    study = next(cases.mems(1))
-    given = recorded(study.bags[0])[0]
-    assert given.counts * GRAVITY == pytest.approx(2048.0)
-    assert (given.density, given.reading_sd, given.sensors) == (150.0, 0.1, ('board',))
-
-
-def test_a_unit_that_was_carried_is_held_out_after_it(recorded) -> None:
-    study = next(cases.carry(1))
-    shifts = np.array([recorded(bag)[3]['shift'] for bag in study.bags])
-    assert not shifts[:6].any()
-    assert (np.abs(shifts[6:]) >= 50.0).all()
-    assert (np.abs(shifts[6:]) <= 150.0).all()
-    assert recorded(study.tests[''][0])[3]['shift'] == pytest.approx(shifts[-1])
-
-
-def test_one_bag_of_the_new_environment_is_added_jointly_and_by_prior(recorded) -> None:
-    alone, joint, prior = cases.third_node(1)
-    assert {recorded(bag)[3].get('environment', CHAMBER) for bag in alone.bags} == {CHAMBER}
-    assert joint.bags[:-1] == alone.bags
-    assert prior.bags == joint.bags[-1:]
-    assert prior.prior_of == alone.label
-    assert recorded(prior.bags[0])[3]['environment'] == STILL_AIR
-    own = recorded(alone.tests['its attitude'][0])[2]
-    assert own == pytest.approx(recorded(prior.bags[0])[2])
-
-
-def test_gravity_is_wrong_by_what_is_stated(recorded) -> None:
-    study = next(cases.gravity(1))
-    assert study.gravity - GRAVITY == pytest.approx(study.options['gravity_sd'])
 
 
 def test_the_bound_falls_with_noise_and_with_data() -> None:

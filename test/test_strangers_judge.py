@@ -4,9 +4,7 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -224,70 +222,3 @@ def test_blocks_go_by_the_clock_and_share_no_sample() -> None:
     # The last sample would be a block alone.
     assert times.tolist() == bag.time_s[9000:-1].tolist()
     assert all((block.time_s // 10800.0 == number).all() for number, block in blocks.items())
-
-
-def test_one_study_of_a_case_can_be_asked_for(capsys, monkeypatch) -> None:
-    ran = []
-    monkeypatch.setattr(
-        strangers, 'run', lambda _, unit, study, *__: ran.append((unit, study.label)) or []
-    )
-    monkeypatch.setattr(cases, 'record', lambda *_, name, **__: Bag(name, None, None, {}))
-    strangers.run_case('turn-on', '9 at 30 ug', 2, None, {})
-    assert ran == [(1, '9 at 30 ug'), (2, '9 at 30 ug')]
-
-
-def test_baselines_come_from_an_earlier_run(tmp_path, monkeypatch) -> None:
-    path = tmp_path / 'earlier.json'
-    scores = {'fit': asdict(Score(1.0, 2.0)), 'cubic': asdict(Score(3.0))}
-    unit = {'title': 'ageing', 'unit': 1, 'scores': scores}
-    path.write_text(json.dumps({'units': [unit]}))
-    earlier = strangers.baselines_in(path)
-    assert list(earlier) == [('ageing', 1)]
-    assert list(earlier['ageing', 1]) == ['cubic']
-    assert earlier['ageing', 1]['cubic'].norm == 3.0
-
-    def refused(study, prior, **options):
-        assert not options
-        raise ValueError('no rest')
-
-    monkeypatch.setattr(strangers, 'fitted', refused)
-    bag = Bag('', np.arange(1.0, 301.0), np.ones((300, 3)), {}, LEVEL)
-    study = cases.Study('', (bag,), {'': (bag,)})
-    [result] = strangers.run('ageing', 1, study, {}, earlier)
-    assert (result.refused, list(result.scores)) == ('no rest', ['cubic'])
-
-
-def test_only_a_study_that_asks_for_a_prior_gets_one(monkeypatch) -> None:
-    priors = []
-
-    def fitted(study, prior, **options):
-        priors.append((study.label, prior, len(options)))
-        return study.label
-
-    monkeypatch.setattr(strangers, 'fitted', fitted)
-    monkeypatch.setattr(strangers, 'chosen_by', str)
-    monkeypatch.setattr(strangers, 'scored', lambda *_: {'': Score()})
-    monkeypatch.setattr(strangers, 'by_hand', lambda _: {})
-    done: dict = {}
-    for label, prior_of in (('', ''), ('alone', ''), ('prior', 'alone')):
-        strangers.run(
-            'third-node', 1, cases.Study(label, (), {'': ()}, prior_of=prior_of), done, {}
-        )
-    fits = [(label, prior) for label, prior, n_options in priors if not n_options]
-    assert fits == [('', None), ('alone', None), ('prior', 'alone')]
-    assert [prior for *_, prior, n_options in priors if n_options] == [None] * 4
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'message'),
-    [
-        (['--cases', 'kinks'], "'kinks' is none of sample-bags"),
-        (['--cases', 'cats'], 'cats needs --cats FILE'),
-    ],
-)
-def test_a_wrong_case_is_told(arguments, message, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(sys, 'argv', ['strangers.py', *arguments])
-    with pytest.raises(SystemExit) as stop:
-        strangers.main()
-    assert stop.value.code == 2
-    assert message in capsys.readouterr().err

@@ -121,11 +121,3 @@ def test_no_samples(tmp_path: Path) -> None:
     result = survey_recording(tmp_path / 'bag')
     assert result.n == 0
     assert any('no accelerometer samples' in f for f in result.findings)
-
-
-def test_progress(tmp_path: Path) -> None:
-    survey(tmp_path / 'bag', up_and_down(5.0, 35.0))
-    parts: list[float] = []
-    survey_recording(tmp_path / 'bag', progress=parts.append)
-    assert parts == sorted(parts)
-    assert parts[-1] == 1.0

@@ -19,7 +19,7 @@ from rclpy.context import Context
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import deserialize_message
 from ros_helpers import DEEP, TIMEOUT, Peer
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -113,17 +113,6 @@ def test_messages_come_serialized_in_order_with_their_time(node: Node, peer: Pee
     assert running.received_ns[0] > 0
 
 
-def test_one_drain_takes_what_waits_and_leaves_nothing(node: Node, peer: Peer) -> None:
-    loop = WaitLoop(node)
-    raw = loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=2000))
-    publisher = peer.publisher(Vector3Stamped, 'samples')
-    for _ in range(100):
-        publisher.publish(Vector3Stamped())
-    taken: list[bytes] = []
-    peer.poll(lambda: taken.extend(raw.drain()[0]) or len(taken) == 100, '100 messages')
-    assert raw.drain() == ([], [])
-
-
 def test_what_a_full_queue_loses_is_counted(node: Node, peer: Peer) -> None:
     loop = WaitLoop(node)
     raw = loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=10))
@@ -142,16 +131,6 @@ def test_what_a_full_queue_loses_is_counted(node: Node, peer: Peer) -> None:
 
     peer.poll(is_last_taken, 'the last message')
     assert raw.n_lost == 51 - len(taken)
-
-
-def test_raw_publisher_sends_the_bytes(node: Node, peer: Peer) -> None:
-    heard = peer.listen(Vector3Stamped, 'copies', raw=True)
-    publisher = node.create_publisher(Vector3Stamped, 'copies', DEEP)
-    peer.poll(publisher.get_subscription_count, 'the match')
-    data = serialize_message(Vector3Stamped())
-    publisher.handle.publish_raw(data)
-    peer.wait_for(lambda: heard)
-    assert heard[0] == data
 
 
 def test_the_rest_of_the_node_is_served_while_samples_flow(node: Node, peer: Peer) -> None:
@@ -221,23 +200,6 @@ def test_a_regular_call_goes_on_with_and_without_samples(node: Node, peer: Peer)
     assert again[0] >= 0.03
     assert again[2] >= 0.09
     assert len(called) <= n_called + 1
-
-
-def test_a_callback_that_fails_stops_no_samples(node: Node, peer: Peer) -> None:
-    failed: list[int] = []
-
-    def fail() -> None:
-        failed.append(len(failed))
-        # The middleware's exceptions, and any others.
-        raise RCLError('the client went away') if len(failed) % 2 else KeyError('key')
-
-    running = Running(node)
-    running.loop.call_every(0.005, fail)
-    with running:
-        publisher = peer.publisher(Vector3Stamped, 'samples')
-        peer.poll(lambda: len(failed) > 2, 'failures')
-        publisher.publish(Vector3Stamped())
-        running.wait_for(lambda: running.messages)
 
 
 def test_stops_from_another_thread_and_at_shutdown(node: Node) -> None:
