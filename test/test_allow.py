@@ -54,10 +54,8 @@ def swapped(source: FitSource, rest: Rest) -> FitSource:
 @pytest.mark.parametrize(
     ('name', 'spoil', 'options', 'n'),
     [
-        ('saturation', saturated, COUNTS, 1),
         ('saturation', saturated, COUNTS, 7),
         ('units', as_it_is, COUNTS, 1),
-        ('units', as_it_is, COUNTS, 7),
         ('jump', jumped, FORCE, 1),
         ('jump', jumped, FORCE, 7),
         # Ten minutes are too short to determine which thermometer leads.

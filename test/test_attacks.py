@@ -139,7 +139,7 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(
             *(('input', value) for value in ('imu', 'counts')),
         ]
         asked = []
-        for _ in range(15):
+        for _ in range(6):
             for client in clients:
                 given = dict(rng.choices(choices, k=3))
                 messages = [Parameter(k, value=v).to_parameter_msg() for k, v in given.items()]

@@ -81,7 +81,7 @@ def calibrations(draw):
 
 
 @given(calibrations())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_round_trip_is_exact(value):
     assert parse_calibration(dump_calibration(value).encode()) == value
 

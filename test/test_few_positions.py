@@ -35,7 +35,7 @@ def left_by(pair: tuple[int, int], **options: str) -> Floats:
     return np.asarray(minutes(corrected.specific_force).std(axis=0))
 
 
-@pytest.mark.parametrize('pair', [(1, 2), (2, 5), (3, 9), (4, 8)])
+@pytest.mark.parametrize('pair', [(1, 2), (3, 9)])
 def test_two_positions_tell_the_thermal_response(pair: tuple[int, int]) -> None:
     # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine their sd to 6 %, and a few
     # superfluous columns may add a tenth. Half of all 36 pairs are as good (docs/accuracy.md).
