@@ -158,7 +158,7 @@ def at_seconds(*events):
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
 @example(at_seconds('B', 12, 'B', 7.1, 'A', 7.1, 'B', 6.1), 1, 0.0)
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, transition_s):
     config = CompensatorConfig(transition_time_s=transition_s, case_timeout_s=2.0)
     streamed = Compensator(RICH, config)

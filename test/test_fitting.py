@@ -93,7 +93,7 @@ def response() -> FitResult:
 
 @pytest.fixture(scope='module')
 def golovach() -> FitResult:
-    return fitted(PAPER, positions(12, 1), 1, model='golovach')
+    return fitted(PAPER, positions(9, 1), 1, model='golovach')
 
 
 def pulls(found: FitResult, unit: UnitModel) -> Floats:

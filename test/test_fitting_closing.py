@@ -52,7 +52,6 @@ def weight(record: SimulatedRun, closes: Closes) -> Floats:
     ('closes', 'options'),
     [
         ('board', {'model': 'golovach'}),
-        ('case', {'model': 'golovach'}),
         ('case', {'groups': ('curve', 'set', 'board')}),
     ],
 )
