@@ -44,10 +44,3 @@ def test_the_table_of_the_response_has_every_group() -> None:
     assert shown == list(
         dict.fromkeys(column.group for column in bank(('case',), {'case': -0.5}, (-9.0, 9.0)))
     )
-
-
-# Not Eq. (3) to (5), which use signed counts at +I and -I: no command measures those.
-@pytest.mark.parametrize('number', [1, 2, 6, 7, 8, 9, 10])
-def test_an_equation_of_the_paper_is_found_by_its_number(number: int) -> None:
-    tag = re.compile(rf'\bEq\. [^\n]*\({number}\)')
-    assert any(tag.search(path.read_text()) for path in SOURCES)

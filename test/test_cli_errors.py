@@ -169,39 +169,10 @@ class TestBags:
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.8')
         assert 'no temperature was recorded' in cli('fit', path, *arguments).stdout
 
-    def test_missing_case_temperature_is_no_error(
-        self, cli: Cli, unit: Path, tmp_path: Path
-    ) -> None:
-        # The regime is decided by the board thermometer, as in the node.
-        path = bag(tmp_path / 'bag', case=False)
-        said = cli('replay', path, '-c', unit, '-o', tmp_path / 'out').stdout
-        assert '600 of 600 samples corrected' in said
-
     def test_another_unit_s_bag(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
         path = bag(tmp_path / 'bag', serial='T-2')
         self.replayed(cli, unit, path, r'unit.serial: this calibration is of unit T-1.*of T-2')
         refused(cli, 1, r'is of unit T-1', 'evaluate', path, '-c', unit)
-
-
-class TestCalibrations:
-    def used(self, cli: Cli, tmp_path: Path, text: str, message: str) -> None:
-        path = tmp_path / 'bad.yaml'
-        path.write_text(text)
-        recorded = tmp_path / 'bag'
-        if not recorded.exists():
-            bag(recorded)
-        refused(cli, 1, message, 'replay', recorded, '-c', path, '-o', tmp_path / 'out')
-
-    def test_nan_names_its_key(self, cli: Cli, tmp_path: Path, unit: Path) -> None:
-        text = re.sub(r'bias: 5\.0', 'bias: .nan', unit.read_text(), count=1)
-        assert '.nan' in text
-        self.used(cli, tmp_path, text, r'bad.yaml: axes.x.bias: ')
-
-    def test_missing_file(self, cli: Cli, tmp_path: Path) -> None:
-        recorded = bag(tmp_path / 'bag')
-        arguments = ('-c', tmp_path / 'absent.yaml', '-o', tmp_path / 'out')
-        refused(cli, 1, r'absent.yaml: cannot be read', 'replay', recorded, *arguments)
-        refused(cli, 1, r'absent.yaml: cannot be read', 'info', tmp_path / 'absent.yaml')
 
 
 class TestFits:
@@ -211,11 +182,6 @@ class TestFits:
         refused(cli, 2, r'`groups` must be of curve, .*memory', *arguments, '--groups', 'memory')
         refused(cli, 2, r'quadratic', *arguments, '--model', 'quadratic')
         assert not (tmp_path / 'new.yaml').exists()
-
-    def test_gravity_of_another_planet(self, cli: Cli, tmp_path: Path) -> None:
-        path = bag(tmp_path / 'bag.mcap')
-        arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '3.71')
-        refused(cli, 1, r'3.71 m/s\^2 is not found on Earth', 'fit', path, *arguments)
 
     def test_bags_of_two_units(self, cli: Cli, tmp_path: Path) -> None:
         paths = [bag(tmp_path / f'{i}.mcap', serial=f'T-{i}') for i in range(2)]
@@ -260,14 +226,6 @@ class TestEvaluations:
         assert 'no claim: ' in cli(*arguments, code=1).stdout
         assert 'valid: ' in cli(*arguments, '--tolerance', '1mg').stdout
         assert 'recalibrate: ' in cli(*arguments, '--tolerance', '1e-5ug', code=1).stdout
-
-    def test_never_at_rest(self, cli: Cli, unit: Path, tmp_path: Path) -> None:
-        rng = np.random.default_rng(1)
-        stamps = START_NS + np.arange(50) * 100_000_000
-        with BagWriter(tmp_path / 'bag') as writer:
-            writer.write_temperature(TOPICS.board, stamps[::10], np.full(5, 20.0))
-            writer.write_counts(TOPICS.counts, stamps, 1000.0 * rng.standard_normal((50, 3)))
-        refused(cli, 1, r'no window of 60 s at rest', 'evaluate', tmp_path / 'bag', '-c', unit)
 
 
 @pytest.mark.usefixtures('no_figures')

@@ -105,6 +105,10 @@ def test_help_cuts_no_name(name: str, cli: Cli, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(rich_utils, 'MAX_WIDTH', 80)
     said = cli(*name.split(), '--help').stdout
     assert '…' not in said
+    assert max(map(len, said.splitlines())) <= 80
+    # The help printer takes square brackets as mark-up and drops their content.
+    assert not re.search(r' \.\s', said)
+    assert said == cli(*name.split(), '-h').stdout
     for parameter in COMMANDS[name].params:
         assert all(option in said for option in parameter.opts if option.startswith('-')), said
 

@@ -284,16 +284,3 @@ def test_format_without_a_time_stamp_is_left_out(tmp_path):
     path.write_bytes(log.body)
     with pytest.raises(RecordingError, match=r'not a ULog file|holds no IMU'):
         read_autopilot(path)
-
-
-def test_command(tmp_path, rng, cli):
-    log = tmp_path / 'flight.ulg'
-    write_two_imus(log, rng)
-    finished = cli('convert', log, '--imu', '1', '-o', tmp_path / 'bag.mcap')
-    assert 'SDLOG_PROFILE' not in finished.stdout
-    assert f'{N:8} imu/uncompensated' in finished.stdout
-    finished = cli('convert', log, '--columns', log, '-o', tmp_path / 'two.mcap', code=2)
-    assert 'needs no --columns' in finished.stderr
-    finished = cli('convert', log, '--imu', '7', '-o', tmp_path / 'two.mcap', code=1)
-    assert 'no IMU 7' in finished.stderr
-    assert not (tmp_path / 'two.mcap').exists()

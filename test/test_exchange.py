@@ -110,16 +110,6 @@ def test_ardupilot_formula_gives_our_bias_changes(cubic: Calibration) -> None:
             assert change == pytest.approx(ours, rel=1e-7, abs=1e-9)
 
 
-def test_px4_round_trip(cubic: Calibration) -> None:
-    back = import_calibration(export_calibration(cubic, 'px4').text, serial='7')
-    assert back.static.temperature_range_c == (5.0, 45.0)
-    for axis in range(3):
-        for celsius in (5.0, 20.0, 45.0):
-            assert bias_at(back, axis, celsius) == pytest.approx(
-                bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9
-            )
-
-
 def test_ardupilot_import_has_no_bias_where_it_was_calibrated(cubic: Calibration) -> None:
     text = (
         export_calibration(cubic, 'ardupilot').text.replace(',', '=') + 'INS_ACC1_CALTEMP=28.0\n'

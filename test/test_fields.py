@@ -199,19 +199,6 @@ def test_a_bag_with_a_drivers_own_type(tmp_path: Path, store: Any, storage: Stor
     assert case.stamp_ns.tolist() == [START_NS + row * 10**7 for row in range(0, 50, 5)]
 
 
-def test_raw_readings_are_temperatures(tmp_path: Path, store: Any) -> None:
-    driver_bag(tmp_path / 'bag', store)
-    names = {'board': '/fmu/out/sensor_accel:temperature', 'case': '/case'}
-    with open_recording(tmp_path / 'bag', Topics.named(names)) as reader:
-        (block,) = reader.blocks(raw=True)
-    found = [
-        store.deserialize_cdr(one, 'sensor_msgs/msg/Temperature') for one in block.raw['case']
-    ]
-    stamps = [one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for one in found]
-    assert stamps == block.temperatures['case'].stamp_ns.tolist()
-    assert [one.temperature for one in found] == block.temperatures['case'].celsius.tolist()
-
-
 def test_two_fields_of_one_message_are_no_twins(tmp_path: Path, store: Any) -> None:
     driver_bag(tmp_path / 'bag', store)
     topic = '/fmu/out/sensor_accel'

@@ -50,10 +50,7 @@ def weight(record: SimulatedRun, closes: Closes) -> Floats:
 
 @pytest.mark.parametrize(
     ('closes', 'options'),
-    [
-        ('board', {'model': 'golovach'}),
-        ('case', {'groups': ('curve', 'set', 'board')}),
-    ],
+    [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],
 )
 def test_evidence_says_when_the_regime_closes(closes: Closes, options: dict[str, Any]) -> None:
     # A reading every four seconds: the case changes by 0.1 K between them.

@@ -180,15 +180,6 @@ def test_where_a_thermometer_is_lost_nothing_is_known(
     np.testing.assert_array_equal(windows.data.columns[both], whole.data.columns[kept])
 
 
-def test_each_column_stands_without_the_others(bags: list[ReducedBag]) -> None:
-    together = windows_of(bags).data
-    for kind in ('board', 'gradient_lag', 'square'):
-        number = next(k for k, one in enumerate(bank()) if one.kind == kind and one.tau_s == 960.0)
-        alone = windows_of(bags, (bank()[number],)).data
-        np.testing.assert_array_equal(alone.columns[:, 6], together.columns[:, 6 + number])
-        np.testing.assert_array_equal(alone.start[:, 6], together.start[:, 6 + number])
-
-
 def test_the_lag_of_a_column_moves_it_as_its_slope_says() -> None:
     # A lag that started a microkelvin higher, through the formula of the columns.
     columns = bank(span_k=(-4.0, 12.0))

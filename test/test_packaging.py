@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import ast
-import configparser
 import os
 import re
 import subprocess
@@ -137,13 +136,6 @@ def test_hosted_ci_does_what_the_readme_says() -> None:
     for line in re.findall(r'^ *((?:rosdep|pip) install .*?) *(?:#.*)?$', run, re.MULTILINE):
         assert line in readme, line
     assert jobs['ros']['container'] == 'ros:jazzy'
-
-
-def test_scripts_land_where_ros2_run_looks() -> None:
-    config = configparser.ConfigParser()
-    config.read(ROOT / 'setup.cfg')
-    assert config['develop']['script_dir'] == '$base/lib/thermo_comp'
-    assert config['install']['install_scripts'] == '$base/lib/thermo_comp'
 
 
 def test_share_holds_what_ros_looks_for(tmp_path: Path) -> None:

@@ -7,11 +7,10 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.recording.chunks import DamagedError, locate, walk
+from thermo_comp.recording.chunks import locate, walk
 from thermo_comp.recording.serialized import Messages
 
 MESSAGE, CHANNEL = 5, 4
@@ -117,25 +116,3 @@ def test_a_walk_equals_the_plain_loop_and_a_false_index_changes_nothing(
     )
     assert listed(messages) == wanted
     assert others == wanted_others
-
-
-def test_what_is_no_sequence_of_records() -> None:
-    whole = message(1, 2, b'abc')
-
-    def located(data: bytes, index: bytes = b'') -> list[tuple[int, int, int, int]]:
-        return listed(locate(np.frombuffer(data, np.uint8), memoryview(index), lambda *_: None))
-
-    assert located(whole) == [(0, 3, 1, 2)]
-    with pytest.raises(DamagedError, match='a record ends too early'):
-        located(whole[:-1])
-    with pytest.raises(DamagedError, match='a record ends too early'):
-        located(whole + b'\x05')
-    with pytest.raises(DamagedError, match='a record has the opcode 0'):
-        located(whole + bytes(9))
-    with pytest.raises(DamagedError, match='a message record has 21 bytes'):
-        located(struct.pack('<BQ', MESSAGE, 21) + bytes(21))
-    with pytest.raises(DamagedError, match='log time beyond the year 2262'):
-        located(message(1, 2**63, b''))
-    # An invalid index is no hint, and the bytes after the message are not part of it.
-    for index in (whole, index_of([(0, 3, 1, 2)])[:-1], b'\0'):
-        assert located(whole, index) == [(0, 3, 1, 2)]

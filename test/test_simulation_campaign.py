@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from accuracy import corrected_by_truth
 from simulation_helpers import of_part
-from triads import TRIAD_NAMES, SlipEffect, sibling, triad
+from triads import TRIAD_NAMES, SlipEffect, triad
 
 from thermo_comp.simulation.campaign import PLAN_NAMES, Position, parse_cyclogram, plan
 from thermo_comp.simulation.drift import FlowEffect, PartHistory
@@ -61,21 +61,6 @@ def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
         # 1311 means scatter by 2 % and 1.2 %; five of each.
         assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
         assert vector == pytest.approx(1.12, abs=0.07)
-
-
-def test_siblings_are_near_and_not_the_same() -> None:
-    unit = triad('between', 1)
-    first, again, second = (sibling(unit, seed) for seed in (1, 1, 2))
-    assert first == again
-    assert first.serial != second.serial
-    for other in (first, second):
-        for name, value in unit.network.capacity.items():
-            assert 0.0 < abs(other.network.capacity[name] / value - 1.0) <= 0.15
-        for was, now in zip(unit.drift, other.drift, strict=True):
-            moved = np.array(now.bias)[np.array(was.bias) != 0.0]
-            base = np.array(was.bias)[np.array(was.bias) != 0.0]
-            assert np.all(np.abs(moved / base - 1.0) <= 0.15)
-            assert np.all(moved != base)
 
 
 def test_plans_are_what_their_names_say() -> None:

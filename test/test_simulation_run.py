@@ -12,7 +12,6 @@ from scipy.signal import welch
 from simulation_helpers import noiseless, of_part, rippled
 
 from thermo_comp.simulation.campaign import Cyclogram, parse_cyclogram, positions
-from thermo_comp.simulation.drift import PartEffect
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import START_NS, SimulatedRun, simulate, simulate_blocks
 from thermo_comp.simulation.unit import UnitModel
@@ -105,41 +104,6 @@ def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
     # Two converters with the same starting phase: each is within one count of its integral.
     assert np.abs(difference).max() < 1.0 + 1e-6
-
-
-def test_axes_permute() -> None:
-    base = replace(
-        noiseless(unit_preset('bare-quartz', 2)),
-        misalignment=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-    )
-    order = [2, 0, 1]
-
-    def turned(value: tuple[float, float, float]) -> tuple[float, float, float]:
-        return value[order[0]], value[order[1]], value[order[2]]
-
-    effect = PartEffect(
-        'magnet', scale=(70.0, 80.0, 90.0), scale_curvature=(0.3, 0.2, 0.1), bias=(1.0, 2.0, 3.0)
-    )
-    permuted = replace(
-        effect,
-        scale=turned(effect.scale),
-        scale_curvature=turned(effect.scale_curvature),
-        bias=turned(effect.bias),
-    )
-    a = replace(base, drift=(effect,))
-    b = replace(
-        base,
-        drift=(permuted,),
-        scale_factor=turned(base.scale_factor),
-        bias_at_reference=turned(base.bias_at_reference),
-    )
-    one, two = simulate(a, SHORT, UP), simulate(b, SHORT, UP[order])
-    np.testing.assert_array_equal(one.truth.bias[:, order], two.truth.bias)
-    np.testing.assert_array_equal(one.truth.scale[:, order], two.truth.scale)
-    # The integrator of each channel starts with a separate charge: sums differ by less than a
-    # count.
-    sums = np.cumsum(one.counts[:, order] - two.counts, axis=0)
-    assert np.abs(sums).max() <= 1
 
 
 def test_counts_follow_the_truth(unit: UnitModel) -> None:

@@ -202,13 +202,6 @@ def test_a_regular_call_goes_on_with_and_without_samples(node: Node, peer: Peer)
     assert len(called) <= n_called + 1
 
 
-def test_stops_from_another_thread_and_at_shutdown(node: Node) -> None:
-    with Running(node) as running:
-        running.loop.stop()
-        running.thread.join(TIMEOUT)
-        assert not running.thread.is_alive()
-
-
 def test_stops_when_the_context_is_shut_down(node: Node) -> None:
     with Running(node) as running:
         node.context.shutdown()
