@@ -73,19 +73,13 @@ class TestUsage:
             (('replay', 'a', '-o', 'b'), r"Missing option '--calibration'"),
             (('replay', 'a', '-o', 'b', '-c', 'c', '--spin'), r'No such option.*--spin'),
             (('replay', 'a', '-o', 'b', '-c', 'c', '--input', 'gps'), r"'gps' is not one of"),
-            (
-                ('replay', 'a', '-o', 'b', '-c', 'c', '--temperature-timeout', '0'),
-                r'`temperature_timeout_s` must be positive',
-            ),
+            (('replay', 'a', '-o', 'b', '-c', 'c', '--temperature-timeout', '0'),
+             r'`temperature_timeout_s` must be positive'),
             (('fit', 'a', '-o', 'b'), r'give --gravity, or --latitude and --height'),
-            (
-                ('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', 'nan'),
-                r'--reference-temperature: must be at least -273.15, got nan',
-            ),
-            (
-                ('play', 'a', '--rate', 'inf'),
-                r'--rate must be finite; 0 is as fast as subscribers',
-            ),
+            (('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', 'nan'),
+             r'--reference-temperature: must be at least -273.15, got nan'),
+            (('play', 'a', '--rate', 'inf'),
+             r'--rate must be finite; 0 is as fast as subscribers'),
             (('fit', 'a', '-o', 'b', '--latitude', '60'), r'--latitude and --height'),
             (('evaluate', 'a', '-c', 'b', '--window', '0'), r"'--window': .*(greater|range)"),
             (('evaluate', 'a', '-c', 'b', '--tolerance', '9'), r'--tolerance: expected .*, got'),
@@ -94,36 +88,28 @@ class TestUsage:
             (('simulate', '-o', 'a', '--unit', 'gold'), r'must be one of thermostatted'),
             (('simulate', '-o', 'a', '--plan', 'oven'), r'must be one of chamber-18'),
             (('simulate', '-o', 'a', '--profile', '20, up'), r"step 2 'up'"),
-            (('simulate', '-o', 'a', '--profile', '20, 90'), r'air of 20\.\.90 degC needs -.* W'),
-            (
-                ('simulate', '-o', 'a', '--temperature-rate-hz', '1e6'),
-                r"'--temperature-rate-hz': .*(or equal to 100|<=100)",
-            ),
-            (
-                ('simulate', '-o', 'a', '--plan', 'held-out', '--positions', '3'),
-                r'--plan is a whole test: leave out --profile and --positions',
-            ),
+            (('simulate', '-o', 'a', '--profile', '20, 90'),
+             r'air of 20\.\.90 degC needs -.* W'),
+            (('simulate', '-o', 'a', '--temperature-rate-hz', '1e6'),
+             r"'--temperature-rate-hz': .*(or equal to 100|<=100)"),
+            (('simulate', '-o', 'a', '--plan', 'held-out', '--positions', '3'),
+             r'--plan is a whole test: leave out --profile and --positions'),
             (('simulate', '-o', 'a', '--positions', '0'), r"Invalid value for '--positions'"),
-            (
-                ('simulate', '-o', 'a', '--positions=2.5'),
-                r"--positions.*(expected a whole number, got '2\.5'|'2\.5' is not a valid int)",
-            ),
-            (
-                ('fit', 'a', '-o', 'b', '--gravity', '9.8,1'),
-                r"--gravity: expected a number with a point, as 9\.8154, got '9\.8,1'",
-            ),
-            (
-                ('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', '1e4'),
-                r'--reference-temperature: must be less than 1000, got 10000',
-            ),
+            (('simulate', '-o', 'a', '--positions=2.5'),
+             r"--positions.*(expected a whole number, got '2\.5'|'2\.5' is not a valid int)"),
+            (('fit', 'a', '-o', 'b', '--gravity', '9.8,1'),
+             r"--gravity: expected a number with a point, as 9\.8154, got '9\.8,1'"),
+            (('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', '1e4'),
+             r'--reference-temperature: must be less than 1000, got 10000'),
             (('export', 'a', '--to', 'ardupilot', '--device-id', '7', '-o', 'b'), r'is for PX4'),
-            (('export', 'a', '--to', 'imu_tk', '--up', '0', '0', '1', '-o', 'b'), r'--up is for'),
+            (('export', 'a', '--to', 'imu_tk', '--up', '0', '0', '1', '-o', 'b'),
+             r'--up is for'),
             (('export', 'a', '--to', 'betaflight', '-o', 'b'), r'betaflight'),
             (('report', '-o', 'b'), r'give bags, a calibration, or both'),
             (('fit', 'a.mcap', '-o', 'b', '--gravity', '9.8', '--rate-hz', '9'), r'for tables'),
         ],
         ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
-    )
+    )  # fmt: skip
     def test_wrong_command_lines(
         self, cli: Cli, tmp_path: Path, arguments: tuple[str, ...], message: str
     ) -> None:

@@ -249,68 +249,32 @@ class TestColumnMap:
     @pytest.mark.parametrize(
         ('changes', 'key', 'message'),
         [
-            (
-                {'further': [{'name': 'case', 'column': 'c'}]},
-                'further[0].name',
-                'serve in a topic',
-            ),
-            (
-                {'further': [{'name': 'a', 'column': column} for column in 'bc']},
-                None,
-                'two thermometers of one',
-            ),
+            ({'further': [{'name': 'case', 'column': 'c'}]}, 'further[0].name',
+             'serve in a topic'),
+            ({'further': [{'name': 'a', 'column': column} for column in 'bc']}, None,
+             'two thermometers of one'),
             ({'stamp': {'column': 't'}}, 'stamp.unit', 'iso if `column` is given'),
             ({'stamp': {}}, 'stamp', 'give either `column` and `unit`, or `rate_hz`'),
             ({'stamp': {'column': 't', 'unit': 's', 'rate_hz': 1.0}}, 'stamp', 'give either'),
-            (
-                {'accel': {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'counts'}},
-                'accel',
-                'g cannot become counts',
-            ),
-            (
-                {'accel': {'columns': ['x', 'y', 'z'], 'unit': 'counts', 'output': 'imu'}},
-                'accel',
-                'only with `counts_per_g`',
-            ),
-            (
-                {
-                    'accel': {
-                        'columns': ['x', 'y', 'z'],
-                        'unit': 'g',
-                        'output': 'imu',
-                        'clip': [2.0, -2.0],
-                    }
-                },
-                'accel',
-                r'must be \[lowest, highest\]',
-            ),
+            ({'accel': {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'counts'}}, 'accel',
+             'g cannot become counts'),
+            ({'accel': {'columns': ['x', 'y', 'z'], 'unit': 'counts', 'output': 'imu'}}, 'accel',
+             'only with `counts_per_g`'),
+            ({'accel': {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'imu', 'clip': [2, 1]}},
+             'accel', r'must be \[lowest, highest\]'),
             ({'board': {'column': 'b', 'unit': 'raw'}}, 'board', 'needs `degc_per_count`'),
-            (
-                {'board': {'column': 'b', 'unit': 'raw', 'degc_per_count': 1.0}},
-                'board',
-                'needs `degc_at_zero`',
-            ),
+            ({'board': {'column': 'b', 'unit': 'raw', 'degc_per_count': 1.0}}, 'board',
+             'needs `degc_at_zero`'),
             ({'board': {'column': 'b', 'publish': 'all'}}, 'board.publish', 'unknown key'),
-            (
-                {
-                    'accel': {'columns': [0, 1, 2], 'unit': 'counts', 'output': 'counts'},
-                    'gyro': {'columns': [3, 4, 5], 'unit': 'rad/s'},
-                },
-                None,
-                'a gyro travels in an Imu message',
-            ),
-            (
-                {'accel': {'columns': ['x', 'x', 'z'], 'unit': 'g', 'output': 'imu'}},
-                None,
-                "column 'x' is given twice",
-            ),
-            (
-                {'board': {'column': 'b'}, 'case': {'column': 'b'}},
-                None,
-                "column 'b' is given twice",
-            ),
+            ({'accel': {'columns': [0, 1, 2], 'unit': 'counts', 'output': 'counts'},
+             'gyro': {'columns': [3, 4, 5], 'unit': 'rad/s'}}, None,
+             'a gyro travels in an Imu message'),
+            ({'accel': {'columns': ['x', 'x', 'z'], 'unit': 'g', 'output': 'imu'}}, None,
+             "column 'x' is given twice"),
+            ({'board': {'column': 'b'}, 'case': {'column': 'b'}}, None,
+             "column 'b' is given twice"),
         ],
-    )
+    )  # fmt: skip
     def test_mistakes_name_their_key(
         self, tmp_path: Path, changes: dict[str, object], key: str | None, message: str
     ) -> None:

@@ -33,32 +33,26 @@ def arguments(*overrides: str) -> list[str]:
     ('overrides', 'text'),
     [
         ([], 'parameter `calibration_file` is not set; start with --ros-args -p calibration_f'),
-        (['calibration_file:={tmp}/none.yaml'], '/none.yaml: cannot be read: No such file or dir'),
+        (['calibration_file:={tmp}/none.yaml'],
+         '/none.yaml: cannot be read: No such file or dir'),
         (['calibration_file:={tmp}'], 'cannot be read: '),
         (['calibration_file:={tmp}/nan.yaml'], '/nan.yaml: axes.x.bias: '),
         (['calibration_file:={tmp}/text.yaml'], '/text.yaml: expected a mapping'),
         (['calibration_file:={unit}', 'serial:=T-2'], "unit.serial: must be 'T-2' (parameter"),
         (['calibration_file:={unit}', 'input:=imu'], "unit.input: must be 'm/s^2'"),
-        (
-            ['calibration_file:={tmp}/imu.yaml'],
-            "/imu.yaml: unit.input: must be 'counts' (parameter `input` is counts), got 'm/s^2'",
-        ),
+        (['calibration_file:={tmp}/imu.yaml'],
+         "/imu.yaml: unit.input: must be 'counts' (parameter `input` is counts), got 'm/s^2'"),
         (['calibration_file:={unit}', 'input:=gyro'], '`input` must be one of counts, imu'),
-        (['calibration_file:={unit}', 'transition_time:=-1'], '`transition_time` must be between'),
-        (
-            [
-                'calibration_file:={unit}',
-                'qos_overrides./accel/counts.subscription.reliability:=good',
-            ],
-            'a topic cannot be opened: ',
-        ),
-        (
-            ['calibration_file:={unit}', 'qos_overrides./accel/counts.subscription.depth:=deep'],
-            "a topic cannot be opened: Trying to set parameter 'qos_overrides./accel/counts",
-        ),
+        (['calibration_file:={unit}', 'transition_time:=-1'],
+         '`transition_time` must be between'),
+        (['calibration_file:={unit}',
+         'qos_overrides./accel/counts.subscription.reliability:=good'],
+         'a topic cannot be opened: '),
+        (['calibration_file:={unit}', 'qos_overrides./accel/counts.subscription.depth:=deep'],
+         "a topic cannot be opened: Trying to set parameter 'qos_overrides./accel/counts"),
         (['calibration_file:={unit}', 'use_sim_time:=7'], "set parameter 'use_sim_time' to '7'"),
     ],
-)
+)  # fmt: skip
 def test_bad_start(
     overrides: list[str], text: str, unit: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -252,14 +252,10 @@ HUGE = 1 << 60
         (chunk_record(b'x' * 50, '', HUGE), 'declare a content of'),
         (chunk_record(zstandard.compress(bytes(1000)), 'zstd', HUGE), 'declare a content of'),
         (chunk_record(lz4.frame.compress(bytes(1000)), 'lz4', HUGE), 'declare a content of'),
-        (
-            chunk_record(zstandard.compress(bytes(1 << 22)), 'zstd', 1000),
-            'exceeds the limit of 1000',
-        ),
-        (
-            chunk_record(lz4.frame.compress(bytes(1 << 22)), 'lz4', 1000),
-            'exceeds the limit of 1000',
-        ),
+        (chunk_record(zstandard.compress(bytes(1 << 22)), 'zstd', 1000),
+         'exceeds the limit of 1000'),
+        (chunk_record(lz4.frame.compress(bytes(1 << 22)), 'lz4', 1000),
+         'exceeds the limit of 1000'),
         (chunk_record(zstandard.compress(bytes(100)), 'zstd', 2000), '100 bytes after'),
         (chunk_record(b'not zstd at all', 'zstd', 100), 'zstd'),
         (chunk_record(b'not lz4 at all', 'lz4', 100), 'lz4'),
@@ -276,7 +272,7 @@ HUGE = 1 << 60
         (struct.pack('<BQ', Opcode.SCHEMA, 3) + bytes(3), 'shorter than its content'),
         (struct.pack('<BQ', 0, 3) + bytes(3), 'not whole'),
     ],
-)
+)  # fmt: skip
 def test_claims_are_not_believed(tmp_path: Path, record: bytes, reason: str) -> None:
     path = tmp_path / 'bag.mcap'
     path.write_bytes(whole_file(record))
