@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +25,6 @@ from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
 START_NS = 1_767_225_600_000_000_000
 
-ros = pytest.mark.skipif(
-    not __import__('importlib.util').util.find_spec('rclpy'), reason='rclpy is not installed'
-)
-
-
-@pytest.fixture
-def peer() -> Iterator[Any]:
-    from ros_helpers import Peer
-
-    peer = Peer()
-    yield peer
-    peer.close()
-
 
 def of_kind(kind: str, cycle_s: float, path: Path) -> Path:
     full_scale, K = (32767.0, 300.0) if kind == 'counts' else (160.0, 1.0)
@@ -47,7 +33,6 @@ def of_kind(kind: str, cycle_s: float, path: Path) -> Path:
     return path
 
 
-@ros
 def test_a_clock_that_goes_back_or_pauses_is_none_of_the_samples(
     peer: Any, tmp_path: Path
 ) -> None:
@@ -87,7 +72,6 @@ def test_a_clock_that_goes_back_or_pauses_is_none_of_the_samples(
         assert node._loop.n_failures == 0
 
 
-@ros
 def test_a_rate_that_goes_up_twentyfold_and_back_loses_nothing(peer: Any, tmp_path: Path) -> None:
     from ros_helpers import drive, node_in_thread, stamp_of
     from sensor_msgs.msg import Imu
@@ -116,7 +100,6 @@ def test_a_rate_that_goes_up_twentyfold_and_back_loses_nothing(peer: Any, tmp_pa
         assert [stamp_of(one) for one in heard] == sent
 
 
-@ros
 def test_twenty_clients_that_set_parameters_at_once_are_all_answered(
     peer: Any, tmp_path: Path
 ) -> None:
@@ -160,9 +143,9 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(
         assert node._loop.n_failures == 0
 
 
-@ros
 def test_links_exchanged_under_the_folder_lead_nowhere_else(tmp_path: Path) -> None:
     # WHY: between the check of a path and its opening a folder can be replaced by a link.
+    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from thermo_comp.ros.reader import read
 
     folder, outside = tmp_path / 'units', tmp_path / 'outside'

@@ -293,7 +293,7 @@ def tumbled() -> Calibration:
 
 
 def ours(calibration: Calibration, raw: np.ndarray) -> np.ndarray:
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    axes = calibration.axes
     x = (raw - [axis.bias for axis in axes]) / [axis.scale_factor for axis in axes]
     return x @ np.array(calibration.misalignment).T
 

@@ -63,7 +63,7 @@ def fitted(unit: UnitModel, ups: Floats, seed: int, **options: object) -> FitRes
 
 def constants(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     """Bias [counts], K and the elements of M below its diagonal."""
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    axes = calibration.axes
     M = np.array(calibration.misalignment)
     bias, scale = [axis.bias for axis in axes], [axis.scale_factor for axis in axes]
     return np.array(bias), np.array(scale), M[[1, 2, 2], [0, 0, 1]]

@@ -42,8 +42,7 @@ def words_of(ups, rng, seconds=20.0):
 
 
 def constants(result):
-    axes = result.calibration.axes
-    triad = (axes.x, axes.y, axes.z)
+    triad = result.calibration.axes
     return np.array([one.bias for one in triad]), np.array([one.scale_factor for one in triad])
 
 

@@ -80,7 +80,7 @@ def test_one_position_becomes_parameters_of_an_autopilot(one_position):
 def test_positions_without_temperature(rng):
     result = fit([turned(rng, positions(12, 3))], OPTIONS)
     calibration = result.calibration
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    axes = calibration.axes
     # 12 rests of 20 s, 2 mg a sample: the noise averages to 50 ug.
     np.testing.assert_allclose([axis.bias for axis in axes], (0.1, -0.2, 0.3), atol=0.005)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.001)

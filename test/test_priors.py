@@ -70,7 +70,7 @@ def sd_of_levels(calibration: Calibration) -> np.ndarray:
     assert calibration.posterior is not None
     variance = np.diag(calibration.posterior.covariance())
     places = [block.static for block in parameter_layout(calibration).bias]
-    K = [a.scale_factor for a in (calibration.axes.x, calibration.axes.y, calibration.axes.z)]
+    K = [axis.scale_factor for axis in calibration.axes]
     return np.sqrt(variance[places]) / np.abs(K)
 
 
@@ -133,7 +133,7 @@ def test_siblings_make_one_position_worth_more():
     truth = sibling(KIND, 9, 0.15)
     errors = []
     for one in (alone, helped):
-        relative = [axis.scale_factor for axis in (one.axes.x, one.axes.y, one.axes.z)]
+        relative = [axis.scale_factor for axis in one.axes]
         errors.append(np.abs(np.array(relative) / truth.scale_factor - 1.0).max())
         curve = one.static.z.scale_function
         errors[-1] += abs(curve.value(10.0) - fitted_curve(9).value(10.0))
@@ -153,11 +153,7 @@ def test_new_rests_make_an_old_calibration_better():
     # 20 ug (scale): on average half of the variance due to ageing must be removed.
     grown = np.mean(sd_of_levels(old) ** 2 + options.ageing_bias**2)
     assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
-    bias = [
-        (a.bias - b.bias) / a.scale_factor
-        for a, b in zip((new.axes.x, new.axes.y, new.axes.z),
-                        (old.axes.x, old.axes.y, old.axes.z), strict=True)
-    ]  # fmt: skip
+    bias = [(a.bias - b.bias) / a.scale_factor for a, b in zip(new.axes, old.axes, strict=True)]
     assert np.all(np.abs(bias) < 4.0 * np.hypot(sd_of_levels(new), sd_of_levels(old)))
 
 

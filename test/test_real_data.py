@@ -65,7 +65,7 @@ def test_handheld_units_agree_with_a_direct_solution(unit):
 
     direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
     calibration = unit.calibration
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    axes = calibration.axes
     # The weights of positions differ slightly: a fraction of the sd of 1 mg, and of 1e-3.
     np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
@@ -83,7 +83,7 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     # By hand: half the sum and half the difference of opposite faces, assumed level.
     means = means_of(result)
     high, low = means.max(axis=0), means.min(axis=0)
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    axes = calibration.axes
     np.testing.assert_allclose([axis.bias for axis in axes], 0.5 * (high + low), atol=1.0)
     by_hand = 0.5 * (high - low) / GRAVITY
     np.testing.assert_allclose([axis.scale_factor for axis in axes], by_hand, rtol=1e-3)

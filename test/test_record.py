@@ -103,7 +103,7 @@ def check_fit(result: dict[str, Any], cli: Cli, folder: Path) -> None:
     cli(*(part for word in words for part in (bags if '*' in word else [word])), cwd=folder)
     calibration = load_calibration(folder / 'unit.yaml')
     assert calibration.unit.serial == 'lab-7'
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+    axes = calibration.axes
     scale = np.array([one.scale_factor for one in axes])
     bias = np.array([one.bias for one in axes]) / scale
     sd = np.array([one['sd_g'] for one in result['positions']]).max() * 9.80665

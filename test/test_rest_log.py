@@ -8,7 +8,7 @@ import json
 import signal
 import threading
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,13 +40,6 @@ START = Start(START_NS, 'T-1', 'counts', 9.80665, 'abc', MemorySpec(('case',), (
 def rest(number: int) -> Rest:
     stamp, state = START_NS + number * 10 * SECOND_NS, (20.0, 1e-6, 0.0, 0.0, 0.0, 0.5, 1e-6)
     return Rest(stamp, 1000, (1.0, -2.0, 2941.25), (3.0,) * 3, (*state, 0.25, 0.0), (0.5,))
-
-
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
 
 
 @pytest.fixture
