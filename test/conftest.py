@@ -144,14 +144,10 @@ def program() -> Cli:
         *args: str | Path, code: int | None = 0, cwd: Path | None = None, **env: str
     ) -> subprocess.CompletedProcess[str]:
         finished = subprocess.run(
-            [sys.executable, '-m', 'thermo_comp', *map(str, args)],
-            cwd=cwd,
+            [sys.executable, '-m', 'thermo_comp', *map(str, args)], cwd=cwd,
             env={**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80', **env},
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
+            capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
         return _checked(finished, code)
 
     return run

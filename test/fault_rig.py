@@ -85,14 +85,11 @@ def unit(**changes: Any) -> Calibration:
         ),
         'board_lag_s': BOARD_LAG_S,
         'detector': DetectorSettings(
-            smallest_ramp_k_min=1.0,
-            relaxed_rate_k_min=0.4,
-            dwell_s=5.0,
-            case=sensor,
+            smallest_ramp_k_min=1.0, relaxed_rate_k_min=0.4, dwell_s=5.0, case=sensor,
             board=replace(sensor, lag_s=BOARD_LAG_S),
         ),
         **changes,
-    }
+    }  # fmt: skip
     return calibration(**values)
 
 

@@ -42,13 +42,9 @@ def rests(
         since = k / 3.0
         begin = int((FIRST_DAY + 0.3 + since) * DAY_NS)
         start = Start(
-            begin,
-            calibration.unit.serial,
-            calibration.unit.input,
-            calibration.gravity_m_s2,
-            'laboratory',
-            correction.memory,
-        )
+            begin, calibration.unit.serial, calibration.unit.input, calibration.gravity_m_s2,
+            'laboratory', correction.memory,
+        )  # fmt: skip
         offset = error(since) + turn_on * rng.standard_normal(3)
         state = ramp_states(calibration, rng.uniform(15.0, 25.0, 1), rate, 3600.0)
         state[:, 1] = 1e-8

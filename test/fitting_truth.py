@@ -107,21 +107,13 @@ def table_of(
     columns = np.concatenate(shapes)
     steepest = np.array([1.0, 2.0 * np.abs(columns[:, 0]).max(), 1.0, 1.0, 1.0, 1.0])
     windows = Windows(
-        position=number,
-        bag=number,
+        position=number, bag=number,
         section=np.tile(np.arange(n_windows) * N_SECTIONS // n_windows, n_positions),
-        time=np.tile(time, n_positions),
-        weight=np.ones(len(number)),
-        mean=np.concatenate(means),
-        columns=columns,
-        groups=GROUPS,
-        kelvins=np.sqrt(np.mean(columns**2, axis=0)) / steepest,
-        lag=np.array([-1, -1, 0, 1, -1, -1]),
-        start=np.tile(share, (n_positions, 1)),
-        start_covariance=START,
-        in_scale=np.ones(len(GROUPS), dtype=bool),
-        tilt=tilt,
-    )
+        time=np.tile(time, n_positions), weight=np.ones(len(number)), mean=np.concatenate(means),
+        columns=columns, groups=GROUPS, kelvins=np.sqrt(np.mean(columns**2, axis=0)) / steepest,
+        lag=np.array([-1, -1, 0, 1, -1, -1]), start=np.tile(share, (n_positions, 1)),
+        start_covariance=START, in_scale=np.ones(len(GROUPS), dtype=bool), tilt=tilt,
+    )  # fmt: skip
     return windows, up
 
 
@@ -169,16 +161,11 @@ def column_sd(names: tuple[str, ...], bias_sd: float, scale_sd: float) -> Floats
 def prior_of(truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: Any) -> Prior:
     """Return a wide prior with the true noise parameters."""
     known: dict[str, Any] = {
-        'bias_mean': np.zeros(3),
-        'bias_sd': np.full(3, 1.0),
-        'scale_sd': 0.05,
-        'misalignment_sd': 1e-2,
-        'column_sd': column_sd(names, 1e-2, 1e-3),
-        'offset_sd': max(truth.offset_sd, 1e-9),
-        'tilt_sd': max(truth.tilt_sd, 1e-9),
-        'sigma': truth.sigma,
-        'noise': truth.noise,
-    }
+        'bias_mean': np.zeros(3), 'bias_sd': np.full(3, 1.0), 'scale_sd': 0.05,
+        'misalignment_sd': 1e-2, 'column_sd': column_sd(names, 1e-2, 1e-3),
+        'offset_sd': max(truth.offset_sd, 1e-9), 'tilt_sd': max(truth.tilt_sd, 1e-9),
+        'sigma': truth.sigma, 'noise': truth.noise,
+    }  # fmt: skip
     return Prior(**(known | changes))
 
 

@@ -45,14 +45,10 @@ def write_unit(
     paths = []
     for number, up in enumerate(positions(n_bags, 1)):
         run = simulate(
-            unit,
-            PROGRAM,
-            up,
-            rate_hz=1.0,
-            temperature_rate_hz=0.5,
+            unit, PROGRAM, up, rate_hz=1.0, temperature_rate_hz=0.5,
             seed=1000 * seed + 100 * test + number,
             start_ns=1_767_225_600_000_000_000 + test * 30 * 86400 * 10**9,
-        )
+        )  # fmt: skip
         path = folder / (names[number] if names else f'{number + 1:02d}.mcap')
         facts = {'serial': unit.serial if serial is None else serial, **(metadata or {})}
         with BagWriter(path, metadata={k: v for k, v in facts.items() if v}) as bag:

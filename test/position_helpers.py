@@ -78,13 +78,9 @@ class Rest:
             use = (board_ns >= begin) & (board_ns < end)
             nothing_ns, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
             block = ImuBlock(
-                stamp_ns[first:last],
-                self.accel[first:last],
-                board_ns[use],
-                board[use],
-                nothing_ns,
-                nothing,
-            )
+                stamp_ns[first:last], self.accel[first:last], board_ns[use], board[use],
+                nothing_ns, nothing,
+            )  # fmt: skip
             if with_gyro:
                 block = replace(block, imu=Imu(self.gyro[first:last]))
             blocks.append(block)

@@ -68,13 +68,9 @@ def refresh() -> None:
             command = match[1].partition('\n')[0]
             program = f'{shlex.quote(sys.executable)} -m thermo_comp'
             finished = subprocess.run(
-                ['bash', '-c', command.replace('$ thermo_comp', program, 1)],
-                cwd=folder,
-                env=environment,
-                capture_output=True,
-                text=True,
-                check=True,
-            )
+                ['bash', '-c', command.replace('$ thermo_comp', program, 1)], cwd=folder,
+                env=environment, capture_output=True, text=True, check=True,
+            )  # fmt: skip
             return f'```console\n{command}\n{finished.stdout.rstrip()}\n```'
 
         page = SESSION.read_text(encoding='utf-8')

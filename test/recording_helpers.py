@@ -26,12 +26,8 @@ TEMPERATURE = 'sensor_msgs/msg/Temperature'
 STRING = 'std_msgs/msg/String'
 
 ACCEL, IMU_IN, BOARD, CASE, OTHER = (
-    '/accel/counts',
-    '/imu/uncompensated',
-    '/temperature/board',
-    '/temperature/case',
-    '/chatter',
-)
+    '/accel/counts', '/imu/uncompensated', '/temperature/board', '/temperature/case', '/chatter',
+)  # fmt: skip
 TYPES = {ACCEL: VECTOR, IMU_IN: IMU, BOARD: TEMPERATURE, CASE: TEMPERATURE, OTHER: STRING}
 START_NS = 1_600_000_000_000_000_000
 
@@ -66,14 +62,10 @@ def to_ros(message: Message, ros: int = 2) -> Any:
         return types[VECTOR](header, vector(*values))
     if message.topic == IMU_IN:
         return types[IMU](
-            header,
-            types['geometry_msgs/msg/Quaternion'](*values[0:4]),
-            np.array(values[4:13]),
-            vector(*values[13:16]),
-            np.array(values[16:25]),
-            vector(*values[25:28]),
+            header, types['geometry_msgs/msg/Quaternion'](*values[0:4]), np.array(values[4:13]),
+            vector(*values[13:16]), np.array(values[16:25]), vector(*values[25:28]),
             np.array(values[28:37]),
-        )
+        )  # fmt: skip
     return types[TEMPERATURE](header, *values)
 
 
@@ -97,16 +89,10 @@ def write_mcap(
     """Write a bare file with the `mcap` library."""
     with path.open('wb') as file:
         writer = McapWriter(
-            file,
-            chunk_size=chunk_size,
-            compression=getattr(CompressionType, compression.upper()),
-            index_types=index_types,
-            use_chunking=use_chunking,
-            use_statistics=use_statistics,
-            repeat_channels=repeat,
-            repeat_schemas=repeat,
-            enable_crcs=enable_crcs,
-        )
+            file, chunk_size=chunk_size, compression=getattr(CompressionType, compression.upper()),
+            index_types=index_types, use_chunking=use_chunking, use_statistics=use_statistics,
+            repeat_channels=repeat, repeat_schemas=repeat, enable_crcs=enable_crcs,
+        )  # fmt: skip
         writer.start('ros2')
         channels: dict[str, int] = {}
         schemas: dict[str, int] = {}

@@ -47,13 +47,9 @@ def fitted() -> FitResult:
     for position in range(N_POSITIONS):
         one = run(position)
         block = ArrayBlock(
-            one.accel_stamp_ns,
-            one.counts.astype(float),
-            one.board_stamp_ns,
-            one.board,
-            one.case_stamp_ns,
-            one.case,
-        )
+            one.accel_stamp_ns, one.counts.astype(float), one.board_stamp_ns, one.board,
+            one.case_stamp_ns, one.case,
+        )  # fmt: skip
         sources.append(
             FitSource(
                 name=f'{position + 1:02d}.mcap',

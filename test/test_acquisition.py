@@ -131,12 +131,8 @@ def test_what_is_wrong_with_a_position_is_said(stream: Stream) -> None:
         test.add(block)
     account = test.account()
     assert [one.reason for one in account.positions] == [
-        '',
-        'left before 50 s',
-        'as position 1',
-        'restless',
-        '',
-    ]
+        '', 'left before 50 s', 'as position 1', 'restless', '',
+    ]  # fmt: skip
     assert account.positions[-1].n_rests == 2
 
 

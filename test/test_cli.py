@@ -94,13 +94,9 @@ def test_a_command_computes_in_one_thread() -> None:
     for wanted, said in (({}, '1'), ({'OPENBLAS_NUM_THREADS': '3'}, '3')):
         environment = {k: v for k, v in os.environ.items() if k != 'OPENBLAS_NUM_THREADS'}
         finished = subprocess.run(
-            [sys.executable, '-c', code],
-            cwd=ROOT,
-            env={**environment, **wanted},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+            [sys.executable, '-c', code], cwd=ROOT, env={**environment, **wanted},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
         assert finished.stdout.split() == ['False', said]
 
 
@@ -112,13 +108,9 @@ def on_a_terminal(*arguments: str, no_color: bool = False) -> str:
     if no_color:
         environment['NO_COLOR'] = '1'
     process = subprocess.Popen(
-        [sys.executable, '-m', 'thermo_comp', *arguments],
-        cwd=ROOT,
-        env=environment,
-        stdin=follower,
-        stdout=follower,
-        stderr=follower,
-    )
+        [sys.executable, '-m', 'thermo_comp', *arguments], cwd=ROOT, env=environment,
+        stdin=follower, stdout=follower, stderr=follower,
+    )  # fmt: skip
     os.close(follower)
     shown = b''
     while True:

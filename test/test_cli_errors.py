@@ -173,13 +173,9 @@ class TestFits:
         paths = [bag(tmp_path / f'{i}.mcap', serial=f'T-{i}') for i in range(2)]
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.80665')
         refused(
-            cli,
-            1,
-            r'of different units: .*0.mcap of T-0, .*1.mcap of T-1',
-            'fit',
-            *paths,
+            cli, 1, r'of different units: .*0.mcap of T-0, .*1.mcap of T-1', 'fit', *paths,
             *arguments,
-        )
+        )  # fmt: skip
 
 
 class TestEvaluations:

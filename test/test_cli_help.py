@@ -41,15 +41,13 @@ EXAMPLES = [
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
 # One example of each command that prints figures and ends by itself; `play`, `report` and `fit`
 # are tested in test_cli, test_cli_errors and test_docs.
-WITH_JSON = list(
-    {
-        one.split()[1]: one
-        for one in EXAMPLES
-        if one.split()[1] not in ('play', 'report')
-        and 'record --positions' not in one
-        and 'bags/unit42/*' not in one
-    }.values()
-)
+WITH_JSON = {
+    one.split()[1]: one
+    for one in EXAMPLES
+    if one.split()[1] not in ('play', 'report')
+    and 'record --positions' not in one
+    and 'bags/unit42/*' not in one
+}.values()
 QUICK = [one for one in EXAMPLES if one.split()[1] in ('info', 'convert', 'export', 'import')]
 
 

@@ -200,22 +200,22 @@ def drawn(unit, layout, d):
     have.
     """
 
+    def moved_by(values, start):
+        return tuple(value + d[start + k] for k, value in enumerate(values))
+
     def moved(regime_set_, start):
         axes = []
         for axis, one in enumerate(regime_set_.axes()):
             bias, scale = start(layout.bias[axis]), start(layout.scale[axis])
             fs, fc = one.bias_function, one.scale_function
+            bias_function = fs.with_free(moved_by(fs.free_coefficients, bias + 1), 0.0)
+            scale_function = fc.with_free(moved_by(fc.free_coefficients, scale + 1), 1.0)
             axes.append(
                 replace(
                     one,
                     delta=one.delta + d[bias],
-                    bias_function=fs.with_free(
-                        tuple(c + d[bias + 1 + k] for k, c in enumerate(fs.free_coefficients)), 0.0
-                    ),
-                    scale_function=fc.with_free(
-                        tuple(c + d[scale + 1 + k] for k, c in enumerate(fc.free_coefficients)),
-                        1.0,
-                    ),
+                    bias_function=bias_function,
+                    scale_function=scale_function,
                 )
             )
         return replace(regime_set_, x=axes[0], y=axes[1], z=axes[2])

@@ -30,15 +30,11 @@ def calibration_of(bias: list[Polynomial], **change: object) -> Calibration:
     axes = [AxisSet(function, ONE) for function in bias]
     regime = RegimeSet((5.0, 45.0), (-2.0, 2.0), *axes)
     base = Calibration(
-        format_version=2,
-        unit=Unit('7', 'm/s^2', 160.0, 0.005),
-        reference_temperature_c=20.0,
+        format_version=2, unit=Unit('7', 'm/s^2', 160.0, 0.005), reference_temperature_c=20.0,
         gravity_m_s2=9.81,
         axes=Axes(AxisReference(1.0, 0.1), AxisReference(1.0, -0.2), AxisReference(1.0, 0.3)),
-        static=regime,
-        dynamic=regime,
-        noise_density_m_s2_sqrt_hz=(1e-3, 1e-3, 1e-3),
-    )
+        static=regime, dynamic=regime, noise_density_m_s2_sqrt_hz=(1e-3, 1e-3, 1e-3),
+    )  # fmt: skip
     return replace(base, **change)
 
 

@@ -119,15 +119,11 @@ def fifo(path: Path) -> None:
 
 
 DAMAGES: dict[Callable[[Path], None], str] = {
-    replaced: "unit.serial: must be 'F-1'",
-    truncated: '',
-    unreadable: 'cannot be read: ',
-    huge: f'at most {SIZE_LIMIT} are accepted',
-    aliases: 'YAML aliases are not accepted',
-    directory: 'cannot be read: ',
-    fifo: 'cannot be read: not a regular file',
+    replaced: "unit.serial: must be 'F-1'", truncated: '', unreadable: 'cannot be read: ',
+    huge: f'at most {SIZE_LIMIT} are accepted', aliases: 'YAML aliases are not accepted',
+    directory: 'cannot be read: ', fifo: 'cannot be read: not a regular file',
     Path.unlink: 'cannot be read: No such file or directory',
-}
+}  # fmt: skip
 
 
 def test_calibration_files_that_go_bad(path: Path, tmp_path: Path) -> None:

@@ -68,17 +68,12 @@ def test_a_thermometer_on_two_topics_is_one() -> None:
     bags = []
     for copies in (('board',), ('board', 'case')):
         rng = np.random.default_rng(9)
-        bags.append(
-            [
-                tc.Columns(
-                    time_s,
-                    force,
-                    dict.fromkeys(copies, (time_s[::5], board[::5])),
-                    name=f'rest{k}',
-                )
-                for k, (time_s, force, board) in enumerate(recording(up, rng) for up in UPS[:3])
-            ]
-        )
+        own = []
+        for k, up in enumerate(UPS[:3]):
+            time_s, force, board = recording(up, rng)
+            readings = dict.fromkeys(copies, (time_s[::5], board[::5]))
+            own.append(tc.Columns(time_s, force, readings, name=f'rest{k}'))
+        bags.append(own)
     one, two = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
     assert one.static == two.static
     assert one.axes == two.axes

@@ -58,15 +58,11 @@ class Dense:
         padded = np.append(x, 0.0)
         up = at.up + np.einsum('pij,pj->pi', tangent_basis(at.up), x[layout.up])
         return State(
-            at.kappa + x[layout.kappa],
-            at.bias + x[layout.bias],
-            at.weights + padded[layout.weights],
-            at.misalignment + x[layout.misalignment],
-            up / np.linalg.norm(up, axis=1, keepdims=True),
-            at.offset + x[layout.offset],
-            at.tilt + x[layout.tilt],
-            at.start + x[layout.start],
-        )
+            at.kappa + x[layout.kappa], at.bias + x[layout.bias],
+            at.weights + padded[layout.weights], at.misalignment + x[layout.misalignment],
+            up / np.linalg.norm(up, axis=1, keepdims=True), at.offset + x[layout.offset],
+            at.tilt + x[layout.tilt], at.start + x[layout.start],
+        )  # fmt: skip
 
     def residual(self, x: Floats) -> Floats:
         """All residuals in sd: those of the windows, then those of the prior."""

@@ -97,14 +97,9 @@ def test_columns_are_those_of_the_tracker(bags: list[ReducedBag]) -> None:
     tracker = ThermalTracker(DetectorSettings(), spec, ThermalConfig())
     bag = bags[0]
     events = sorted(
-        [
-            (int(s), 'board', float(v))
-            for s, v in zip(bag.board.stamp_ns, bag.board.value, strict=True)
-        ]
-        + [
-            (int(s), 'case', float(v))
-            for s, v in zip(bag.case.stamp_ns, bag.case.value, strict=True)
-        ]
+        (int(s), name, float(v))
+        for name, readings in (('board', bag.board), ('case', bag.case))
+        for s, v in zip(readings.stamp_ns, readings.value, strict=True)
     )
     of_bag = windows.data.bag == 0
     time, rows = windows.data.time[of_bag], windows.data.columns[of_bag]

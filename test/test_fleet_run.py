@@ -188,14 +188,10 @@ def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path: Path) -> None:
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
     words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
     process = subprocess.Popen(
-        [sys.executable, '-m', 'thermo_comp', *words],
-        cwd=tmp_path,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
+        [sys.executable, '-m', 'thermo_comp', *words], cwd=tmp_path,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True, start_new_session=True,
+    )  # fmt: skip
     pause = threading.Event()
     # The first worker is a child of the fork server.
     while not any(map(children_of, children_of(process.pid))):

@@ -52,24 +52,13 @@ def fleet_of(
         sds = {quantity.sd: 2.0 for quantity in QUANTITIES if quantity.sd}
         rows.append(
             row_of(
-                name=f'{lots[i % len(lots)]}/u{i:03d}@{day:g}',
-                serial=f'S{i:03d}',
-                lot=lots[i % len(lots)],
-                verdict='valid',
-                model='response',
-                start=f'{MONDAY + timedelta(days=day):%Y-%m-%dT%H:%M:%SZ}',
-                raw_ug=300.0,
-                peak_ug=9.0,
-                n_bags=12,
-                n_left_out=0,
-                n_positions=12,
-                lowest_c=5.0,
-                highest_c=35.0,
-                calibration_sha256=f'{day}-{i}',
-                **sds,
-                **cells,
-            )
-        )
+                name=f'{lots[i % len(lots)]}/u{i:03d}@{day:g}', serial=f'S{i:03d}',
+                lot=lots[i % len(lots)], verdict='valid', model='response',
+                start=f'{MONDAY + timedelta(days=day):%Y-%m-%dT%H:%M:%SZ}', raw_ug=300.0,
+                peak_ug=9.0, n_bags=12, n_left_out=0, n_positions=12, lowest_c=5.0, highest_c=35.0,
+                calibration_sha256=f'{day}-{i}', **sds, **cells,
+            ),
+        )  # fmt: skip
     return rows
 
 

@@ -89,26 +89,13 @@ def made(
     constant[:, 2] = GRAVITY + raw * MICRO_G
     rows = np.arange(n)
     return Windows(
-        window_s=60.0,
-        gravity=GRAVITY,
-        bag=np.zeros(n, np.int64),
-        position=np.zeros(n, np.int64),
-        start_ns=START_NS + rows * 60 * 10**9,
-        time=rows * 60.0 + 30.0,
-        count=np.full(n, 600),
-        mean=constant * K,
-        board=np.full(n, 20.0),
-        rate=np.zeros(n),
-        is_dynamic=rows < dynamic,
-        is_inside=rows >= outside,
-        is_swapped=np.zeros(n, bool),
-        raw=constant,
-        force=force,
-        size=np.full(n, GRAVITY),
-        claimed_sd=np.full(n, claimed * MICRO_G),
-        noise_sd=np.zeros(n),
+        window_s=60.0, gravity=GRAVITY, bag=np.zeros(n, np.int64), position=np.zeros(n, np.int64),
+        start_ns=START_NS + rows * 60 * 10**9, time=rows * 60.0 + 30.0, count=np.full(n, 600),
+        mean=constant * K, board=np.full(n, 20.0), rate=np.zeros(n), is_dynamic=rows < dynamic,
+        is_inside=rows >= outside, is_swapped=np.zeros(n, bool), raw=constant, force=force,
+        size=np.full(n, GRAVITY), claimed_sd=np.full(n, claimed * MICRO_G), noise_sd=np.zeros(n),
         gyro=np.zeros((n, 0)),
-    )
+    )  # fmt: skip
 
 
 CLAIMING = corrected_by(SLOPE, 1e-5)

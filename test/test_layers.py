@@ -46,24 +46,13 @@ LAYERS = {
 # Rooms that may import a library. A library that is missing here is free for all rooms.
 ROS = ['rclpy', 'rcl_interfaces', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs']
 HOMES = {
-    **{name: {'ros'} for name in ROS},
-    'rosgraph_msgs': {'ros'},
-    'builtin_interfaces': {'ros'},
-    'rosbags': {'recording'},
-    'mcap': {'recording'},
-    'zstandard': {'recording'},
-    'lz4': {'recording'},
-    'matplotlib': {'report'},
-    'jinja2': {'report'},
-    'pyulog': {'convert'},
-    'pymavlink': {'convert'},
-    'pyarrow': {'convert', 'fleet', 'recording'},
-    'dask': {'fleet'},
-    'distributed': {'fleet'},
-    'fsspec': {'fleet'},
-    'typer': {'cli', '__main__'},
+    **{name: {'ros'} for name in ROS}, 'rosgraph_msgs': {'ros'}, 'builtin_interfaces': {'ros'},
+    'rosbags': {'recording'}, 'mcap': {'recording'}, 'zstandard': {'recording'},
+    'lz4': {'recording'}, 'matplotlib': {'report'}, 'jinja2': {'report'}, 'pyulog': {'convert'},
+    'pymavlink': {'convert'}, 'pyarrow': {'convert', 'fleet', 'recording'}, 'dask': {'fleet'},
+    'distributed': {'fleet'}, 'fsspec': {'fleet'}, 'typer': {'cli', '__main__'},
     'rich': {'cli', '__main__'},
-}
+}  # fmt: skip
 
 # The mathematics reads no clock.
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
@@ -181,13 +170,9 @@ def loaded_after(statement: str, *watched: str) -> list[str]:
     """Return which of the watched modules a new interpreter has imported after one statement."""
     code = f'{statement}\nimport sys\nprint(*[m for m in {watched!r} if m in sys.modules])'
     finished = subprocess.run(
-        [sys.executable, '-c', code],
-        cwd=PACKAGE.parent,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
+        [sys.executable, '-c', code], cwd=PACKAGE.parent, capture_output=True, text=True,
+        check=True, timeout=120,
+    )  # fmt: skip
     return finished.stdout.split()
 
 

@@ -61,26 +61,17 @@ STRANGE: list[ParameterMessage] = [
     *[
         Parameter(name, value=value).to_parameter_msg()
         for name, value in (
-            ('calibration_file', '~nosuchuser/u.yaml'),
-            ('calibration_file', '~' * 5000),
-            ('calibration_file', ''),
-            ('calibration_file', 'a\0b'),
-            ('calibration_file', [1.0, 2.0]),
-            ('calibration_directory', '/'),
-            ('frame_id', 'x' * 10_000_000),
-            ('frame_id', 'a\nb'),
-            ('nobody\x1b[2J' * 100_000, 1),
-            ('frame_id', 'a\x1b[2Jb'),
-            ('serial', 's' * 65),
-            ('transition_time', float('nan')),
-            ('transition_time', 1 << 62),
+            ('calibration_file', '~nosuchuser/u.yaml'), ('calibration_file', '~' * 5000),
+            ('calibration_file', ''), ('calibration_file', 'a\0b'), ('input', 'imu'),
+            ('calibration_file', [1.0, 2.0]), ('calibration_directory', '/'),
+            ('frame_id', 'x' * 10_000_000), ('frame_id', 'a\nb'), ('frame_id', 'a\x1b[2Jb'),
+            ('nobody\x1b[2J' * 100_000, 1), ('serial', 's' * 65), ('use_sim_time', 'perhaps'),
+            ('transition_time', float('nan')), ('transition_time', 1 << 62),
             ('diagnostics_period', -(1 << 62)),
-            ('input', 'imu'),
-            ('use_sim_time', 'perhaps'),
             ('qos_overrides./accel/counts.subscription.depth', 7),
         )
     ],
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize('together', [False, True], ids=['each', 'together'])

@@ -22,30 +22,10 @@ MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314 - our own file
 
 # Keys that rosdep/python.yaml of rosdistro resolves on Ubuntu 24.04, and ROS 2 Jazzy packages.
 KNOWN_KEYS = {
-    *(
-        'rclpy',
-        'builtin_interfaces',
-        'diagnostic_msgs',
-        'geometry_msgs',
-        'rcl_interfaces',
-        'rosgraph_msgs',
-    ),
-    *(
-        'sensor_msgs',
-        'std_msgs',
-        'launch_xml',
-        'launch_ros',
-        'ament_flake8',
-        'ament_pep257',
-        'ament_xmllint',
-    ),
-    *(
-        'python3-numpy',
-        'python3-yaml',
-        'python3-hypothesis',
-        'python3-pytest',
-        'python3-pytest-xdist',
-    ),
+    *('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'rcl_interfaces'),
+    *('rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'launch_xml', 'launch_ros', 'ament_flake8'),
+    *('ament_pep257', 'ament_xmllint', 'python3-numpy', 'python3-yaml', 'python3-hypothesis'),
+    *('python3-pytest', 'python3-pytest-xdist'),
 }
 
 

@@ -20,10 +20,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from recording_helpers import ACCEL, BOARD, Message, write_rosbag1
 from ros_helpers import TIMEOUT, Peer, stamp_of
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool
@@ -177,31 +176,12 @@ def test_imu_and_the_bags_own_names(peer: Peer, tmp_path: Path, rng: np.random.G
 
 
 def test_ros1_bags_are_played_in_cdr(peer: Peer, tmp_path: Path) -> None:
-    store = get_typestore(Stores.ROS1_NOETIC)
-    header, stamp, vector, sample, reading, imu = (
-        store.types[name]
-        for name in (
-            'std_msgs/msg/Header',
-            'builtin_interfaces/msg/Time',
-            'geometry_msgs/msg/Vector3',
-            'geometry_msgs/msg/Vector3Stamped',
-            'sensor_msgs/msg/Temperature',
-            'sensor_msgs/msg/Imu',
-        )
-    )
-    del imu
-    path = tmp_path / 'old.bag'
-    with Writer1(path) as writer:
-        counts = writer.add_connection('/accel/counts', sample.__msgtype__, typestore=store)
-        board = writer.add_connection('/temperature/board', reading.__msgtype__, typestore=store)
-        for k in range(20):
-            head = header(k, stamp(5, k), 'imu_link')
-            for connection, message in (
-                (board, reading(header=head, temperature=20.0 + k, variance=0.0)),
-                (counts, sample(header=head, vector=vector(float(k), 2.0, 3.0))),
-            ):
-                data = store.serialize_ros1(message, message.__msgtype__)
-                writer.write(connection, 5 * 10**9 + k, data)
+    path, messages = tmp_path / 'old.bag', []
+    for k in range(20):
+        for topic, numbers in ((BOARD, (20.0 + k, 0.0)), (ACCEL, (float(k), 2.0, 3.0))):
+            at = 5 * 10**9 + k
+            messages.append(Message(topic, at, at, 'imu_link', numbers))
+    write_rosbag1(path, messages)
     counts_heard = peer.listen(Vector3Stamped, 'accel/counts', UNLIMITED)
     board_heard = peer.listen(Temperature, 'temperature/board', UNLIMITED)
     play(path, rate=0.0)

@@ -41,14 +41,9 @@ def write_session(path: Path, ups: np.ndarray = UPS, chunk_bytes: int = 1 << 14)
     with BagWriter(path, metadata={'serial': 'lab-7'}, chunk_bytes=chunk_bytes) as writer:
         for seed, up in enumerate(ups):
             (run,) = simulate_blocks(
-                UNIT,
-                program,
-                up,
-                block_size=1 << 20,
-                rate_hz=RATE,
-                temperature_rate_hz=1.0,
+                UNIT, program, up, block_size=1 << 20, rate_hz=RATE, temperature_rate_hz=1.0,
                 seed=seed,
-            )
+            )  # fmt: skip
             by = start_ns - int(run.accel_stamp_ns[0])
             writer.write_counts('accel/counts', run.accel_stamp_ns + by, run.counts, 'imu_link')
             for name, stamp_ns, celsius in (

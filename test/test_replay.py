@@ -284,15 +284,9 @@ def test_a_table_holds_what_the_bag_holds(tmp_path: Path, imu: bool) -> None:
         'stamp_ns': block.accel_stamp_ns,
         **{f'specific_force_{a}_m_s2': block.accel[:, i] for i, a in enumerate('xyz')},
         **{
-            f'covariance_{name}_m2_s4': covariance[:, 3 * i + j]
-            for name, i, j in (
-                ('xx', 0, 0),
-                ('xy', 0, 1),
-                ('xz', 0, 2),
-                ('yy', 1, 1),
-                ('yz', 1, 2),
-                ('zz', 2, 2),
-            )
+            f'covariance_{"xyz"[i]}{"xyz"[j]}_m2_s4': covariance[:, 3 * i + j]
+            for i in range(3)
+            for j in range(i, 3)
         },
     }
     if imu:

@@ -182,13 +182,9 @@ def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
     )
     calibration = fitted().calibration
     provenance = replace(
-        calibration.provenance,
-        created=evil,
-        tool_version=evil,
-        model=evil,
-        notes=(evil,),
+        calibration.provenance, created=evil, tool_version=evil, model=evil, notes=(evil,),
         sources=(replace(calibration.provenance.sources[0], name=evil, sha256=evil),),
-    )
+    )  # fmt: skip
     calibration = replace(
         calibration, unit=replace(calibration.unit, serial=evil), provenance=provenance
     )

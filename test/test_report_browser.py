@@ -39,19 +39,12 @@ def test_browser_draws_the_page_for_a_phone_whole_and_without_a_complaint(tmp_pa
 }</script>""")
     finished = subprocess.run(
         [
-            browser(),
-            *HEADLESS,
-            '--enable-logging=stderr',
-            '--allow-file-access-from-files',
-            f'--user-data-dir={tmp_path / "profile"}',
-            f'--screenshot={tmp_path / "phone.png"}',
+            browser(), *HEADLESS, '--enable-logging=stderr', '--allow-file-access-from-files',
+            f'--user-data-dir={tmp_path / "profile"}', f'--screenshot={tmp_path / "phone.png"}',
             frame.as_uri(),
         ],
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-        check=True,
-    )
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=True,
+    )  # fmt: skip
     (said,) = [line for line in finished.stderr.splitlines() if 'CONSOLE' in line]
     cut, n_tables = re.search(r'(\d+) of (\d+) tables are cut', said).groups()
     assert int(n_tables) >= 5
@@ -63,17 +56,12 @@ def test_no_printed_page_is_empty(tmp_path):
     (tmp_path / 'page.html').write_text(certificate(), encoding='utf-8')
     subprocess.run(
         [
-            browser(),
-            *HEADLESS,
-            f'--user-data-dir={tmp_path / "profile"}',
-            '--no-pdf-header-footer',
-            f'--print-to-pdf={tmp_path / "page.pdf"}',
+            browser(), *HEADLESS, f'--user-data-dir={tmp_path / "profile"}',
+            '--no-pdf-header-footer', f'--print-to-pdf={tmp_path / "page.pdf"}',
             (tmp_path / 'page.html').as_uri(),
         ],
-        capture_output=True,
-        timeout=TIMEOUT_S,
-        check=True,
-    )
+        capture_output=True, timeout=TIMEOUT_S, check=True,
+    )  # fmt: skip
     printed = (tmp_path / 'page.pdf').read_bytes()
     pages = re.findall(rb'/Type /Page\n.*?/Contents (\d+) 0 R', printed, re.DOTALL)
     assert 5 <= len(pages) <= 12

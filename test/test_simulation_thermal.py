@@ -76,14 +76,9 @@ def test_presets_agree_with_a_numerical_integrator(name: str) -> None:
 
     solved = solve_ivp(
         lambda t, x: A @ x + b * air(t) + p + network.convection(x, air(t)),
-        (0.0, program.duration_s),
-        states[0],
-        method='LSODA',
-        t_eval=time,
-        rtol=1e-10,
-        atol=1e-10,
+        (0.0, program.duration_s), states[0], method='LSODA', t_eval=time, rtol=1e-10, atol=1e-10,
         max_step=60.0,
-    )
+    )  # fmt: skip
     # The integrator steps over the corners of the program, which is its error.
     np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
 

@@ -17,14 +17,10 @@ from thermo_comp.thermal.thermometer import Thermometer, correct, mix, predict
 
 SOAK_S, RAMP_S = 1800.0, 2400.0
 SENSORS = {
-    '1 mK': (0.001, 0.0, 1.0),
-    '10 mK': (0.01, 0.0, 1.0),
-    '10 mK, 0.1 Hz': (0.01, 0.0, 10.0),
-    '10 mK, 10 Hz': (0.01, 0.0, 0.1),
-    '1 mK, 62.5 mK steps': (0.001, 0.0625, 1.0),
-    '10 mK, 62.5 mK steps': (0.01, 0.0625, 1.0),
-    '10 mK, 1 K steps': (0.01, 1.0, 1.0),
-}
+    '1 mK': (0.001, 0.0, 1.0), '10 mK': (0.01, 0.0, 1.0), '10 mK, 0.1 Hz': (0.01, 0.0, 10.0),
+    '10 mK, 10 Hz': (0.01, 0.0, 0.1), '1 mK, 62.5 mK steps': (0.001, 0.0625, 1.0),
+    '10 mK, 62.5 mK steps': (0.01, 0.0625, 1.0), '10 mK, 1 K steps': (0.01, 1.0, 1.0),
+}  # fmt: skip
 
 
 def run(thermometer, t, readings):

@@ -75,12 +75,8 @@ class Running:
 def test_rclpy_still_has_what_is_used_beyond_its_documented_api() -> None:
     methods = {
         'WaitSet': (
-            'clear_entities',
-            'add_subscription',
-            'add_guard_condition',
-            'add_service',
-            'wait',
-            'is_ready',
+            *('clear_entities', 'add_subscription', 'add_guard_condition', 'add_service'),
+            *('wait', 'is_ready'),
         ),
         'Subscription': ('take_message', 'pointer', 'get_publisher_count'),
         'Service': ('service_take_request',),
