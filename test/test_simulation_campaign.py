@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A whole test in memory: runs as in a bag, units of every kind, physics of their errors."""
+"""Programs and whole tests in memory: runs as in a bag, physics of their errors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from accuracy import corrected_by_truth
-from simulation_helpers import of_part
+from simulation_helpers import of_part, rates_k_min
 from triads import TRIAD_NAMES, SlipEffect, triad
 
 from thermo_comp.simulation.campaign import PLAN_NAMES, Position, parse_cyclogram, plan
@@ -134,3 +134,39 @@ def test_a_switched_load_heats_its_part() -> None:
     # 0.5 W through 0.4 W/K to the case and about 4 W/K to the air.
     to_air = next(link.conductance for link in unit.network.links if link.a == 'air')
     assert warmer[-1] == pytest.approx(0.5 / 0.4 + 0.5 / to_air, rel=1e-6)
+
+
+def test_paper_covers_its_range_in_ramps_and_soaks() -> None:
+    program = parse_cyclogram('paper')
+    assert min(program.temperature_c) == 5.0
+    assert max(program.temperature_c) == 35.0
+    ramps = rates_k_min(program)[rates_k_min(program) != 0.0]
+    np.testing.assert_allclose(np.abs(ramps), 0.5)
+
+
+def test_a_typed_program_is_read_as_written() -> None:
+    program = parse_cyclogram('20 30min, 35@0.5 1h; -5.5@1.5\n-5.5 90s, 20')
+    np.testing.assert_allclose(program.temperature_c, [20, 20, 35, 35, -5.5, -5.5, 20])
+    np.testing.assert_allclose(
+        np.diff(program.time_s), [1800, 30 * 60, 3600, 40.5 / 1.5 * 60, 90, 25.5 / 1.5 * 60]
+    )
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('20, 35@', "step 2 '35@' must read TARGET"),
+        ('20@1, 30', "step 1 '20@1' must read"),
+        ('20, 30@0 5min', "step 2 '30@0 5min' must read"),
+        ('20, 30@0.00 5min', r"step 2 '30@0\.00 5min' must read"),
+        ('20, 30 5', "step 2 '30 5' must read"),
+        ('nan', "step 1 'nan' must read"),
+        ('oven', "step 1 'oven' must read"),
+        (' ,\n', 'cyclogram is empty'),
+        ('20', 'a ramp or a soak'),
+        (f'20, {"9" * 400}', 'finite numbers'),
+    ],
+)
+def test_a_typed_program_that_cannot_be_read_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse_cyclogram(text)
