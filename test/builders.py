@@ -162,16 +162,39 @@ def columns_from_events(events):
     )
 
 
+def stream(compensator, events):
+    """
+    Run events one by one; return the rows and the indices of the published samples.
+
+    With a gyroscope a row also contains the rate, a thousandth of the sample.
+    """
+    rows, index = [], []
+    position = 0
+    for kind, stamp, value in events:
+        if kind == 'accel':
+            row = compensator.process(stamp, *map(float, value))
+            if row is not None:
+                if compensator.corrects_rate:
+                    rate = (1e-3 * float(component) for component in value)
+                    row = (*row, *compensator.correct_rate(stamp, *rate))
+                rows.append(row)
+                index.append(position)
+            position += 1
+        else:
+            compensator.push(kind, stamp, value)
+    return np.array(rows).reshape(-1, 15 if compensator.corrects_rate else 9), index
+
+
 @dataclass(frozen=True)
 class ArrayBlock:
     """A block built from arrays."""
 
     accel_stamp_ns: np.ndarray
     accel: np.ndarray
-    board_stamp_ns: np.ndarray
-    board: np.ndarray
-    case_stamp_ns: np.ndarray
-    case: np.ndarray
+    board_stamp_ns: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    board: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    case_stamp_ns: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    case: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def temperatures(self):
@@ -180,3 +203,16 @@ class ArrayBlock:
             name: (stamp_ns, celsius, np.searchsorted(self.accel_stamp_ns, stamp_ns))
             for name, (stamp_ns, celsius) in own.items()
         }
+
+
+def source_of(*arrays, name='bag', **keys):
+    """Return a bag of one block, for a fit."""
+    from thermo_comp.fitting.sources import FitSource
+
+    return FitSource(name, lambda: [ArrayBlock(*arrays)], **keys)
+
+
+def arrays_of(run, every=1):
+    """Return the arrays of a simulated run for a block, with some of its readings."""
+    readings = (run.board_stamp_ns, run.board, run.case_stamp_ns, run.case)
+    return (run.accel_stamp_ns, run.counts.astype(float), *(one[::every] for one in readings))

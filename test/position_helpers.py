@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -76,12 +76,8 @@ class Rest:
             begin = stamp_ns[first] if first else 0
             end = stamp_ns[last] if last < len(stamp_ns) else np.iinfo(np.int64).max
             use = (board_ns >= begin) & (board_ns < end)
-            nothing_ns, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
-            block = ImuBlock(
-                stamp_ns[first:last], self.accel[first:last], board_ns[use], board[use],
-                nothing_ns, nothing,
-            )  # fmt: skip
-            if with_gyro:
-                block = replace(block, imu=Imu(self.gyro[first:last]))
-            blocks.append(block)
+            rows = slice(first, last)
+            imu = Imu(self.gyro[rows]) if with_gyro else None
+            readings = (board_ns[use], board[use])
+            blocks.append(ImuBlock(stamp_ns[rows], self.accel[rows], *readings, imu=imu))
         return FitSource(name, lambda: blocks)

@@ -9,10 +9,10 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from builders import ArrayBlock
+from builders import arrays_of, source_of
 
 from thermo_comp import fitting
-from thermo_comp.fitting import FitOptions, FitResult, FitSource
+from thermo_comp.fitting import FitOptions, FitResult
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.report.evidence import Evidence, evidence_of_fit
 from thermo_comp.report.page import render_report
@@ -46,18 +46,9 @@ def fitted() -> FitResult:
     sources = []
     for position in range(N_POSITIONS):
         one = run(position)
-        block = ArrayBlock(
-            one.accel_stamp_ns, one.counts.astype(float), one.board_stamp_ns, one.board,
-            one.case_stamp_ns, one.case,
-        )  # fmt: skip
-        sources.append(
-            FitSource(
-                name=f'{position + 1:02d}.mcap',
-                blocks=lambda block=block: [block],
-                sha256=f'{position + 1:064x}',
-                serial='thermostatted-0001',
-            )
-        )
+        number = position + 1
+        keys = {'sha256': f'{number:064x}', 'serial': 'thermostatted-0001'}
+        sources.append(source_of(*arrays_of(one), name=f'{number:02d}.mcap', **keys))
     # Without products the bank of columns is a third as large.
     groups = ('curve', 'set', 'gradient', 'board')
     return fitting.fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))

@@ -18,6 +18,7 @@ from builders import (
     columns_from_events,
     regime_set,
     rich_calibration,
+    stream,
     term,
     thermal_calibration,
 )
@@ -41,29 +42,6 @@ def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=
         noise = flicker * (-1) ** second
         compensator.push('board', second * SECOND_NS, celsius + noise)
         compensator.push('case', second * SECOND_NS, (celsius if case is None else case) + noise)
-
-
-def stream(compensator, events):
-    """
-    Run events one by one; return the rows and the indices of the published samples.
-
-    With a gyroscope a row also contains the rate, a thousandth of the sample.
-    """
-    rows, index = [], []
-    position = 0
-    for kind, stamp, value in events:
-        if kind == 'accel':
-            row = compensator.process(stamp, *map(float, value))
-            if row is not None:
-                if compensator.corrects_rate:
-                    rate = (1e-3 * float(component) for component in value)
-                    row = (*row, *compensator.correct_rate(stamp, *rate))
-                rows.append(row)
-                index.append(position)
-            position += 1
-        else:
-            compensator.push(kind, stamp, value)
-    return np.array(rows).reshape(-1, 15 if compensator.corrects_rate else 9), index
 
 
 def batch(compensator, events):

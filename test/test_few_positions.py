@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builders import ArrayBlock
+from builders import source_of
 from position_helpers import GRAVITY, MG, START_NS, Rest
 
 import thermo_comp as tc
 from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.fitting import FitOptions, fit
-from thermo_comp.fitting.sources import FitSource
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.typing import Floats
 from thermo_comp.unit.calibration import parameter_layout
@@ -75,9 +74,7 @@ def turned(rng, ups, rest_s=20.0):
         parts += [still, GRAVITY * rng.standard_normal((100, 3))]
     accel = np.concatenate(parts)
     stamp_ns = START_NS + np.arange(len(accel)) * 10_000_000
-    nothing_ns, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
-    block = ArrayBlock(stamp_ns, accel, nothing_ns, nothing, nothing_ns, nothing)
-    return FitSource('turned', lambda: [block])
+    return source_of(stamp_ns, accel, name='turned')
 
 
 def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):

@@ -5,12 +5,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from builders import ArrayBlock
+from builders import ArrayBlock, arrays_of, source_of
 from triads import triad
 
 from thermo_comp.errors import FitError
@@ -31,15 +30,6 @@ PROGRAM = parse_cyclogram('20 20min, 45@1.5 30min, 5@1.5 30min, 20@1.5 20min')
 FACES = np.vstack((np.eye(3), -np.eye(3)))
 
 
-def block_of(record: SimulatedRun, has_temperature: bool = True) -> ArrayBlock:
-    n = None if has_temperature else 0
-    return ArrayBlock(
-        record.accel_stamp_ns, record.counts.astype(np.float64),
-        record.board_stamp_ns[:n], record.board[:n],
-        record.case_stamp_ns[:n], record.case[:n],
-    )  # fmt: skip
-
-
 def records_of(unit: UnitModel, ups: Floats, seed: int) -> list[SimulatedRun]:
     plan = [Position(PROGRAM, up) for up in ups]
     return arrays(unit, plan, seed, rate_hz=RATE_HZ)
@@ -48,10 +38,8 @@ def records_of(unit: UnitModel, ups: Floats, seed: int) -> list[SimulatedRun]:
 def sources_of(
     records: Sequence[SimulatedRun], has_temperature: bool = True, first: int = 0
 ) -> list[FitSource]:
-    blocks = [block_of(record, has_temperature) for record in records]
-    return [
-        FitSource(f'bag{k}', lambda block=block: [block]) for k, block in enumerate(blocks, first)
-    ]
+    n = 6 if has_temperature else 2
+    return [source_of(*arrays_of(r)[:n], name=f'bag{k}') for k, r in enumerate(records, first)]
 
 
 def fitted(unit: UnitModel, ups: Floats, seed: int, **options: object) -> FitResult:
@@ -188,7 +176,7 @@ def test_the_compensator_does_what_the_fit_promised(response: FitResult) -> None
     up = np.array([[0.48, -0.6, 0.64]])
     (record,) = records_of(OWN_LAGS, up, 77)
     compensator = Compensator(response.calibration)
-    found = process_block(compensator, block_of(record))
+    found = process_block(compensator, ArrayBlock(*arrays_of(record)))
     per_window = round(60.0 * RATE_HZ)
     n = len(found.index) // per_window
     force = found.specific_force[: n * per_window].reshape(n, per_window, 3).mean(axis=1)
@@ -227,8 +215,8 @@ def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(
     bias, scale, M = PLAIN.bias_at_reference, PLAIN.scale_factor, np.array(PLAIN.M)
 
     def fit_of(correct: Callable[[Floats], Floats], **options: object) -> FitResult:
-        blocks = [replace(one, accel=correct(one.accel)) for one in map(block_of, records)]
-        sources = [FitSource(str(k), lambda one=one: [one]) for k, one in enumerate(blocks)]
+        recorded = [(stamps, correct(n), *rest) for stamps, n, *rest in map(arrays_of, records)]
+        sources = [source_of(*one, name=str(k)) for k, one in enumerate(recorded)]
         options |= {'gravity': STANDARD_GRAVITY, 'groups': ('curve',)}
         return fit(sources, FitOptions(**options))  # type: ignore[arg-type]
 
@@ -261,7 +249,7 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> No
         compensator = Compensator(golovach.calibration)
         if weight is not None:
             compensator.thermal.tracker.weight_at = lambda _stamp_ns: weight  # type: ignore[method-assign]
-        found = process_block(compensator, block_of(record))
+        found = process_block(compensator, ArrayBlock(*arrays_of(record)))
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return found.specific_force
 
@@ -279,10 +267,10 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> No
     assert moved.max() / MICRO_G < 1.01 * max(1.0, size.max() / MICRO_G / 300.0)
 
 
-def short_block(accel: np.ndarray, board: np.ndarray) -> ArrayBlock:
+def short(accel: np.ndarray, board: np.ndarray, name: str = 'bag') -> FitSource:
     stamps = np.arange(len(accel), dtype=np.int64) * 10_000_000
     readings = np.arange(len(board), dtype=np.int64) * 1_000_000_000
-    return ArrayBlock(stamps, accel, readings, board, readings, board)
+    return source_of(stamps, accel, readings, board, readings, board, name=name)
 
 
 @pytest.mark.parametrize(
@@ -299,21 +287,14 @@ def short_block(accel: np.ndarray, board: np.ndarray) -> ArrayBlock:
 def test_bags_without_what_a_fit_needs_are_refused(
     accel: np.ndarray, board: np.ndarray, message: str
 ) -> None:
-    source = FitSource('bag', lambda: [short_block(accel, board)])
     with pytest.raises(FitError, match=f'bag: {message}'):
-        fit([source], FitOptions(gravity=STANDARD_GRAVITY))
+        fit([short(accel, board)], FitOptions(gravity=STANDARD_GRAVITY))
 
 
 def faces(scale: float, offset: float, rng: np.random.Generator) -> list[FitSource]:
-    up = np.vstack((np.eye(3), -np.eye(3)))
-    blocks = [
-        short_block(
-            scale * one + offset + 1e-3 * scale * rng.standard_normal((4000, 3)),
-            np.linspace(10.0, 40.0, 40),
-        )
-        for one in up
-    ]
-    return [FitSource(f'face{k}', lambda block=block: [block]) for k, block in enumerate(blocks)]
+    forces = (scale * (up + 1e-3 * rng.standard_normal((4000, 3))) + offset for up in FACES)
+    celsius = np.linspace(10.0, 40.0, 40)
+    return [short(accel, celsius, name=f'face{k}') for k, accel in enumerate(forces)]
 
 
 def test_accelerations_are_not_taken_for_counts(rng: np.random.Generator) -> None:

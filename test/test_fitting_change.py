@@ -9,7 +9,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from builders import ArrayBlock
+from builders import source_of
 from scipy.signal import lfilter
 
 from thermo_comp.fitting import FitOptions, FitSource, fit
@@ -46,11 +46,11 @@ def recorded(rng, up, name: str, targets: tuple[float, ...]) -> FitSource:
     bias += np.outer(change, (9.0, -12.0, 6.0)) * (1.0 + 0.01 * t[:, None])
     force = GRAVITY * up * (1.0 + 6e-5 * t[:, None])
     stamps = 10**18 + np.rint(time * 1e9).astype(np.int64)
-    thermometers = [np.round(one + 0.003 * rng.standard_normal(len(time)), 4)
-                    for one in (board, case)]  # fmt: skip
+    board, case = (
+        np.round(one + 0.003 * rng.standard_normal(len(time)), 4) for one in (board, case)
+    )
     accel = force + bias * MICRO + NOISE * rng.standard_normal((len(time), 3))
-    block = ArrayBlock(stamps, accel, stamps, thermometers[0], stamps + 1, thermometers[1])
-    return FitSource(name, lambda: [block])
+    return source_of(stamps, accel, stamps, board, stamps + 1, case, name=name)
 
 
 def test_what_a_change_does_is_found_about_rest(rng):

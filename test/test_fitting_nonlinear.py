@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders import arrays_of, source_of
 from fitting_truth import GRAVITY, MICRO, NOMINAL, Truth, begin, prior_of, table_of
 from triads import triad
 
@@ -235,14 +236,9 @@ def test_simulated_forces_are_those_of_a_rotation():
 
 
 def source(run: SimulatedRun, spin: Spin | None, name: str) -> FitSource:
-    from builders import ArrayBlock
-
     sections = tuple(Section(*one, 0.0) for one in spin.sections(G)) if spin else ()
-    block = ArrayBlock(
-        *(run.accel_stamp_ns, run.counts.astype(float)),
-        *(run.board_stamp_ns, run.board, run.case_stamp_ns, run.case),
-    )
-    return FitSource(name, lambda: [block], force=KnownForce(name, sections) if spin else None)
+    force = KnownForce(name, sections) if spin else None
+    return source_of(*arrays_of(run), name=name, force=force)
 
 
 def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():

@@ -76,8 +76,7 @@ def test_short_rests_of_slow_samples_are_found(rng: np.random.Generator, rest_s:
     # WHY: at 1 Hz a cell was half a minute, and the mean over all attitudes was 0.07 m/s^2 long.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
-    none, empty = np.empty(0, np.int64), np.empty(0)
-    tumble = ArrayBlock(stamps(len(samples), 1.0), samples, none, empty, none, empty)
+    tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
     bag = reduced([tumble], min_rest_s=None, full_scale=None)
     assert len(bag.intervals) >= 18
     for one in bag.intervals:
@@ -202,8 +201,7 @@ def test_windows_are_as_long_as_stated(
 ) -> None:
     n = round(150 * rate_hz)
     accel = np.array((0.0, 0.0, 3000.0)) + 0.3 * rng.standard_normal((n, 3))
-    none = np.zeros(0, dtype=np.int64)
-    bag = reduced([ArrayBlock(stamps(n, rate_hz), accel, none, none * 1.0, none, none * 1.0)])
+    bag = reduced([ArrayBlock(stamps(n, rate_hz), accel)])
     (interval,) = bag.intervals
     assert bag.window_s == window_s
     assert bag.n_cells == pytest.approx(150 / cell_s)

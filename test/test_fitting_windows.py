@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import ArrayBlock
+from builders import arrays_of, source_of
 from triads import triad
 
 from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit_bags, reduce_bag
@@ -40,14 +40,8 @@ SECOND = 1_000_000_000
 
 def sources(n: int, seed: int = 1) -> list[FitSource]:
     plan = [Position(PROGRAM, up) for up in positions(n, seed)]
-    result = []
     unit = triad('own-lags', seed).with_thermometers(rate_hz=0.25)
-    for record in arrays(unit, plan, seed):
-        counts = record.counts.astype(np.float64)
-        board, case = (record.board_stamp_ns, record.board), (record.case_stamp_ns, record.case)
-        block = ArrayBlock(record.accel_stamp_ns, counts, *board, *case)
-        result.append(FitSource('bag', lambda block=block: [block]))
-    return result
+    return [source_of(*arrays_of(record)) for record in arrays(unit, plan, seed)]
 
 
 @pytest.fixture(scope='module')

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import ArrayBlock
+from builders import source_of
 from position_helpers import START_NS
 
 from thermo_comp.fitting import FitOptions, FitSource, fit
@@ -25,9 +25,7 @@ M = np.array(((1.0, 0.0, 0.0), (0.004, 1.0, 0.0), (-0.006, 0.003, 1.0)))
 
 def source(words, name='words') -> FitSource:
     stamps = START_NS + np.arange(len(words)) * 10_000_000
-    none_ns, none = np.zeros(0, dtype=np.int64), np.zeros(0)
-    block = ArrayBlock(stamps, words, none_ns, none, none_ns, none)
-    return FitSource(name, lambda: [block])
+    return source_of(stamps, words, name=name)
 
 
 def words_of(ups, rng, seconds=20.0):

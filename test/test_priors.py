@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import ArrayBlock
+from builders import arrays_of, source_of
 from triads import sibling, triad
 
 from thermo_comp.cli.app import run
@@ -32,16 +32,10 @@ OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
 def source(record: SimulatedRun) -> FitSource:
-    block = ArrayBlock(
-        record.accel_stamp_ns + 10**18,
-        record.counts.astype(np.float64),
-        # A reading every eight seconds: a ramp of 1 K/min is still detected, eight times faster.
-        record.board_stamp_ns[::8] + 10**18,
-        record.board[::8],
-        record.case_stamp_ns[::8] + 10**18,
-        record.case[::8],
-    )
-    return FitSource('bag', lambda: [block])
+    # A reading every eight seconds: a ramp of 1 K/min is still detected, eight times faster.
+    arrays = arrays_of(record, 8)
+    later = [one + 10**18 if one.dtype == np.int64 else one for one in arrays]
+    return source_of(*later)
 
 
 @cache
