@@ -212,13 +212,10 @@ class Desk:
         Start a command that runs until Ctrl-C, and send Ctrl-C once it has printed its first line.
         """
         process = subprocess.Popen(
-            [sys.executable, '-m', 'thermo_comp', *arguments],
-            cwd=here,
-            env={**os.environ, 'PYTHONPATH': str(ROOT)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+            [sys.executable, '-m', 'thermo_comp', *arguments], cwd=here,
+            env={**os.environ, 'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
         assert process.stdout is not None
         first = process.stdout.readline()
         process.send_signal(signal.SIGINT)

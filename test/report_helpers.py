@@ -31,13 +31,10 @@ LEFT_OUT_RMS = [1e-6 * STANDARD_GRAVITY * (1 + k) for k in range(N_POSITIONS - 1
 def run(position: int = 0) -> SimulatedRun:
     """Run one position of a thermostatted unit through 54 minutes of ramps and soaks."""
     return simulate(
-        unit_preset('thermostatted', 1),
-        parse_cyclogram(PROGRAM),
-        positions(N_POSITIONS, 0)[position],
-        rate_hz=RATE_HZ,
-        temperature_rate_hz=0.4,
+        unit_preset('thermostatted', 1), parse_cyclogram(PROGRAM),
+        positions(N_POSITIONS, 0)[position], rate_hz=RATE_HZ, temperature_rate_hz=0.4,
         seed=position,
-    )
+    )  # fmt: skip
 
 
 @cache

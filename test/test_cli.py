@@ -63,12 +63,9 @@ class TestOutput:
     def test_a_reader_that_has_seen_enough_is_no_error(self, bag: Path) -> None:
         command = f'{sys.executable} -m thermo_comp info {bag} | head -n 1'
         finished = subprocess.run(
-            ['bash', '-c', f'set -o pipefail; {command}'],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+            ['bash', '-c', f'set -o pipefail; {command}'], cwd=ROOT, capture_output=True,
+            text=True, check=False,
+        )  # fmt: skip
         assert finished.stderr == ''
         assert len(finished.stdout.splitlines()) == 1
 

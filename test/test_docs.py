@@ -84,11 +84,8 @@ def test_completion_is_a_script_that_bash_takes(root: Path) -> None:
     # The program looks for the shell that started it; the `:` keeps that shell waiting.
     finished = subprocess.run(
         [bash, '-c', f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+        cwd=root, capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert (finished.returncode, finished.stderr) == (0, '')
     assert 'thermo_comp' in finished.stdout
 
@@ -109,11 +106,8 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
         pytest.importorskip(module, reason=f'{module} is not installed: the extra `docs`')
     finished = subprocess.run(
         [sys.executable, '-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path / 'site'],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert finished.returncode == 0, finished.stderr
     assert (tmp_path / 'site' / 'index.html').is_file()
 

@@ -156,12 +156,9 @@ def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: st
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS[name][0]]
     killed = subprocess.run(
-        [sys.executable, '-c', KILLED, point, name, *arguments, name],
-        cwd=folder,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        check=False,
-    )
+        [sys.executable, '-c', KILLED, point, name, *arguments, name], cwd=folder,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)}, capture_output=True, check=False,
+    )  # fmt: skip
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert output.read_bytes() == old
     (rest,) = set(folder.iterdir()) - listed
@@ -185,12 +182,9 @@ def test_a_command_that_is_asked_to_end_leaves_nothing(folder: Path, name: str) 
     arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]
     script = KILLED.replace('SIGKILL', 'SIGTERM')
     ended = subprocess.run(
-        [sys.executable, '-c', script, 'writing', name, *arguments, name],
-        cwd=folder,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        check=False,
-    )
+        [sys.executable, '-c', script, 'writing', name, *arguments, name], cwd=folder,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)}, capture_output=True, check=False,
+    )  # fmt: skip
     assert (ended.returncode, ended.stderr) == (143, b'')
     assert set(folder.iterdir()) == listed
 

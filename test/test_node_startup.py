@@ -170,12 +170,9 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
         assert 'rror' not in node.said.replace('[ERROR]', '')
     peer.close()
     finished = subprocess.run(
-        [sys.executable, '-m', 'thermo_comp', 'info', unit],
-        cwd=Path(__file__).parents[1],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+        [sys.executable, '-m', 'thermo_comp', 'info', unit], cwd=Path(__file__).parents[1],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert finished.returncode == 1
     said = 'thermo_comp: error: the commands need typer: pip install thermo_comp\n'
     assert (finished.stdout, finished.stderr) == ('', said)

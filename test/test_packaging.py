@@ -45,12 +45,9 @@ def test_one_version() -> None:
     assert MANIFEST.findtext('version') == thermo_comp.__version__
     assert re.fullmatch(r'\d+\.\d+\.\d+', thermo_comp.__version__)
     finished = subprocess.run(
-        [sys.executable, 'setup.py', '--version'],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
+        [sys.executable, 'setup.py', '--version'], cwd=ROOT, capture_output=True, text=True,
         check=True,
-    )
+    )  # fmt: skip
     assert finished.stdout.split()[-1] == thermo_comp.__version__
 
 
@@ -132,11 +129,8 @@ def test_share_holds_what_ros_looks_for(tmp_path: Path) -> None:
             *(sys.executable, 'setup.py', '-q', 'build', '--build-base', tmp_path / 'build'),
             *('install_data', '--install-dir', tmp_path / 'prefix'),
         ],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        env={**os.environ, 'PYTHONWARNINGS': 'ignore'},
-    )
+        cwd=ROOT, check=True, capture_output=True, env={**os.environ, 'PYTHONWARNINGS': 'ignore'},
+    )  # fmt: skip
     share = tmp_path / 'prefix' / 'share'
     assert (share / 'ament_index/resource_index/packages/thermo_comp').is_file()
     assert (share / 'thermo_comp/package.xml').is_file()

@@ -122,11 +122,8 @@ def test_only_whole_numbers_for_float_parameters_are_turned_into_floats() -> Non
     found = [parameters.read_parameter(one.to_parameter_msg()) for one in changes]
     assert [one.value for one in found] == [5.0, 5, True, 5]
     assert [one.type_ for one in found] == [
-        Parameter.Type.DOUBLE,
-        Parameter.Type.INTEGER,
-        Parameter.Type.BOOL,
-        Parameter.Type.INTEGER,
-    ]
+        Parameter.Type.DOUBLE, Parameter.Type.INTEGER, Parameter.Type.BOOL, Parameter.Type.INTEGER,
+    ]  # fmt: skip
 
 
 def test_table_and_help_name_every_parameter() -> None:

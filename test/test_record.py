@@ -237,12 +237,9 @@ class Recording:
 
     def __init__(self, *arguments: str | Path) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, '-m', 'thermo_comp', 'record', *map(str, arguments)],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+            [sys.executable, '-m', 'thermo_comp', 'record', *map(str, arguments)], cwd=ROOT,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
 
     def wait_for(self, words: str) -> None:
         """Read its output up to this text."""

@@ -57,12 +57,9 @@ def small_bag(compression: str, use_chunking: bool = True) -> tuple[bytes, int, 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         write_mcap(
-            path,
-            regular_messages(24),
-            chunk_size=600,
-            compression=compression,
+            path, regular_messages(24), chunk_size=600, compression=compression,
             use_chunking=use_chunking,
-        )
+        )  # fmt: skip
         position, length = chunk_places(path)[-1] if use_chunking else (0, 0)
         return path.read_bytes(), position, length
 

@@ -133,14 +133,11 @@ def test_every_number_of_an_imu_message_arrives(messages: list[Message], chunk_s
         assert columns.imu is not None
         together = np.hstack(
             [
-                columns.imu.orientation,
-                columns.imu.orientation_covariance,
-                columns.imu.angular_velocity,
-                columns.imu.angular_velocity_covariance,
-                columns.accel,
-                columns.imu.linear_acceleration_covariance,
-            ]
-        )
+                columns.imu.orientation, columns.imu.orientation_covariance,
+                columns.imu.angular_velocity, columns.imu.angular_velocity_covariance,
+                columns.accel, columns.imu.linear_acceleration_covariance,
+            ],
+        )  # fmt: skip
         assert together.tobytes() == np.array(numbers).tobytes()
 
 
@@ -343,11 +340,8 @@ def test_topics_by_the_names_of_their_inputs(tmp_path: Path) -> None:
     found = read_recording(path, Topics.named(names))
     assert found.info.chosen is None
     assert {name: one.celsius.tolist() for name, one in found.columns.temperatures.items()} == {
-        'board': [20.0],
-        'case': [21.0],
-        'lid': [23.0],
-        'magnet': [22.0],
-    }
+        'board': [20.0], 'case': [21.0], 'lid': [23.0], 'magnet': [22.0],
+    }  # fmt: skip
     with pytest.raises(RecordingError, match=r'/t9: no such topic.*--topic temperature/magnet='):
         open_recording(path, Topics.named({**names, 'temperature/magnet': '/t9'}))
     with pytest.raises(RecordingError, match=r'/raw: the topic has type geometry_msgs/msg/Vector'):

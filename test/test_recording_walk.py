@@ -51,12 +51,9 @@ def listed(messages: Messages) -> list[tuple[int, int, int, int]]:
 
 #: Contents that look like records, with the lengths of real ones.
 DECEITFUL = [
-    b'\x05' * 40,
-    message(1, 5, b'\x05' * 9),
-    (message(1, 7, b'') * 3)[:40],
-    struct.pack('<BQ', MESSAGE, 22 + 40) * 4,
-    bytes(40),
-]
+    b'\x05' * 40, message(1, 5, b'\x05' * 9), (message(1, 7, b'') * 3)[:40],
+    struct.pack('<BQ', MESSAGE, 22 + 40) * 4, bytes(40),
+]  # fmt: skip
 
 
 @st.composite

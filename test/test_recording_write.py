@@ -72,12 +72,9 @@ def test_rosbags_and_mcap_read_back_what_was_written(
                 }
         file = path if is_file else path / 'bag_0.mcap'
         names = {
-            '/accel/counts': 'c',
-            '/temperature/board': 't',
-            '/imu/data_raw': 'i',
-            '/regime/dynamic': 'b',
-            '/diagnostics': 'r',
-        }
+            '/accel/counts': 'c', '/temperature/board': 't', '/imu/data_raw': 'i',
+            '/regime/dynamic': 'b', '/diagnostics': 'r',
+        }  # fmt: skip
         # Order in the file: by group of calls, then log time, then order of the calls.
         wanted = [
             (log_ns, name) for _, log_ns, name in sorted(written, key=lambda entry: entry[:2])

@@ -55,13 +55,10 @@ class Drawing:
 names = st.text(min_size=2, max_size=5)
 lengths = st.floats(1.0, 9.0)
 drawings = st.builds(
-    Drawing,
-    name=names,
+    Drawing, name=names,
     shapes=st.lists(st.builds(Circle, lengths) | st.builds(Square, lengths)).map(tuple),
-    layer=st.integers() | names,
-    is_hidden=st.booleans(),
-    frame=st.builds(Circle, lengths),
-)
+    layer=st.integers() | names, is_hidden=st.booleans(), frame=st.builds(Circle, lengths),
+)  # fmt: skip
 
 
 @given(drawings)

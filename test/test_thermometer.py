@@ -43,13 +43,10 @@ def run(thermometer, t, readings):
 
 def state(thermometer):
     return (
-        thermometer.temperature,
-        thermometer.rate,
-        thermometer.acceleration,
-        thermometer.var_temperature,
-        thermometer.var_rate,
+        thermometer.temperature, thermometer.rate, thermometer.acceleration,
+        thermometer.var_temperature, thermometer.var_rate,
         thermometer.at((thermometer.stamp_ns or 0) + SECOND_NS),
-    )
+    )  # fmt: skip
 
 
 def settled(noise=0.001, n=600, **changes):
@@ -87,12 +84,9 @@ def errors():
 
 
 PARTS = {
-    'soak': (-0.5 * SOAK_S, 0.0),
-    'onset': (0.0, 300.0),
-    'ramp': (600.0, RAMP_S),
-    'end': (RAMP_S, RAMP_S + 600.0),
-    'late': (RAMP_S + 600.0, RAMP_S + 3600.0),
-}
+    'soak': (-0.5 * SOAK_S, 0.0), 'onset': (0.0, 300.0), 'ramp': (600.0, RAMP_S),
+    'end': (RAMP_S, RAMP_S + 600.0), 'late': (RAMP_S + 600.0, RAMP_S + 3600.0),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize('part', PARTS)
