@@ -295,6 +295,13 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
     return get
 
 
+@pytest.fixture(scope='module')
+def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli, once: Once) -> Any:
+    from desk_helpers import Desk
+
+    return Desk(tmp_path_factory.mktemp('desk'), cli, once)
+
+
 class _Pickler(pickle.Pickler):
     """Leave out the functions that read the bags of a fit; they are not needed after it."""
 

@@ -10,7 +10,7 @@ import re
 from typing import Any
 
 import pytest
-from conftest import Cli, Once, parsed
+from conftest import Cli, parsed
 from desk_helpers import Desk
 from typer import rich_utils
 from typer.main import get_command
@@ -49,11 +49,6 @@ WITH_JSON = {
     and 'bags/unit42/*' not in one
 }.values()
 QUICK = [one for one in EXAMPLES if one.split()[1] in ('info', 'convert', 'export', 'import')]
-
-
-@pytest.fixture(scope='module')
-def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli, once: Once) -> Desk:
-    return Desk(tmp_path_factory.mktemp('desk'), cli, once)
 
 
 def test_every_command_has_an_example() -> None:

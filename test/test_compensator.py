@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from builders import (
     SECOND_NS,
-    Columns,
     axis_set,
     calibration,
     columns_from_events,
@@ -168,22 +167,6 @@ def assert_sound(block, counters, events):
     assert np.count_nonzero(backward) <= counters.n_time_jumps
 
 
-def test_axes_are_treated_alike():
-    one = axis_set((0.0, 0.3), (1.0, 8e-5), delta=1.0)
-    two = axis_set((0.0, -0.1), (1.0, 5e-5))
-    three = axis_set((0.0, 0.7, 0.01), (1.0, -5e-5))
-
-    def run(order, sample):
-        sets = [(one, two, three)[i] for i in order]
-        compensator = Compensator(calibration(static=regime_set(*sets)))
-        warm(compensator, 27.0, until_s=60)
-        return compensator.process(60 * SECOND_NS, *(sample[i] for i in order))[:3]
-
-    sample = (500.0, -1200.0, 2500.0)
-    plain = run((0, 1, 2), sample)
-    assert run((2, 0, 1), sample) == (plain[2], plain[0], plain[1])
-
-
 def test_unknown_regime_is_paid_for_in_the_covariance():
     unit = calibration(dynamic=regime_set(axis_set(delta=3.0)))
     compensator = Compensator(unit)
@@ -290,14 +273,6 @@ def test_flush_lets_the_regime_go_on_without_samples():
     compensator.flush(1500 * SECOND_NS)
     flags = compensator.take_flags()
     assert flags[-1] == (1499 * SECOND_NS, False)
-
-
-def test_empty_block():
-    block = process_block(
-        Compensator(calibration()), Columns(np.empty(0, np.int64), np.empty((0, 3)))
-    )
-    assert block.specific_force.shape == (0, 3)
-    assert block.covariance.shape == (0, 9)
 
 
 def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():

@@ -37,6 +37,7 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
     ('text', 'seconds'),
     [
         ('2026-03-29T01:30:00Z', 0),
+        ('2026-03-29T01:30:00.123456789Z', 0.123456789),
         ('2026-03-29 01:30:00', 0),  # without a zone: UTC
         ('2026-03-29T03:30:00.5+02:00', 0.5),
         ('2026-03-29T03:30:00+0200', 0),  # GGIR
@@ -47,10 +48,6 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
 )
 def test_dates_with_their_zones(text: str, seconds: float) -> None:
     assert exact_ns(text, 'iso') == START_NS + round(seconds * 1e9)
-
-
-def test_nanoseconds_of_a_date_are_exact() -> None:
-    assert exact_ns('2026-03-29T01:30:00.123456789Z', 'iso') == START_NS + 123456789
 
 
 @pytest.mark.parametrize('text', ['', '01:30', '2026-13-29 01:30:00', '2026-03-29T01:30:00+2'])
@@ -146,7 +143,6 @@ def test_the_right_triad_and_thermometers_are_taken() -> None:
             *('gtemp', 'AHT_tmp[C]', 'BMP_temp[K]'),
         ]
     )
-    assert found is not None
     assert (found.time, found.time_unit, found.accel_unit) == ('now[ms]', 'ms', 'mg')
     assert found.accel == ('acc_x [mg]', 'acc_y [mg]', 'acc_z [mg]')
     assert (found.gyro, found.gyro_unit) == (('gx[deg/s]', 'gy[deg/s]', 'gz[deg/s]'), 'deg/s')

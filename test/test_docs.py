@@ -16,7 +16,7 @@ from pathlib import Path
 import matplotlib as mpl
 import pytest
 import yaml
-from conftest import ROOT, Cli, Once, parsed
+from conftest import ROOT, parsed
 from desk_helpers import Desk
 from matplotlib import pyplot as plt
 from readme_helpers import is_alike
@@ -53,11 +53,6 @@ def commands() -> list[tuple[str, str, str]]:
 
 
 COMMANDS = commands()
-
-
-@pytest.fixture(scope='module')
-def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli, once: Once) -> Desk:
-    return Desk(tmp_path_factory.mktemp('desk'), cli, once)
 
 
 @pytest.mark.parametrize(('page', 'command', 'output'), COMMANDS, ids=[c for _, c, _ in COMMANDS])

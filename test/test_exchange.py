@@ -399,7 +399,6 @@ def test_px4_rates_of_different_degree_keep_their_own_reference(cubic: Calibrati
     lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']
     text = export_calibration(cubic, 'px4').text + '\n'.join(lines) + '\n'
     back = import_calibration(text, serial='7')
-    assert back.gyroscope is not None
     for axis, row in enumerate(rows):
         curve = back.gyroscope.static.axes()[axis].bias_function
         for celsius in (5.0, 20.0, 44.0):

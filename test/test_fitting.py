@@ -59,7 +59,6 @@ def constants(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
 
 def claimed(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     """Their sd, that of K relative."""
-    assert calibration.posterior is not None
     layout, sd = (
         parameter_layout(calibration),
         np.sqrt(np.diag(calibration.posterior.covariance())),

@@ -30,7 +30,6 @@ def ratio(path: Path) -> float:
     result = fit_bags(bags, options)
     posterior, prior = result.selected.posterior, result.selected.prior
     calibration, data = result.calibration, result.windows.data
-    assert calibration.posterior is not None
     K = np.array([axis.scale_factor for axis in calibration.axes])
     found = []
     for p in range(data.n_positions):

@@ -15,7 +15,7 @@ from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitSource, normal_gravity
 from thermo_comp.fitting.reduction import Readings, ReducedBag, reduce_source
 from thermo_comp.fitting.sensors import learn_detector, learn_thermometer, quantum_of
-from thermo_comp.recording.stillness import CellAccumulator, still_intervals
+from thermo_comp.recording.stillness import CellAccumulator
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 
@@ -113,14 +113,6 @@ def test_positions_in_one_bag_are_told_apart(rng: np.random.Generator) -> None:
     assert (second.end_ns - second.start_ns) * 1e-9 == pytest.approx(30.0, abs=1.6)
 
 
-def test_vibration_is_cut_out(rng: np.random.Generator) -> None:
-    accel = still(rng, 60.0, (0.0, 0.0, 3000.0))
-    accel[2000:2300] += 5.0 * rng.standard_normal((300, 3))
-    first, second = reduced([block(accel)]).intervals
-    assert first.time[-1] < 20.0
-    assert second.time[0] > 23.0
-
-
 def test_a_chamber_whose_compressor_cycles_has_one_position(rng: np.random.Generator) -> None:
     # WHY: half of the recording was left out, and each pause of the compressor was a position: 18
     # bags had 1135, and their fit took ten minutes. WHAT: twelve shakes of three times the noise
@@ -176,18 +168,6 @@ def test_time_origin_does_not_matter(rng: np.random.Generator) -> None:
         results.append(cells.finish())
     np.testing.assert_array_equal(results[0].mean, results[1].mean)
     np.testing.assert_array_equal(results[0].time, results[1].time)
-
-
-def test_nothing_gives_nothing() -> None:
-    cells = CellAccumulator(0.5, None).finish()
-    assert still_intervals(cells, 3.0) == []
-
-
-def test_slow_samples_get_longer_cells(rng: np.random.Generator) -> None:
-    cells = CellAccumulator(0.5, None)
-    cells.add(stamps(640, 10.0), rng.standard_normal((640, 3)))
-    # 30 samples at 10 Hz.
-    assert cells.finish().cell_s == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize(

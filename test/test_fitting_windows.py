@@ -278,7 +278,6 @@ def test_covariance_of_the_file_is_that_of_the_claim(fitted: tuple[FitResult, Cl
     # form.
     result, claim = fitted
     calibration = result.calibration
-    assert calibration.posterior is not None
     layout = parameter_layout(calibration)
     covariance = calibration.posterior.covariance()
     assert covariance.shape == (layout.n_parameters, layout.n_parameters)

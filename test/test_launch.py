@@ -149,7 +149,6 @@ def test_our_node_s_executable_parameters_and_topics() -> None:
         # Temperature topics are named after the sensors.
         assert topic in topics or topic.startswith('temperature/'), topic
         argument = re.fullmatch(r'\$\(var (\w+)\)', remap.get('to', ''))
-        assert argument is not None
         assert defaults[argument[1]] == topic
 
 

@@ -216,7 +216,6 @@ def test_a_reader_that_ends_is_begun_anew(unit: Path) -> None:
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
     process = reader._process
-    assert process is not None
     process.kill()
     process.wait()
     with pytest.raises(CalibrationError, match='the process that reads it ended'):
@@ -232,7 +231,6 @@ def test_a_reader_that_hangs_is_given_up(unit: Path) -> None:
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
     process, reader._limit_s = reader._process, 0.3
-    assert process is not None
     process.send_signal(signal.SIGSTOP)
     with pytest.raises(CalibrationError, match=r'cannot be read: no answer within 0\.3 s'):
         reader.read(str(unit), '')
@@ -316,7 +314,6 @@ def test_a_start_that_hangs_ends_with_one_signal() -> None:
     with subprocess.Popen(
         [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == 'reads\n'
         began = time.monotonic()
         process.send_signal(signal.SIGTERM)

@@ -237,7 +237,6 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path: Path) -> 
         }
         sample = START_NS + k * CYCLE_NS, *standing(k)
         force = node._compensator.process(*sample)
-        assert force is not None
         assert force[0] == pytest.approx((standing(k)[0] - 2.0) / K, abs=1e-12)
         assert node._relay.running.config.frame_id == 'body'
         assert node._loop._period_ns == 2 * SECOND_NS

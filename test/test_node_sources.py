@@ -123,7 +123,6 @@ def driver_process(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """Run a driver; return the time of its first sample [ns]. It is killed at the end."""
     command = [sys.executable, '-c', DRIVER, name]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
     try:
         yield process, int(process.stdout.readline())
     finally:

@@ -68,7 +68,6 @@ def test_licence_is_the_whole_apache_text() -> None:
     assert 'Version 2.0, January 2004' in licence
     assert 'END OF TERMS AND CONDITIONS' in licence
     node = MANIFEST.find('license')
-    assert node is not None
     assert (node.text, node.get('file')) == ('Apache-2.0', 'LICENSE')
 
 
@@ -112,7 +111,6 @@ def test_the_manifest_asks_for_the_node_alone() -> None:
 def test_hosted_ci_does_what_the_readme_says() -> None:
     jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yaml').read_text())['jobs']
     lowest = re.search(r"python_requires='>=([\d.]+)'", (ROOT / 'setup.py').read_text())
-    assert lowest is not None
     assert jobs['wheels']['strategy']['matrix']['python'][0] == lowest[1]
     run = '\n'.join(step.get('run', '') for step in jobs['ros']['steps'])
     readme = (ROOT / 'README.md').read_text()

@@ -61,7 +61,6 @@ def siblings() -> list[Calibration]:
 
 
 def sd_of_levels(calibration: Calibration) -> np.ndarray:
-    assert calibration.posterior is not None
     variance = np.diag(calibration.posterior.covariance())
     places = [block.static for block in parameter_layout(calibration).bias]
     K = [axis.scale_factor for axis in calibration.axes]
@@ -78,14 +77,12 @@ def test_population_is_the_mean_unit_and_its_scatter():
     ]
     mean = found.static.x.bias_function.free_coefficients[0] / found.axes.x.scale_factor
     assert mean == pytest.approx(np.mean(slopes))
-    assert found.posterior is not None
     variance = np.diag(found.posterior.covariance())
     at = parameter_layout(found).bias[0].static + 1
     sd = np.sqrt(variance[at]) / found.axes.x.scale_factor
     # Scatter of three units and of their mean, and parameters that are not determined in any.
     own = []
     for one in siblings():
-        assert one.posterior is not None
         variance = np.diag(one.posterior.covariance())
         own.append(variance[parameter_layout(one).bias[0].static + 1])
     own = np.array(own) / K[:, 0] ** 2

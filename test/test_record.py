@@ -144,7 +144,6 @@ class TestGrowing:
             n_looks += news is None
             if news is not None:
                 block, info = news
-                assert info is not None
                 assert info.metadata['serial'] == 'lab-7'
                 for role, messages in block.raw.items():
                     found.setdefault(role, []).extend(messages)
@@ -243,7 +242,6 @@ class Recording:
 
     def wait_for(self, words: str) -> None:
         """Read its output up to this text."""
-        assert self.process.stderr is not None
         for line in self.process.stderr:
             if words in line:
                 return

@@ -88,10 +88,8 @@ def test_rosbags_and_mcap_read_back_what_was_written(
         with file.open('rb') as stream:
             reader = make_reader(stream, validate_crcs=True)
             summary = reader.get_summary()
-            assert summary is not None
             topics = {c.id: names[c.topic] for c in summary.channels.values()}
             assert [(log_ns, topics[number]) for log_ns, number in records] == wanted
-            assert summary.statistics is not None
             assert summary.statistics.message_count == len(wanted)
             in_time = [message.log_time for _, _, message in reader.iter_messages()]
             assert in_time == sorted(log_ns for log_ns, _ in wanted)
@@ -170,7 +168,6 @@ def test_the_directory_is_what_rosbag2_writes(tmp_path: Path) -> None:
         reader = make_reader(stream)
         assert reader.get_header().profile == 'ros2'
         summary = reader.get_summary()
-        assert summary is not None
         (channel,) = summary.channels.values()
         (schema,) = summary.schemas.values()
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}

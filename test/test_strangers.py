@@ -94,28 +94,6 @@ def test_noise_bias_scale_and_misalignment_follow_their_definition() -> None:
     assert error.std(axis=0) == pytest.approx([sd] * 3, rel=0.03 + 4.0 / np.sqrt(2 * n))
 
 
-def test_a_shift_is_added_to_its_bag_alone() -> None:
-    bags = [
-        record(unit(), program(20, 10), LEVEL, rng_of('shift'), shift=shift)
-        for shift in (0.0, np.array([30.0, -15.0, 7.0]))
-    ]
-    shifts = (bags[1].samples - bags[0].samples) / UG
-    assert shifts == pytest.approx(np.broadcast_to([30.0, -15.0, 7.0], shifts.shape), abs=1e-6)
-
-
-def test_a_kink_changes_the_slope_at_its_temperature() -> None:
-    given = unit(kink=np.array([8.0, -12.0, 20.0]), kink_c=22.0)
-    at = given.bias_at(np.array([[21.0], [22.0], [24.0]]))
-    assert at == pytest.approx(np.array([np.zeros(3), np.zeros(3), 2.0 * given.kink]))
-
-
-def test_a_bump_has_its_height_and_its_width() -> None:
-    given = unit(bump=np.array([300.0, -400.0, 600.0]), bump_c=18.0)
-    at = given.bias_at(np.array([[18.0], [17.0], [19.0], [28.0]]))
-    expected = [given.bump, given.bump / 2, given.bump / 2, np.zeros(3)]
-    assert at == pytest.approx(np.array(expected), abs=1e-9)
-
-
 def test_a_support_tilts_with_the_square_of_temperature() -> None:
     axis = np.array([1e-6, 0.0, 0.0])
     bag = record(unit(), program(20, 10, (35, 1, 60)), LEVEL, rng_of('tilt'), tilt=axis)
