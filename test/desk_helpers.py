@@ -46,19 +46,7 @@ def write_fit_of_the_readme(path: Path, cli: Cli) -> None:
 
 
 class Desk:
-    """
-    Prepare files once, and run examples in folders where they lie ready.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the files are made.
-    cli : Cli
-        The command line.
-    once : Once
-        Where files are that every desk needs.
-
-    """
+    """Prepares files once, and runs examples in folders where they lie ready."""
 
     def __init__(self, folder: Path, cli: Cli, once: Once) -> None:
         self._cli = cli
@@ -160,19 +148,6 @@ class Desk:
         """
         Run one example as written, with a shorter wait; it must succeed. Each example has a new
         folder, except that fleets share one.
-
-        Parameters
-        ----------
-        command : str
-            A line that starts with ``thermo_comp``; wildcards are expanded as a shell does.
-        cli : Cli or None, optional
-            The command line; the desk's own by default.
-
-        Returns
-        -------
-        subprocess.CompletedProcess
-            With its output.
-
         """
         words = shlex.split(command, comments=True)
         assert words.pop(0) == 'thermo_comp'
