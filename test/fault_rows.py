@@ -7,8 +7,6 @@ Times are seconds of the bag of `fault_rig`: the unit turns until 40, the ramp i
 and the lag of the board has decayed by 270. docs/faults.md describes each row.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 
@@ -59,21 +57,21 @@ class Row:
     source: list[Event] | None = field(default=None, repr=False)
 
 
-def swap_topics(events: list[Event]) -> list[Event]:
+def swap_topics(events):
     other = {'board': 'case', 'case': 'board'}
     return [(other.get(topic, topic), stamp, v) for topic, stamp, v in events]
 
 
-def lose(share: float) -> Inject:
+def lose(share):
     rng = np.random.default_rng(3)
     return changed('counts', 0.0, 999.0, lambda e: [e] if rng.random() >= share else [])
 
 
-def faster(begin_s: float, end_s: float, factor: int) -> Inject:
+def faster(begin_s, end_s, factor):
     """Shorten the conversion cycle: a sample becomes `factor` samples with fewer counts each."""
     step_ns = round(1e9 / RATE_HZ / factor)
 
-    def split(event: Event) -> list[Event]:
+    def split(event):
         topic, stamp_ns, sample = event
         part = tuple(float(round(one / factor)) for one in sample)
         return [
@@ -84,12 +82,12 @@ def faster(begin_s: float, end_s: float, factor: int) -> Inject:
     return changed('counts', begin_s, end_s, split)
 
 
-def half_time(begin_s: float) -> Inject:
+def half_time(begin_s):
     """Let a bag restart: play its beginning, then the whole bag."""
     return lambda events: [e for e in events if seconds_of(e[1]) < begin_s] + events
 
 
-def sensor_rows(name: str) -> list[Row]:
+def sensor_rows(name):
     """Return the rows of one thermometer; only faults of the board stop the output."""
     is_board = name == 'board'
     lost = 'nothing is published' if is_board else 'the board sensor decides the regime'
@@ -199,7 +197,7 @@ TIME_ROWS = [
 ROWS = [*SENSOR_ROWS, *BOTH_ROWS, *SAMPLE_ROWS, *TIME_ROWS]
 
 
-def true_seconds(row: Row, stamps: np.ndarray) -> np.ndarray:
+def true_seconds(row, stamps):
     """Return the times of the bag that belong to stamps."""
     seconds = (stamps - START_NS) * 1e-9
     at, by = row.shift

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns units and attitudes for the tests of the strangers benchmark."""
 
-from __future__ import annotations
-
 import numpy as np
 from strangers_units import Unit
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of columns: all columns, the memory they need, and each value by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -124,7 +122,7 @@ def test_each_value_by_hand():
     assert at_edge[2] == 0.5
 
 
-def test_a_bend_moves_with_the_board_and_its_lag() -> None:
+def test_a_bend_moves_with_the_board_and_its_lag():
     columns = [Column('bend', 'bend', tau_s=tau, knee_k=2.0, **WIDE) for tau in (0.0, 60.0)]
     spec = memory_of(columns)
     table = ColumnTable(columns, spec, 20.0)

@@ -2,10 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags by others: topics of any name, ROS 1 and 2, and units recognised at rest."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from recording_helpers import typestore
@@ -27,7 +23,7 @@ IMU, TEMPERATURE, PRESSURE = (
 NAMES = {'/mpu/data': IMU, '/mpu/die': TEMPERATURE, '/baro/air': TEMPERATURE}
 
 
-def messages(ros: int, rng, scale: float, names: dict[str, str]):
+def messages(ros, rng, scale, names):
     """Yield (topic, type, log_ns, message) of a driver at rest that publishes `scale` per g."""
     types = typestore(ros).types
     vector = types['geometry_msgs/msg/Vector3']
@@ -50,7 +46,7 @@ def messages(ros: int, rng, scale: float, names: dict[str, str]):
                 yield topic, kind, now, types[kind](header(now), value, 0.0)
 
 
-def write_ros2(path: Path, rng, scale: float = G, names: dict[str, str] | None = None) -> Path:
+def write_ros2(path, rng, scale=G, names=None):
     names = names or NAMES
     with Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         store = typestore(2)
@@ -60,7 +56,7 @@ def write_ros2(path: Path, rng, scale: float = G, names: dict[str, str] | None =
     return path
 
 
-def write_ros1(path: Path, rng) -> Path:
+def write_ros1(path, rng):
     with Writer1(path) as writer:
         store = typestore(1)
         links = {t: writer.add_connection(t, kind, typestore=store) for t, kind in NAMES.items()}
@@ -175,13 +171,13 @@ def test_command(tmp_path, rng, cli):
         (32.2, 'unknown'),  # ft/s^2
     ],
 )
-def test_what_a_still_sensor_reads_says_its_unit(magnitude: float, unit: str) -> None:
+def test_what_a_still_sensor_reads_says_its_unit(magnitude, unit):
     believed, reason = believed_unit(magnitude)
     assert believed == unit
     assert f'{magnitude:.4g}' in reason
 
 
-def test_nothing_is_said_against_what_may_be_true() -> None:
+def test_nothing_is_said_against_what_may_be_true():
     assert contradiction('g', 1.15, None) is None
     assert contradiction('m/s^2', 9.6, None) is None
     # Values above those of all units are counts of a precise converter.
@@ -191,7 +187,7 @@ def test_nothing_is_said_against_what_may_be_true() -> None:
     assert contradiction('g', float('nan'), None) is None
 
 
-def shaken(rng: np.random.Generator, n: int, scale: float, noise: float) -> np.ndarray:
+def shaken(rng, n, scale, noise):
     """At rest, except for a shaken middle fifth."""
     accel = scale * np.array([0.6, 0.0, 0.8]) + noise * rng.standard_normal((n, 3))
     middle = slice(2 * n // 5, 3 * n // 5)
@@ -200,7 +196,7 @@ def shaken(rng: np.random.Generator, n: int, scale: float, noise: float) -> np.n
 
 
 @pytest.mark.parametrize('scale', [1.0, 9.81, 2048.0])
-def test_movement_is_found_in_any_unit(rng: np.random.Generator, scale: float) -> None:
+def test_movement_is_found_in_any_unit(rng, scale):
     n = 5000
     stamp_ns = np.arange(1, n + 1) * 10_000_000
     found = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
@@ -214,7 +210,7 @@ def test_movement_is_found_in_any_unit(rng: np.random.Generator, scale: float) -
     assert found.still_s == pytest.approx(40.0, abs=0.5)
 
 
-def test_a_sensor_that_shows_no_noise_is_not_moving(rng: np.random.Generator) -> None:
+def test_a_sensor_that_shows_no_noise_is_not_moving(rng):
     # Rounded to steps larger than the noise, the value changes by a step from time to time.
     accel = np.tile([0.0, 0.0, 1.0], (1000, 1))
     accel[::97, 0] = 0.1
@@ -223,7 +219,7 @@ def test_a_sensor_that_shows_no_noise_is_not_moving(rng: np.random.Generator) ->
     assert found.magnitude == pytest.approx(1.0, rel=1e-3)
 
 
-def test_too_short_to_tell() -> None:
+def test_too_short_to_tell():
     found = find_stillness(np.arange(5), np.ones((5, 3)))
     assert np.isnan(found.magnitude)
     assert found.moving_ns == ()

@@ -5,8 +5,6 @@ Corrections with all columns: single samples equal blocks bit for bit, axes are 
 claimed sd equals the scatter of random calibrations.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

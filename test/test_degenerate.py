@@ -7,13 +7,8 @@ silently.
 `benchmarks/degenerate.py` runs every command on every input.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import degenerate
 import pytest
-from conftest import Cli
 
 
 @pytest.mark.parametrize(
@@ -31,9 +26,7 @@ from conftest import Cli
         ('name not UTF-8', ('replay',)),
     ],
 )
-def test_it_ends_with_a_sentence_in_bounded_memory(
-    name: str, commands: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_it_ends_with_a_sentence_in_bounded_memory(name, commands, tmp_path):
     folder = tmp_path / 'in' / 'unit'
     folder.mkdir(parents=True)
     path = degenerate.INPUTS[name].make(folder)
@@ -58,9 +51,7 @@ def test_it_ends_with_a_sentence_in_bounded_memory(
         ('axes that lean', 'with one unit for three axes at right angles?'),
     ],
 )
-def test_the_cause_is_said_in_the_users_words(
-    name: str, said: str, tmp_path: Path, cli: Cli
-) -> None:
+def test_the_cause_is_said_in_the_users_words(name, said, tmp_path, cli):
     path = degenerate.INPUTS[name].make(tmp_path)
     failed = cli('fit', path, '--gravity', '9.81', '-o', tmp_path / 'out.yaml', code=1)
     (line,) = [one for one in failed.stderr.splitlines() if ': error: ' in one]

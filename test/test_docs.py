@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands and snippets on the pages work, and every page is in the site."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -11,13 +9,11 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import matplotlib as mpl
 import pytest
 import yaml
 from conftest import ROOT, parsed
-from desk_helpers import Desk
 from matplotlib import pyplot as plt
 from readme_helpers import is_alike
 
@@ -35,7 +31,7 @@ ELSEWHERE = (
 )
 
 
-def commands() -> list[tuple[str, str, str]]:
+def commands():
     """Return page, command, and the output shown for it (empty for none)."""
     found = []
     for page in PAGES:
@@ -56,9 +52,7 @@ COMMANDS = commands()
 
 
 @pytest.mark.parametrize(('page', 'command', 'output'), COMMANDS, ids=[c for _, c, _ in COMMANDS])
-def test_the_command_does_what_the_page_says(
-    page: str, command: str, output: str, desk: Desk
-) -> None:
+def test_the_command_does_what_the_page_says(page, command, output, desk):
     if '--install-completion' in command:
         pytest.skip('writes into the home of who runs it')
     finished = desk.run(command)
@@ -68,11 +62,11 @@ def test_the_command_does_what_the_page_says(
         assert is_alike(finished.stdout, output), finished.stdout
 
 
-def test_there_are_commands_to_run() -> None:
+def test_there_are_commands_to_run():
     assert {page for page, _, _ in COMMANDS} >= {'README.md', 'integration.md', 'recording.md'}
 
 
-def test_completion_is_a_script_that_bash_takes(root: Path) -> None:
+def test_completion_is_a_script_that_bash_takes(root):
     bash = shutil.which('bash')
     if bash is None:
         pytest.skip('no bash')
@@ -85,8 +79,8 @@ def test_completion_is_a_script_that_bash_takes(root: Path) -> None:
     assert 'thermo_comp' in finished.stdout
 
 
-def test_every_page_is_in_the_site_s_menu() -> None:
-    def listed(entry: object) -> list[str]:
+def test_every_page_is_in_the_site_s_menu():
+    def listed(entry):
         if isinstance(entry, str):
             return [entry]
         inner = entry.values() if isinstance(entry, dict) else entry
@@ -96,7 +90,7 @@ def test_every_page_is_in_the_site_s_menu() -> None:
     assert sorted(listed(nav)) == sorted(page.name for page in [*PAGES[1:], TUTORIAL])
 
 
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+def test_the_site_builds_without_a_warning(tmp_path):
     for module in ('material', 'mkdocstrings', 'mkdocs_jupyter'):
         pytest.importorskip(module, reason=f'{module} is not installed: the extra `docs`')
     finished = subprocess.run(
@@ -107,10 +101,10 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     assert (tmp_path / 'site' / 'index.html').is_file()
 
 
-def test_the_tutorial_prints_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_tutorial_prints_what_it_shows(monkeypatch):
     mpl.use('Agg')
     monkeypatch.chdir(ROOT / 'docs')
-    names: dict[str, object] = {}
+    names = {}
     n_figures = 0
     for cell in json.loads(TUTORIAL.read_text())['cells']:
         if cell['cell_type'] != 'code':
@@ -127,7 +121,7 @@ def test_the_tutorial_prints_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> N
     assert n_figures == 2
 
 
-def test_refusals_are_quoted_as_they_are_said() -> None:
+def test_refusals_are_quoted_as_they_are_said():
     text = (ROOT / 'docs' / 'recording.md').read_text()
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10

@@ -5,8 +5,6 @@ Outputs that cannot be written, and writers that are killed: the old or the new 
 the error is one line, and the incomplete file of a killed writer can be read.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -17,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import calibration
-from conftest import ROOT, Cli
+from conftest import ROOT
 from fleet_helpers import write_unit
 
 from thermo_comp.recording.reader import read_recording
@@ -38,14 +36,14 @@ COMMANDS = {
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     save_calibration(calibration(), tmp_path / 'unit.yaml')
     write_unit(tmp_path / 'bags', 1, 2)
     return tmp_path
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_a_full_disk(small_disk: Path, folder: Path, cli: Cli, name: str) -> None:
+def test_a_full_disk(small_disk, folder, cli, name):
     before, _ = COMMANDS[name]
     output = small_disk / name
     finished = cli(*before, output, code=1, cwd=folder)
@@ -57,9 +55,7 @@ def test_a_full_disk(small_disk: Path, folder: Path, cli: Cli, name: str) -> Non
 
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
-def test_a_conversion_on_a_full_disk_leaves_no_draft(
-    small_disk: Path, tmp_path: Path, cli: Cli
-) -> None:
+def test_a_conversion_on_a_full_disk_leaves_no_draft(small_disk, tmp_path, cli):
     table = tmp_path / 'log.csv'
     samples = np.random.default_rng(3).normal((0.0, 0.0, 9.8), 0.1, (9000, 3))
     rows = [f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(samples)]
@@ -77,7 +73,7 @@ def test_a_conversion_on_a_full_disk_leaves_no_draft(
 
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
-def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk: Path, cli: Cli) -> None:
+def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
     # About 700 KB of noise, which compresses to not less than half.
     n = 20000
     stamps = np.arange(n) * 10**8
@@ -103,7 +99,7 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk: Path, cli
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_a_folder_that_is_read_only(folder: Path, cli: Cli, name: str) -> None:
+def test_a_folder_that_is_read_only(folder, cli, name):
     if os.geteuid():
         locked = folder / 'locked'
         locked.mkdir(mode=0o500)
@@ -148,7 +144,7 @@ sys.exit(main())
         ('bag.mcap', 'before'),
     ],
 )
-def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: str) -> None:
+def test_a_killed_command_leaves_the_old_file(folder, name, point):
     output = folder / name
     if not output.exists():
         output.write_bytes(b'<!doctype html>old' if name == 'page.html' else b'\x89MCAP old')
@@ -176,7 +172,7 @@ def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: st
 
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
-def test_a_command_that_is_asked_to_end_leaves_nothing(folder: Path, name: str) -> None:
+def test_a_command_that_is_asked_to_end_leaves_nothing(folder, name):
     # WHY: a hidden file as large as the bag remained after each time-out and each shutdown.
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]
@@ -189,7 +185,7 @@ def test_a_command_that_is_asked_to_end_leaves_nothing(folder: Path, name: str) 
     assert set(folder.iterdir()) == listed
 
 
-def rewritten(torn: Path, whole: Path) -> None:
+def rewritten(torn, whole):
     """Write the readable part of a damaged bag as a complete bag."""
     found = read_recording(torn).columns
     with BagWriter(whole) as bag:
@@ -198,7 +194,7 @@ def rewritten(torn: Path, whole: Path) -> None:
         bag.write_counts('accel/counts', found.accel_stamp_ns, found.accel, found.frame_id)
 
 
-def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder: Path, cli: Cli) -> None:
+def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder, cli):
     torn, whole = folder / 'torn.mcap', folder / 'whole.mcap'
     content = (folder / FIT[0]).read_bytes()
     torn.write_bytes(content[: len(content) // 2])

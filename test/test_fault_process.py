@@ -2,22 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults of processes and files around the node: restarts, signals, reloads, calibration files."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-from fault_bench import Bench, Heard, bench
+from fault_bench import bench
 from fault_rig import RATE_HZ, START_NS, bag, corrected, force_at, seconds_of, unit
 
 from thermo_comp.unit.calibration import Unit
@@ -27,25 +23,25 @@ SIGMAS = 5.0
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     save_calibration(unit(), tmp_path / 'unit.yaml')
     return tmp_path / 'unit.yaml'
 
 
 @pytest.fixture
-def node(path: Path) -> Iterator[Bench]:
+def node(path):
     with bench(path) as started:
         yield started
 
 
-def sigmas(heard: Heard) -> float:
+def sigmas(heard):
     """Return the largest error in units of the published standard deviation."""
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
     return float((np.abs(heard.force - force_at(seconds)) / sd).max())
 
 
-def test_a_publisher_restarts(node: Bench) -> None:
+def test_a_publisher_restarts(node):
     events = bag(duration_s=100.0)
     first = node.play([e for e in events if seconds_of(e[1]) < 50.0])
     node.restart_publishers()
@@ -55,7 +51,7 @@ def test_a_publisher_restarts(node: Bench) -> None:
     assert second.values['lost'] == '0'
 
 
-def test_the_node_is_killed_and_restarts_in_the_ramp(path: Path) -> None:
+def test_the_node_is_killed_and_restarts_in_the_ramp(path):
     events = [e for e in bag() if seconds_of(e[1]) < 300.0]
     _, undisturbed = corrected(events)
     with bench(path) as node:
@@ -81,15 +77,15 @@ def test_the_node_is_killed_and_restarts_in_the_ramp(path: Path) -> None:
     )
 
 
-def replaced(path: Path) -> None:
+def replaced(path):
     path.write_text(dump_calibration(unit(unit=Unit('F-2', 'counts', 8388607.0, 0.08))))
 
 
-def truncated(path: Path) -> None:
+def truncated(path):
     path.write_bytes(path.read_bytes()[:-300])
 
 
-def unreadable(path: Path) -> None:
+def unreadable(path):
     if os.geteuid():
         path.chmod(0)
     else:
@@ -98,27 +94,27 @@ def unreadable(path: Path) -> None:
         path.symlink_to('/proc/self/mem')
 
 
-def huge(path: Path) -> None:
+def huge(path):
     os.truncate(path, 1 << 30)
 
 
-def aliases(path: Path) -> None:
+def aliases(path):
     lines = ['a0: &a0 [x, x, x, x, x, x, x, x, x]']
     lines += [f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]' for k in range(1, 30)]
     path.write_text('\n'.join(lines))
 
 
-def directory(path: Path) -> None:
+def directory(path):
     path.unlink()
     path.mkdir()
 
 
-def fifo(path: Path) -> None:
+def fifo(path):
     path.unlink()
     os.mkfifo(path)
 
 
-DAMAGES: dict[Callable[[Path], None], str] = {
+DAMAGES = {
     replaced: "unit.serial: must be 'F-1'", truncated: '', unreadable: 'cannot be read: ',
     huge: f'at most {SIZE_LIMIT} are accepted', aliases: 'YAML aliases are not accepted',
     directory: 'cannot be read: ', fifo: 'cannot be read: not a regular file',
@@ -126,7 +122,7 @@ DAMAGES: dict[Callable[[Path], None], str] = {
 }  # fmt: skip
 
 
-def test_calibration_files_that_go_bad(path: Path, tmp_path: Path) -> None:
+def test_calibration_files_that_go_bad(path, tmp_path):
     events = bag(duration_s=90.0)
     good = path.read_bytes()
     heard = []
@@ -153,7 +149,7 @@ def test_calibration_files_that_go_bad(path: Path, tmp_path: Path) -> None:
     assert n == sum(e[0] == 'counts' for e in events if seconds_of(e[1]) < 80.0)
 
 
-def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
+def test_a_storm_of_reloads_at_1_khz(tmp_path):
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
@@ -164,7 +160,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
         answers, news = list[bool](), threading.Event()
         node.take()
 
-        def ask() -> Any:
+        def ask():
             future = node.ask(calibration_file=str(path))
             future.add_done_callback(lambda _: news.set())
             return future
@@ -196,7 +192,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_samples_flow(path: Path, number: int) -> None:
+def test_a_signal_while_samples_flow(path, number):
     with bench(path) as node:
         heard = node.play(bag(duration_s=20.0))
         node.send(bag(duration_s=40.0, start_s=20.0))

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Few positions: what they determine is right, and the rest stays at its prior."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -15,21 +13,20 @@ import thermo_comp as tc
 from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.simulation.campaign import positions
-from thermo_comp.typing import Floats
 from thermo_comp.unit.calibration import parameter_layout
 
 BAGS = Path(__file__).parent.parent / 'bags'
 MICRO_G = 9.80665e-6
 
 
-def minutes(values: Floats) -> Floats:
+def minutes(values):
     """Means of a minute at 2 Hz [ug], without the first minutes, which have no temperature."""
     values = values[~np.isnan(values).any(axis=1)]
     n = len(values) // 120
     return values[: 120 * n].reshape(n, 120, 3).mean(axis=1) / MICRO_G
 
 
-def left_by(pair: tuple[int, int], **options: str) -> Floats:
+def left_by(pair, **options):
     """Fit two positions; return the drift of each axis in a third position at rest [ug]."""
     bags = [BAGS / f'fit/0{number}.mcap' for number in pair]
     calibration = tc.fit(bags, gravity=9.80665, **options)
@@ -42,13 +39,13 @@ def left_by(pair: tuple[int, int], **options: str) -> Floats:
 
 
 @pytest.mark.parametrize('pair', [(1, 2), (3, 9)])
-def test_two_positions_tell_the_thermal_response(pair: tuple[int, int]) -> None:
+def test_two_positions_tell_the_thermal_response(pair):
     # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine their sd to 6 %, and a few
     # superfluous columns may add a tenth. Half of all 36 pairs are as good (docs/accuracy.md).
     assert left_by(pair) == pytest.approx([1.2] * 3, rel=0.3)
 
 
-def test_two_sets_leave_a_lag() -> None:
+def test_two_sets_leave_a_lag():
     assert (left_by((1, 2), model='golovach') > 10.0).all()
 
 

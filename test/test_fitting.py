@@ -2,25 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole fit on simulated units with known truth."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
-from pathlib import Path
-
 import numpy as np
 import pytest
 from builders import ArrayBlock, arrays_of, source_of
 from triads import triad
 
 from thermo_comp.errors import FitError
-from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
+from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
-from thermo_comp.simulation.run import SimulatedRun, arrays
-from thermo_comp.simulation.unit import UnitModel
-from thermo_comp.typing import Floats
-from thermo_comp.unit.calibration import Calibration, parameter_layout
+from thermo_comp.simulation.run import arrays
+from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 from thermo_comp.unit.metrics import norm_residual, residual_statistics
@@ -30,26 +23,23 @@ PROGRAM = parse_cyclogram('20 20min, 45@1.5 30min, 5@1.5 30min, 20@1.5 20min')
 FACES = np.vstack((np.eye(3), -np.eye(3)))
 
 
-def records_of(unit: UnitModel, ups: Floats, seed: int) -> list[SimulatedRun]:
+def records_of(unit, ups, seed):
     plan = [Position(PROGRAM, up) for up in ups]
     return arrays(unit, plan, seed, rate_hz=RATE_HZ)
 
 
-def sources_of(
-    records: Sequence[SimulatedRun], has_temperature: bool = True, first: int = 0
-) -> list[FitSource]:
+def sources_of(records, has_temperature=True, first=0):
     n = 6 if has_temperature else 2
     return [source_of(*arrays_of(r)[:n], name=f'bag{k}') for k, r in enumerate(records, first)]
 
 
-def fitted(unit: UnitModel, ups: Floats, seed: int, **options: object) -> FitResult:
+def fitted(unit, ups, seed, **options):
     return fit(
-        sources_of(records_of(unit, ups, seed)),
-        FitOptions(gravity=STANDARD_GRAVITY, **options),  # type: ignore[arg-type]
+        sources_of(records_of(unit, ups, seed)), FitOptions(gravity=STANDARD_GRAVITY, **options)
     )
 
 
-def constants(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
+def constants(calibration):
     """Bias [counts], K and the elements of M below its diagonal."""
     axes = calibration.axes
     M = np.array(calibration.misalignment)
@@ -57,7 +47,7 @@ def constants(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
     return np.array(bias), np.array(scale), M[[1, 2, 2], [0, 0, 1]]
 
 
-def claimed(calibration: Calibration) -> tuple[Floats, Floats, Floats]:
+def claimed(calibration):
     """Their sd, that of K relative."""
     layout, sd = (
         parameter_layout(calibration),
@@ -74,16 +64,16 @@ OWN_LAGS, PAPER, PLAIN = (
 
 
 @pytest.fixture(scope='module')
-def response() -> FitResult:
+def response():
     return fitted(OWN_LAGS, positions(12, 1), 1)
 
 
 @pytest.fixture(scope='module')
-def golovach() -> FitResult:
+def golovach():
     return fitted(PAPER, positions(9, 1), 1, model='golovach')
 
 
-def pulls(found: FitResult, unit: UnitModel) -> Floats:
+def pulls(found, unit):
     (bias, scale, M), (bias_sd, scale_sd, M_sd) = (
         constants(found.calibration), claimed(found.calibration)
     )  # fmt: skip
@@ -96,7 +86,7 @@ def pulls(found: FitResult, unit: UnitModel) -> Floats:
     )
 
 
-def test_truth_lies_within_the_claimed_sd(response: FitResult) -> None:
+def test_truth_lies_within_the_claimed_sd(response):
     # Nine numbers that share the reference temperature and the directions.
     found = pulls(response, OWN_LAGS)
     assert np.abs(found).max() < 4.0
@@ -108,7 +98,7 @@ def test_truth_lies_within_the_claimed_sd(response: FitResult) -> None:
     assert M_sd.max() < 5e-6
 
 
-def test_the_response_reaches_the_noise(response: FitResult) -> None:
+def test_the_response_reaches_the_noise(response):
     row = response.residuals[-1]
     # White noise of 5 ug / sqrt(Hz) over 60 s: 0.65 ug.
     assert row.fitted.rms / MICRO_G < 0.8
@@ -117,14 +107,14 @@ def test_the_response_reaches_the_noise(response: FitResult) -> None:
     assert row.two_sets.rms / MICRO_G > 50.0
 
 
-def test_attitudes_have_unit_norm(response: FitResult) -> None:
+def test_attitudes_have_unit_norm(response):
     up = np.array([position.up for position in response.positions])
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0, rtol=1e-14)
     # The directions are unknown to the fit and estimated within some urad.
     np.testing.assert_allclose(up, positions(12, 1), atol=3e-5)
 
 
-def test_the_paper_s_model_on_its_own_physics(golovach: FitResult) -> None:
+def test_the_paper_s_model_on_its_own_physics(golovach):
     calibration = golovach.calibration
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
@@ -145,7 +135,7 @@ def test_the_paper_s_model_on_its_own_physics(golovach: FitResult) -> None:
     np.testing.assert_allclose(M, np.array(PAPER.M)[[1, 2, 2], [0, 0, 1]], atol=3e-5)
 
 
-def test_the_evidence_is_complete(response: FitResult) -> None:
+def test_the_evidence_is_complete(response):
     assert len(response.positions) == 12
     assert all(position.duration_s > 5000.0 for position in response.positions)
     assert all(np.isfinite(position.left_out_rms) for position in response.positions)
@@ -163,13 +153,13 @@ def test_the_evidence_is_complete(response: FitResult) -> None:
     assert {term.group for term in weighty} <= {group for _, group in judged}
 
 
-def test_the_file_holds_the_fit(response: FitResult, tmp_path: Path) -> None:
+def test_the_file_holds_the_fit(response, tmp_path):
     path = tmp_path / 'unit.yaml'
     save_calibration(response.calibration, path)
     assert load_calibration(path) == response.calibration
 
 
-def test_the_compensator_does_what_the_fit_promised(response: FitResult) -> None:
+def test_the_compensator_does_what_the_fit_promised(response):
     # A run in a new attitude, corrected sample by sample: the same noise as in positions left out,
     # and the published variance covers the error.
     up = np.array([[0.48, -0.6, 0.64]])
@@ -191,7 +181,7 @@ def test_the_compensator_does_what_the_fit_promised(response: FitResult) -> None
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
 
 
-def test_six_faces_leave_misalignment_at_its_prior() -> None:
+def test_six_faces_leave_misalignment_at_its_prior():
     result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'))
     _, _, M = constants(result.calibration)
     _, scale_sd, M_sd = claimed(result.calibration)
@@ -206,20 +196,18 @@ def test_six_faces_leave_misalignment_at_its_prior() -> None:
     assert np.abs(pulls(result, PLAIN)).max() < 4.0
 
 
-def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(
-    rng: np.random.Generator,
-) -> None:
+def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng):
     # WHY: both were fitted without a message. A triad without drift only has constants.
     records = records_of(PLAIN, positions(9, 1), 4)
     bias, scale, M = PLAIN.bias_at_reference, PLAIN.scale_factor, np.array(PLAIN.M)
 
-    def fit_of(correct: Callable[[Floats], Floats], **options: object) -> FitResult:
+    def fit_of(correct, **options):
         recorded = [(stamps, correct(n), *rest) for stamps, n, *rest in map(arrays_of, records)]
         sources = [source_of(*one, name=str(k)) for k, one in enumerate(recorded)]
         options |= {'gravity': STANDARD_GRAVITY, 'groups': ('curve',)}
-        return fit(sources, FitOptions(**options))  # type: ignore[arg-type]
+        return fit(sources, FitOptions(**options))
 
-    def force(counts: Floats) -> Floats:
+    def force(counts):
         # The output of a compensator has no quantisation steps, and its noise hides those of the
         # counts.
         return ((counts - bias) / scale) @ M.T + 5e-4 * rng.standard_normal(counts.shape)
@@ -232,22 +220,22 @@ def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(
         fit_of(lambda counts: np.rint(4e5 * force(counts)), full_scale=8388607.0)
 
 
-def test_bags_with_and_without_temperature_contradict_themselves() -> None:
+def test_bags_with_and_without_temperature_contradict_themselves():
     records = records_of(PLAIN, FACES, 5)
     sources = sources_of(records[:3]) + sources_of(records[3:], False, 3)
     with pytest.raises(FitError, match='bag3: no board temperature, which the other bags have'):
         fit(sources, FitOptions(gravity=STANDARD_GRAVITY))
 
 
-def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> None:
+def test_a_switch_of_the_sets_moves_the_output_gently(golovach):
     # An INS at rest must not notice the switch: at most 1 ug per second, or, for the longest
     # transition of ten times the given 30 s, the difference divided by its duration.
     (record,) = records_of(PAPER, positions(1, 5), 905)
 
-    def forces(weight: float | None) -> Floats:
+    def forces(weight):
         compensator = Compensator(golovach.calibration)
         if weight is not None:
-            compensator.thermal.tracker.weight_at = lambda _stamp_ns: weight  # type: ignore[method-assign]
+            compensator.thermal.tracker.weight_at = lambda _stamp_ns: weight
         found = process_block(compensator, ArrayBlock(*arrays_of(record)))
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return found.specific_force
@@ -266,7 +254,7 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach: FitResult) -> No
     assert moved.max() / MICRO_G < 1.01 * max(1.0, size.max() / MICRO_G / 300.0)
 
 
-def short(accel: np.ndarray, board: np.ndarray, name: str = 'bag') -> FitSource:
+def short(accel, board, name='bag'):
     stamps = np.arange(len(accel), dtype=np.int64) * 10_000_000
     readings = np.arange(len(board), dtype=np.int64) * 1_000_000_000
     return source_of(stamps, accel, readings, board, readings, board, name=name)
@@ -283,27 +271,25 @@ def short(accel: np.ndarray, board: np.ndarray, name: str = 'bag') -> FitSource:
         ),
     ],
 )
-def test_bags_without_what_a_fit_needs_are_refused(
-    accel: np.ndarray, board: np.ndarray, message: str
-) -> None:
+def test_bags_without_what_a_fit_needs_are_refused(accel, board, message):
     with pytest.raises(FitError, match=f'bag: {message}'):
         fit([short(accel, board)], FitOptions(gravity=STANDARD_GRAVITY))
 
 
-def faces(scale: float, offset: float, rng: np.random.Generator) -> list[FitSource]:
+def faces(scale, offset, rng):
     forces = (scale * (up + 1e-3 * rng.standard_normal((4000, 3))) + offset for up in FACES)
     celsius = np.linspace(10.0, 40.0, 40)
     return [short(accel, celsius, name=f'face{k}') for k, accel in enumerate(forces)]
 
 
-def test_accelerations_are_not_taken_for_counts(rng: np.random.Generator) -> None:
+def test_accelerations_are_not_taken_for_counts(rng):
     with pytest.raises(FitError, match=r'norm 9.81 and are no whole numbers: they look like m/s'):
         fit(faces(9.81, 0.01, rng), FitOptions(gravity=9.81))
     with pytest.raises(FitError, match='they look like g, not counts'):
         fit(faces(1.0, 0.01, rng), FitOptions(gravity=9.81))
 
 
-def test_saturated_samples_are_refused(rng: np.random.Generator) -> None:
+def test_saturated_samples_are_refused(rng):
     sources = faces(9.81, 0.01, rng)
     options = FitOptions(gravity=9.81, input='m/s^2', full_scale=9.815)
     with pytest.raises(FitError, match='samples are at the full scale'):

@@ -4,15 +4,13 @@
 A board warmer than its case by self-heating: effects of temperature changes are even about that.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
 from builders import source_of
 from scipy.signal import lfilter
 
-from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.sensors import gradients_at_rest
 from thermo_comp.simulation.campaign import positions
@@ -23,13 +21,13 @@ STEP_S, OWN_HEAT_K = 2.0, 0.6
 NOISE = 4.0 * MICRO
 
 
-def lagged(values, tau: float):
+def lagged(values, tau):
     """First-order lag that starts in equilibrium."""
     share = 1.0 - np.exp(-STEP_S / tau)
     return lfilter([share], [1.0, share - 1.0], values - values[0]) + values[0]
 
 
-def recorded(rng, up, name: str, targets: tuple[float, ...]) -> FitSource:
+def recorded(rng, up, name, targets):
     """Record a unit of two thermal nodes whose bias is even in the heating of its board."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):

@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Noise of series, and the end of the dynamic regime: both estimated, not assumed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -16,11 +14,10 @@ from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.noise import Whitener
 from thermo_comp.fitting.unknowns import WHITE, Noise
 from thermo_comp.simulation.campaign import Position, parse_cyclogram
-from thermo_comp.simulation.run import SimulatedRun, arrays
+from thermo_comp.simulation.run import arrays
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.thermal.state import WEIGHT
 from thermo_comp.thermal.tracker import ThermalTracker
-from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 Closes = Literal['board', 'case']
@@ -30,7 +27,7 @@ PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min')
 STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
 
 
-def weight(record: SimulatedRun, closes: Closes) -> Floats:
+def weight(record, closes):
     """Weight of the dynamic set at each sample, by a detector with the true sensor settings."""
     tracker = ThermalTracker(replace(DetectorSettings(), closes=closes))
     readings = sorted(
@@ -54,7 +51,7 @@ def weight(record: SimulatedRun, closes: Closes) -> Floats:
     ('closes', 'options'),
     [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],
 )
-def test_evidence_says_when_the_regime_closes(closes: Closes, options: dict[str, Any]) -> None:
+def test_evidence_says_when_the_regime_closes(closes, options):
     # A reading every four seconds: the case changes by 0.1 K between them.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refusals and advice of a fit, each with its number, on tables made to trigger them."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -32,14 +30,12 @@ from thermo_comp.unit.metrics import residual_statistics
 LINE = Polynomial((0.0, 1.0))
 
 
-def findings_of(
-    windows: ThermalWindows, up: np.ndarray, *, has_case: bool = True
-) -> dict[str, Finding]:
+def findings_of(windows, up, *, has_case=True):
     return {finding.name: finding for finding in judge_windows(windows, up, has_case)}
 
 
 @pytest.fixture
-def good(rng: np.random.Generator) -> tuple[ThermalWindows, np.ndarray]:
+def good(rng):
     """Spend an hour and a half in each of 18 positions: up, down, and a soak at the end."""
     data, up = table_of(Truth(), 18, rng)
     case = np.interp(data.time, [0.0, 1800.0, 3000.0, 3600.0], [5.0, 45.0, 5.0, 5.0])
@@ -64,7 +60,7 @@ def good(rng: np.random.Generator) -> tuple[ThermalWindows, np.ndarray]:
     return windows, up
 
 
-def test_a_good_test_passes(good: tuple[ThermalWindows, np.ndarray]) -> None:
+def test_a_good_test_passes(good):
     found = findings_of(*good)
     assert {finding.level for finding in found.values()} == {'good'}
 
@@ -85,7 +81,7 @@ def test_a_good_test_passes(good: tuple[ThermalWindows, np.ndarray]) -> None:
         ('swapped', lambda w: {'gradient': -w.gradient}, r'are the two sensors exchanged\?'),
     ],
 )  # fmt: skip
-def test_what_a_test_lacks_is_said(good, name, changed, message) -> None:
+def test_what_a_test_lacks_is_said(good, name, changed, message):
     windows, up = good
     found = findings_of(replace(windows, **changed(windows)), up)
     assert re.search(message, found[name].message)
@@ -93,11 +89,11 @@ def test_what_a_test_lacks_is_said(good, name, changed, message) -> None:
     assert name != 'temperature' or set(found) == {'positions', 'temperature'}
 
 
-def test_a_missing_case_is_said(good: tuple[ThermalWindows, np.ndarray]) -> None:
+def test_a_missing_case_is_said(good):
     assert findings_of(*good, has_case=False)['case'].level == 'advice'
 
 
-def test_six_faces_tell_no_misalignment(good: tuple[ThermalWindows, np.ndarray]) -> None:
+def test_six_faces_tell_no_misalignment(good):
     windows, _ = good
     faces = np.vstack((np.eye(3), -np.eye(3)))
     assert not can_tell_misalignment(faces)
@@ -111,7 +107,7 @@ def test_six_faces_tell_no_misalignment(good: tuple[ThermalWindows, np.ndarray])
     assert not can_tell_misalignment(np.vstack((faces, tilted)))
 
 
-def test_few_and_badly_spread_positions_are_said(good: tuple[ThermalWindows, np.ndarray]) -> None:
+def test_few_and_badly_spread_positions_are_said(good):
     windows, up = good
     assert (
         '5 positions: bias and scale cannot be separated'
@@ -122,7 +118,7 @@ def test_few_and_badly_spread_positions_are_said(good: tuple[ThermalWindows, np.
     assert geometry(flat, with_misalignment=True) == np.inf
 
 
-def test_geometry_is_the_scatter_of_the_parameters(rng: np.random.Generator) -> None:
+def test_geometry_is_the_scatter_of_the_parameters(rng):
     # By Monte Carlo: least squares of pure noise of the norm on the nine parameters.
     up = positions(12, 5)
     x, y, z = up.T
@@ -133,7 +129,7 @@ def test_geometry_is_the_scatter_of_the_parameters(rng: np.random.Generator) -> 
     assert geometry(up, with_misalignment=True) == pytest.approx(scatter, rel=0.05)
 
 
-def test_refusals_stop_and_may_be_allowed() -> None:
+def test_refusals_stop_and_may_be_allowed():
     refusal = Finding('swapped', 'refusal', 'the board leads')
     with pytest.raises(FitError, match=r'the board leads \(override with --allow swapped\)'):
         enforce([refusal], FitOptions(gravity=9.81))
@@ -141,7 +137,7 @@ def test_refusals_stop_and_may_be_allowed() -> None:
     assert (allowed.level, allowed.message) == ('advice', 'allowed: the board leads')
 
 
-def judged(raw: float, fitted: float, slow: float, left_out: float | None = None, **options: str):
+def judged(raw, fitted, slow, left_out=None, **options):
     """Judge residuals with a given RMS [ug]."""
     steps = [
         residual_statistics(np.full(0 if one is None else 9, (one or 0.0) * MICRO_G))
@@ -154,7 +150,7 @@ def judged(raw: float, fitted: float, slow: float, left_out: float | None = None
     return {finding.name: finding for finding in found}
 
 
-def test_what_the_fit_left_is_said() -> None:
+def test_what_the_fit_left_is_said():
     good = judged(100.0, 1.0, 0.2, 1.5)
     assert set(good) == {'residual'}
     assert '100.0 ug RMS raw, 1.5 ug on data left out, 1.0 ug' in good['residual'].message
@@ -172,7 +168,7 @@ def test_what_the_fit_left_is_said() -> None:
         ((100.0, 1.0, 0.2, 1.5), 'units', 'expected near 1'),
     ],
 )
-def test_residuals_that_no_good_fit_leaves_are_said(given, name, message) -> None:
+def test_residuals_that_no_good_fit_leaves_are_said(given, name, message):
     options = {'input': 'm/s^2'} if name == 'units' else {}
     assert message in judged(*given, **options)[name].message
 
@@ -185,6 +181,6 @@ def test_residuals_that_no_good_fit_leaves_are_said(given, name, message) -> Non
         ({'input': 'g'}, '`input` must be of counts, m/s'),
     ],
 )
-def test_options_out_of_range_are_refused(change: dict[str, object], message: str) -> None:
+def test_options_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         FitOptions(**{'gravity': 9.81, **change})

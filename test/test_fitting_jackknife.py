@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Claimed sd of real units against their scatter from position to position."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +17,7 @@ from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
-def ratio(path: Path) -> float:
+def ratio(path):
     """Fit one log; return the jackknife over its positions, in units of the claimed sd."""
     accel = np.loadtxt(path, usecols=(0, 1, 2))
     stamps = np.arange(len(accel), dtype=np.int64) * 10_000_000
@@ -48,7 +45,7 @@ def ratio(path: Path) -> float:
     return float(np.sqrt(np.mean(scatter / np.concatenate((*claimed, variance[-3:])))))
 
 
-def test_claimed_sd_is_the_jackknife_s(real_data: Path) -> None:
+def test_claimed_sd_is_the_jackknife_s(real_data):
     logs = [real_data / f'mikoff-mpu9150/mk_imu{k}.log' for k in range(3)]
     if not all(path.is_file() for path in logs):
         pytest.skip('the logs of the MPU-9150 units are not there')

@@ -122,7 +122,7 @@ def test_what_is_not_finite_is_no_curve_of_a_set(bad):
             check_reference('bias_function', function, 0.0)
 
 
-def slope_and_lag(variances: dict[int, float]):
+def slope_and_lag(variances):
     """
     Make a unit with a slope and a lag of 600 s, and variances of some parameters of its x axis.
     """

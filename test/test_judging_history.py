@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The history of a unit, with covariances known by hand, and one verdict of all commands."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +13,7 @@ from report_helpers import evidence, fitted, write_bag
 from thermo_comp.judging.evaluation import drifts_of, history_of
 from thermo_comp.report.html import number
 from thermo_comp.report.page import render_report
-from thermo_comp.unit.calibration import AxisReference, Calibration
+from thermo_comp.unit.calibration import AxisReference
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.provenance import Source
@@ -26,7 +23,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 K = 300.0
 
 
-def dated(created: str, bias_ug: float = 0.0, ppm: float = 0.0, sd_ug: float = 3.0) -> Calibration:
+def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
     """Change the z axis of a unit, with a claimed sd of its bias."""
     scale = K * (1.0 + 1e-6 * ppm)
     axes = dataclasses.replace(
@@ -40,7 +37,7 @@ def dated(created: str, bias_ug: float = 0.0, ppm: float = 0.0, sd_ug: float = 3
     return dataclasses.replace(one, provenance=provenance)
 
 
-def test_changes_and_their_sd_by_hand() -> None:
+def test_changes_and_their_sd_by_hand():
     # The later calibration is given first, but dates decide. Sd of 3 and 4 ug make 5.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
     assert [one.constant for one in drifts] == [
@@ -57,7 +54,7 @@ def test_changes_and_their_sd_by_hand() -> None:
         assert not one.is_sure
 
 
-def test_what_is_no_history() -> None:
+def test_what_is_no_history():
     one = dated('2026-01-01')
     # Another model of the same bags, another unit, and a single calibration.
     other = dataclasses.replace(one, unit=dataclasses.replace(one.unit, serial='other'))
@@ -70,7 +67,7 @@ def test_what_is_no_history() -> None:
     assert not any(drift.is_sure for drift in silent)
 
 
-def test_commands_tell_the_history(cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_tell_the_history(cli, tmp_path, monkeypatch):
     undrawn = 'thermo_comp.report.page.drawn_figures'
     monkeypatch.setattr(undrawn, lambda figures: [(one, '') for one in figures])
     now = fitted().calibration
@@ -102,7 +99,7 @@ FACTS = (
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp('judge')
     save_calibration(fitted().calibration, folder / 'unit.yaml')
     write_bag(folder / 'held_out.mcap')
@@ -111,7 +108,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.usefixtures('no_figures')
 @pytest.mark.parametrize('options', [(), ('--tolerance', '1ug', '--window', '120')])
-def test_evaluate_and_report_agree(cli, folder: Path, options: tuple[str, ...]) -> None:
+def test_evaluate_and_report_agree(cli, folder, options):
     # WHY: for one bag and calibration one command said "re-calibrate", another "holds".
     page = folder / f'page{len(options)}.html'
     given = (folder / 'held_out.mcap', '-c', folder / 'unit.yaml', *options, '--json')

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Jumps at rest: time and size; turns, motions and knocks are not jumps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@
 The thermal memory against closed forms: lags of ramps and steps, loops of plays, unknown starts.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

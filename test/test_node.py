@@ -2,13 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node on real DDS: its input, its output and its diagnostics."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -20,13 +15,13 @@ from builders import calibration, rich_calibration, thermal_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
+from ros_helpers import DEEP, SECOND_NS, drive, node_in_thread, stamp_of, stamped, standing
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
 from thermo_comp.ros.player import lossless
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
-from thermo_comp.unit.calibration import Calibration, Unit
+from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.nonlinearity import Nonlinearity
 
@@ -40,10 +35,10 @@ IMU_UNIT = Unit('T-1', 'm/s^2', 160.0, 0.01)
 
 
 @pytest.fixture
-def saved(tmp_path: Path) -> Callable[..., list[str]]:
+def saved(tmp_path):
     """Write a calibration and return the ROS arguments of a node with it."""
 
-    def save(of: Calibration, *overrides: str) -> list[str]:
+    def save(of, *overrides):
         path = tmp_path / 'unit.yaml'
         save_calibration(of, path)
         words = [f'calibration_file:={path}', 'diagnostics_period:=0.05', *overrides]
@@ -52,14 +47,14 @@ def saved(tmp_path: Path) -> Callable[..., list[str]]:
     return save
 
 
-def diagnosis(peer: Peer) -> Callable[[Callable[[DiagnosticStatus, dict[str, str]], Any]], Any]:
+def diagnosis(peer):
     """Wait for diagnostics that fulfil a condition; return the status and its values."""
     heard = peer.listen(DiagnosticArray, '/diagnostics')
 
-    def wait(condition: Callable[[DiagnosticStatus, dict[str, str]], Any]) -> Any:
+    def wait(condition):
         found = []
 
-        def look() -> bool:
+        def look():
             for array in heard:
                 values = {one.key: one.value for one in array.status[0].values}
                 if condition(array.status[0], values):
@@ -74,9 +69,7 @@ def diagnosis(peer: Peer) -> Callable[[Callable[[DiagnosticStatus, dict[str, str
     return wait
 
 
-def test_imu_input_with_frame_and_switch_of_the_input(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
+def test_imu_input_with_frame_and_switch_of_the_input(peer, saved):
     unit = replace(calibration(), unit=IMU_UNIT)
     with node_in_thread(*saved(unit, 'input:=imu', 'frame_id:=body')) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -110,9 +103,7 @@ def test_imu_input_with_frame_and_switch_of_the_input(
         assert heard[1].linear_acceleration.x == pytest.approx(0.5, rel=1e-12)
 
 
-def test_flag_is_latched_and_not_there_while_unknown(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
+def test_flag_is_latched_and_not_there_while_unknown(peer, saved):
     with node_in_thread(*saved(calibration()), *lossless()) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         flags = peer.listen(Bool, 'regime/dynamic')
@@ -157,7 +148,7 @@ def test_flag_is_latched_and_not_there_while_unknown(
         assert stamps[-1] <= START_NS + n * SECOND_NS
 
 
-def test_diagnostics_name_what_is_wrong(peer: Peer, saved: Callable[..., list[str]]) -> None:
+def test_diagnostics_name_what_is_wrong(peer, saved):
     wait = diagnosis(peer)
     with node_in_thread(*saved(thermal_calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -195,9 +186,7 @@ def test_diagnostics_name_what_is_wrong(peer: Peer, saved: Callable[..., list[st
         wait(lambda s, _: '1 jumps of time backwards' in s.message)
 
 
-def test_diagnostics_tell_noise_and_bias_apart(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
+def test_diagnostics_tell_noise_and_bias_apart(peer, saved):
     wait, unit = diagnosis(peer), rich_calibration()
     with node_in_thread(*saved(unit)) as node:
         driver = drive(peer, node)
@@ -226,9 +215,7 @@ def test_diagnostics_tell_noise_and_bias_apart(
 
 
 @pytest.mark.parametrize('was_fitted_with_case', [False, True])
-def test_a_case_is_missed_only_by_a_calibration_that_knew_one(
-    peer: Peer, saved: Callable[..., list[str]], was_fitted_with_case: bool
-) -> None:
+def test_a_case_is_missed_only_by_a_calibration_that_knew_one(peer, saved, was_fitted_with_case):
     seen = DetectorSettings(case=ThermometerSettings(noise_sd_c=0.05))
     unit = thermal_calibration()
     unit = replace(unit, detector=seen) if was_fitted_with_case else unit
@@ -242,7 +229,7 @@ def test_a_case_is_missed_only_by_a_calibration_that_knew_one(
         assert values['case age [s]'] == 'inf'
 
 
-def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]) -> None:
+def test_diagnostics_of_temperatures(peer, saved):
     wait = diagnosis(peer)
     # Of a fit that has seen less than 1 g.
     unit = replace(thermal_calibration(), nonlinearity=Nonlinearity((1.0, 5.0), 1e-4))
@@ -271,7 +258,7 @@ def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]
         assert values['stale'] == '1'
 
 
-def test_constants_need_no_thermometer(peer: Peer, saved: Callable[..., list[str]]) -> None:
+def test_constants_need_no_thermometer(peer, saved):
     wait = diagnosis(peer)
     with node_in_thread(*saved(calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -287,9 +274,7 @@ def test_constants_need_no_thermometer(peer: Peer, saved: Callable[..., list[str
     assert (values['board age [s]'], values['board temperature sd [K]']) == ('inf', '10.0000')
 
 
-def test_sample_rate_is_held_against_the_calibrated_one(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
+def test_sample_rate_is_held_against_the_calibrated_one(peer, saved):
     wait = diagnosis(peer)
     with node_in_thread(*saved(calibration())) as node:
         driver = drive(peer, node)
@@ -305,9 +290,7 @@ def test_sample_rate_is_held_against_the_calibrated_one(
 
 
 @pytest.mark.parametrize('qos', [DEEP, BEST_EFFORT], ids=['reliable', 'best effort'])
-def test_any_reader_and_any_driver_match(
-    peer: Peer, saved: Callable[..., list[str]], qos: QoSProfile
-) -> None:
+def test_any_reader_and_any_driver_match(peer, saved, qos):
     with node_in_thread(*saved(calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw', qos)
         driver = drive(peer, node, qos=qos)
@@ -316,7 +299,7 @@ def test_any_reader_and_any_driver_match(
         peer.wait_for(lambda: heard, 'the sample')
 
 
-def test_namespace_and_remapping(peer: Peer, saved: Callable[..., list[str]]) -> None:
+def test_namespace_and_remapping(peer, saved):
     args = ['-r', '__ns:=/imu0', '-r', 'accel/counts:=/adc/raw', '-r', 'imu/data_raw:=imu/clean']
     with node_in_thread(*saved(calibration()), *args) as node:
         topics = dict(node.node.get_topic_names_and_types())

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node as a process: bad starts end at once with one clear line, good ones end cleanly."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -24,7 +22,7 @@ from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 
 
-def arguments(*overrides: str) -> list[str]:
+def arguments(*overrides):
     words = [word for override in overrides for word in ('-p', override)]
     return ['thermo_comp_node', '--ros-args', *words]
 
@@ -53,9 +51,7 @@ def arguments(*overrides: str) -> list[str]:
         (['calibration_file:={unit}', 'use_sim_time:=7'], "set parameter 'use_sim_time' to '7'"),
     ],
 )  # fmt: skip
-def test_bad_start(
-    overrides: list[str], text: str, unit: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_start(overrides, text, unit, tmp_path, capfd):
     (tmp_path / 'text.yaml').write_text('just words')
     nan = dump_calibration(calibration()).replace('bias: 0.0', 'bias: .nan', 1)
     (tmp_path / 'nan.yaml').write_text(nan)
@@ -69,7 +65,7 @@ def test_bad_start(
     assert text in line
 
 
-def test_one_topic_for_two_thermometers(unit: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_one_topic_for_two_thermometers(unit, capfd):
     remaps = [f'temperature/{name}:=/imu/temperature' for name in ('board', 'case')]
     words = [word for one in remaps for word in ('-r', one)]
     assert main([*arguments(f'calibration_file:={unit}'), *words]) == 1
@@ -86,14 +82,7 @@ def test_one_topic_for_two_thermometers(unit: Path, capfd: pytest.CaptureFixture
         ('ROS_LOG_DIR', '/proc/none', "Failed to create log directory '/proc/none'"),
     ],
 )
-def test_an_environment_that_ros_cannot_use(
-    name: str,
-    value: str,
-    text: str,
-    unit: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_an_environment_that_ros_cannot_use(name, value, text, unit, monkeypatch, capfd):
     monkeypatch.setenv(name, value)
     assert main(arguments(f'calibration_file:={unit}')) == 1
     said = capfd.readouterr().err.splitlines()[-1]
@@ -101,7 +90,7 @@ def test_an_environment_that_ros_cannot_use(
     assert text in said
 
 
-def test_closed_streams_are_no_signal(unit: Path) -> None:
+def test_closed_streams_are_no_signal(unit):
     # WHY: the signals' pipe got the descriptor of stderr, and the first letter of the log was
     # taken for a signal.
     peer = Peer()
@@ -115,7 +104,7 @@ def test_closed_streams_are_no_signal(unit: Path) -> None:
 
 
 @pytest.mark.parametrize(('sink', 'code'), [('> /dev/full', 1), ('| true', 0)])
-def test_help_that_cannot_be_written(sink: str, code: int) -> None:
+def test_help_that_cannot_be_written(sink, code):
     words = f'set -o pipefail; "{sys.executable}" -m thermo_comp.ros.node --help {sink}'
     root = Path(__file__).parents[1]
     finished = subprocess.run(
@@ -129,9 +118,7 @@ def test_help_that_cannot_be_written(sink: str, code: int) -> None:
 ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
 
 
-def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
-    unit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path, monkeypatch):
     # The interpreters of the node and of its child processes import this first.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
@@ -154,7 +141,7 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
         driver = Driver(peer)
         peer.poll(lambda: peer.node.count_publishers('imu/data_raw'), 'the output')
 
-        def is_heard() -> bool:
+        def is_heard():
             stamp_ns = time.monotonic_ns()
             driver.temperatures(stamp_ns, 20.0, 20.0)
             driver.counts(stamp_ns, *standing(stamp_ns))
@@ -178,21 +165,21 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
     assert (finished.stdout, finished.stderr) == ('', said)
 
 
-def test_usage(capfd: pytest.CaptureFixture[str]) -> None:
+def test_usage(capfd):
     assert main(['thermo_comp_node', '--help']) == 0
     assert 'example: thermo_comp_node --ros-args -p calibration_file' in capfd.readouterr().out
     assert main(['thermo_comp_node', 'unit.yaml']) == 2
     assert "unknown argument 'unit.yaml'" in capfd.readouterr().err
 
 
-def test_unreadable_ros_arguments(capfd: pytest.CaptureFixture[str]) -> None:
+def test_unreadable_ros_arguments(capfd):
     assert main(['thermo_comp_node', '--ros-args', '--params-file', '/none.yaml']) == 2
     said = capfd.readouterr().err
     assert 'thermo_comp_node: ' in said
     assert 'Traceback' not in said
 
 
-def test_misspelt_parameters_are_said(unit: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_misspelt_parameters_are_said(unit, capfd):
     overrides = ['-p', f'calibration_file:={unit}', '-p', 'transition_tme:=3.0']
     overrides += ['-p', 'qos_overrides./imu/uncompensated.subscription.depth:=3']
     with node_in_thread(*overrides):
@@ -202,7 +189,7 @@ def test_misspelt_parameters_are_said(unit: Path, capfd: pytest.CaptureFixture[s
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_during_start_up_ends_it_cleanly(unit: Path, number: int) -> None:
+def test_a_signal_during_start_up_ends_it_cleanly(unit, number):
     # A signal during the construction of the node, once the middleware has a thread.
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         tasks = Path(f'/proc/{node.process.pid}/task')
@@ -213,7 +200,7 @@ def test_a_signal_during_start_up_ends_it_cleanly(unit: Path, number: int) -> No
         assert 'Traceback' not in node.said
 
 
-def name(task: Path) -> str:
+def name(task):
     try:
         return (task / 'comm').read_text()
     except OSError:

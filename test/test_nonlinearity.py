@@ -4,8 +4,6 @@
 Nonlinear axes in the correction: closed forms of the inverse, bits of stream and batch, variance.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

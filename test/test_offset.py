@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Raw words with an offset: the same calibration, with the offset in its bias."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +9,7 @@ import pytest
 from builders import source_of
 from position_helpers import START_NS
 
-from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.coverage import rough_centre
 from thermo_comp.fitting.fit import about
 from thermo_comp.simulation.campaign import positions
@@ -23,7 +21,7 @@ BIAS = np.array((120.0, -340.0, 55.0))
 M = np.array(((1.0, 0.0, 0.0), (0.004, 1.0, 0.0), (-0.006, 0.003, 1.0)))
 
 
-def source(words, name='words') -> FitSource:
+def source(words, name='words'):
     stamps = START_NS + np.arange(len(words)) * 10_000_000
     return source_of(stamps, words, name=name)
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Version, licence, commands and keys of the package agree wherever they are stated."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re
@@ -29,9 +27,9 @@ KNOWN_KEYS = {
 }
 
 
-def setup_literals() -> dict[str, object]:
+def setup_literals():
     """Return the module-level literals of setup.py without running it."""
-    literals: dict[str, object] = {}
+    literals = {}
     for node in ast.parse((ROOT / 'setup.py').read_text()).body:
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
             try:
@@ -41,7 +39,7 @@ def setup_literals() -> dict[str, object]:
     return literals
 
 
-def test_one_version() -> None:
+def test_one_version():
     assert MANIFEST.findtext('version') == thermo_comp.__version__
     assert re.fullmatch(r'\d+\.\d+\.\d+', thermo_comp.__version__)
     finished = subprocess.run(
@@ -51,7 +49,7 @@ def test_one_version() -> None:
     assert finished.stdout.split()[-1] == thermo_comp.__version__
 
 
-def test_manifest_is_format_3_with_keys_that_exist() -> None:
+def test_manifest_is_format_3_with_keys_that_exist():
     assert MANIFEST.get('format') == '3'
     assert MANIFEST.findtext('name') == 'thermo_comp'
     assert MANIFEST.findtext('export/build_type') == 'ament_python'
@@ -63,7 +61,7 @@ def test_manifest_is_format_3_with_keys_that_exist() -> None:
     assert keys == KNOWN_KEYS
 
 
-def test_licence_is_the_whole_apache_text() -> None:
+def test_licence_is_the_whole_apache_text():
     licence = (ROOT / 'LICENSE').read_text()
     assert 'Version 2.0, January 2004' in licence
     assert 'END OF TERMS AND CONDITIONS' in licence
@@ -71,7 +69,7 @@ def test_licence_is_the_whole_apache_text() -> None:
     assert (node.text, node.get('file')) == ('Apache-2.0', 'LICENSE')
 
 
-def tracked(*patterns: str) -> list[Path]:
+def tracked(*patterns):
     listing = subprocess.run(
         ['git', 'ls-files', '-z', '--', *patterns], cwd=ROOT, capture_output=True, check=False
     )
@@ -81,7 +79,7 @@ def tracked(*patterns: str) -> list[Path]:
     return [ROOT / name for name in names if (ROOT / name).exists()]
 
 
-def test_every_source_carries_its_licence() -> None:
+def test_every_source_carries_its_licence():
     first = 'SPDX-FileCopyrightText: 2026 thermo_comp contributors'
     second = 'SPDX-License-Identifier: Apache-2.0'
     for path in tracked('*.py', 'Makefile', '.ci/run'):
@@ -90,12 +88,12 @@ def test_every_source_carries_its_licence() -> None:
         assert lines[:2] == [f'# {first}', f'# {second}'], path
 
 
-def test_no_source_is_too_long_to_read() -> None:
+def test_no_source_is_too_long_to_read():
     lengths = {path: len(path.read_text().splitlines()) for path in tracked('*.py')}
     assert {path.name: n for path, n in lengths.items() if n > 500} == {}
 
 
-def test_the_manifest_asks_for_the_node_alone() -> None:
+def test_the_manifest_asks_for_the_node_alone():
     # Other dependencies of the commands come from PyPI: test_node_startup.py runs the node without
     # them.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
@@ -108,7 +106,7 @@ def test_the_manifest_asks_for_the_node_alone() -> None:
     assert all('>=' in requirement for requirement in install), 'no floor'
 
 
-def test_hosted_ci_does_what_the_readme_says() -> None:
+def test_hosted_ci_does_what_the_readme_says():
     jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yaml').read_text())['jobs']
     lowest = re.search(r"python_requires='>=([\d.]+)'", (ROOT / 'setup.py').read_text())
     assert jobs['wheels']['strategy']['matrix']['python'][0] == lowest[1]
@@ -119,7 +117,7 @@ def test_hosted_ci_does_what_the_readme_says() -> None:
     assert jobs['ros']['container'] == 'ros:jazzy'
 
 
-def test_share_holds_what_ros_looks_for(tmp_path: Path) -> None:
+def test_share_holds_what_ros_looks_for(tmp_path):
     # colcon installs a package in this way: setup.py's install command into a prefix. Only the
     # data files are tested here, not scripts and code.
     subprocess.run(

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Impossible readings of a thermometer are rejected, possible ones never."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from itertools import count

@@ -146,7 +146,7 @@ def fitted(rng, ups):
     return fit([rest.source(name=f'bag{k}') for k, rest in enumerate(rests)], OPTIONS)
 
 
-def said(result) -> str:
+def said(result):
     return next((one.message for one in result.findings if one.name == 'unseen'), '')
 
 

@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The benefit of an earlier calibration and of siblings for a fit with little data."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,13 +12,13 @@ from triads import sibling, triad
 
 from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError
-from thermo_comp.fitting import FitOptions, FitResult, FitSource, fit
+from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.priors import population
-from thermo_comp.fitting.selection import Selected, fit_all
-from thermo_comp.fitting.unknowns import InformativePrior, Prior
+from thermo_comp.fitting.selection import fit_all
+from thermo_comp.fitting.unknowns import Prior
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
-from thermo_comp.simulation.run import SimulatedRun, arrays
-from thermo_comp.unit.calibration import Calibration, parameter_layout
+from thermo_comp.simulation.run import arrays
+from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
@@ -31,7 +28,7 @@ KIND = triad('products', 1)
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
-def source(record: SimulatedRun) -> FitSource:
+def source(record):
     # A reading every eight seconds: a ramp of 1 K/min is still detected, eight times faster.
     arrays = arrays_of(record, 8)
     later = [one + 10**18 if one.dtype == np.int64 else one for one in arrays]
@@ -39,7 +36,7 @@ def source(record: SimulatedRun) -> FitSource:
 
 
 @cache
-def test_of(number: int, first: int, last: int) -> tuple[SimulatedRun, ...]:
+def test_of(number, first, last):
     """Record some of twelve positions of one sibling."""
     ups = positions(12, number)[first:last]
     stations = [Position(PROGRAM, up) for up in ups]
@@ -50,17 +47,17 @@ test_of.__test__ = False
 
 
 @cache
-def fitted(number: int) -> FitResult:
+def fitted(number):
     """Fit a sibling on nine of its twelve positions, which determine everything."""
     options = replace(OPTIONS, serial=f'unit-{number}')
     return fit([source(record) for record in test_of(number, 0, 9)], options)
 
 
-def siblings() -> list[Calibration]:
+def siblings():
     return [fitted(number).calibration for number in (1, 2, 3)]
 
 
-def sd_of_levels(calibration: Calibration) -> np.ndarray:
+def sd_of_levels(calibration):
     variance = np.diag(calibration.posterior.covariance())
     places = [block.static for block in parameter_layout(calibration).bias]
     K = [axis.scale_factor for axis in calibration.axes]
@@ -90,13 +87,13 @@ def test_population_is_the_mean_unit_and_its_scatter():
     assert sd == pytest.approx(expected, rel=1e-3)
 
 
-def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch: pytest.MonkeyPatch):
+def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch):
     # WHY: a fit started with the narrow prior of three units attributed 190 ug of their
     # differences to the mounting offset and stayed there: 271 ug held out instead of 0.9. WHAT: no
     # prior is wider anywhere than the one of the start.
-    seen: list[InformativePrior] = []
+    seen = []
 
-    def fitted_with(*given: Any) -> Selected:
+    def fitted_with(*given):
         (prior,) = (argument for argument in given if isinstance(argument, Prior))
         assert prior.informative is not None
         seen.extend((*given[-1], prior.informative))
@@ -131,7 +128,7 @@ def test_siblings_make_one_position_worth_more():
     assert errors[1] < errors[0]
 
 
-def fitted_curve(number: int):
+def fitted_curve(number):
     return fitted(number).calibration.static.z.scale_function
 
 
@@ -155,7 +152,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
     moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
     old = fitted(9).calibration
 
-    def aged(record: SimulatedRun) -> SimulatedRun:
+    def aged(record):
         by = np.rint(moved * np.array([axis.scale_factor for axis in old.axes]))
         return replace(record, counts=record.counts + by.astype(record.counts.dtype))
 
@@ -181,7 +178,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
     assert left[2] < left[1] / 50.0
 
 
-def left_by(calibration: Calibration, record: SimulatedRun) -> float:
+def left_by(calibration, record):
     """Return RMS of |f| - g in means of a minute."""
     origin = record.accel_stamp_ns[0]
     board, case = (

@@ -6,8 +6,6 @@ Recordings by other people through `fit`, with the figures of docs/real_data.md.
 Skipped with a reason if the recordings are absent.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 from contextlib import suppress

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records are found with and without an index as by a plain loop, whatever the bytes are."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np
@@ -11,21 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermo_comp.recording.chunks import locate, walk
-from thermo_comp.recording.serialized import Messages
 
 MESSAGE, CHANNEL = 5, 4
 
 
-def message(channel: int, log_ns: int, content: bytes) -> bytes:
+def message(channel, log_ns, content):
     body = struct.pack('<HIQQ', channel, 0, log_ns, log_ns) + content
     return struct.pack('<BQ', MESSAGE, len(body)) + body
 
 
-def other(content: bytes) -> bytes:
+def other(content):
     return struct.pack('<BQ', CHANNEL, len(content)) + content
 
 
-def one_by_one(data: bytes) -> tuple[list[tuple[int, int, int, int]], list[bytes], int]:
+def one_by_one(data):
     """
     Scan in a plain loop: place, size, channel and log time of each message; other records; the
     end.
@@ -44,7 +41,7 @@ def one_by_one(data: bytes) -> tuple[list[tuple[int, int, int, int]], list[bytes
     return messages, others, at
 
 
-def listed(messages: Messages) -> list[tuple[int, int, int, int]]:
+def listed(messages):
     columns = (messages.start - 31, messages.size, messages.channel, messages.log_ns)
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
@@ -57,9 +54,9 @@ DECEITFUL = [
 
 
 @st.composite
-def records(draw: st.DrawFn) -> bytes:
+def records(draw):
     """Long regular parts with irregular ones between."""
-    pieces: list[bytes] = []
+    pieces = []
     for _ in range(draw(st.integers(1, 6))):
         content = draw(st.sampled_from(DECEITFUL) | st.binary(max_size=60))
         pattern = [
@@ -73,7 +70,7 @@ def records(draw: st.DrawFn) -> bytes:
     return b''.join(pieces)
 
 
-def index_of(entries: list[tuple[int, int, int, int]]) -> bytes:
+def index_of(entries):
     pieces = []
     for channel in sorted({entry[2] for entry in entries}):
         rows = b''.join(
@@ -85,14 +82,12 @@ def index_of(entries: list[tuple[int, int, int, int]]) -> bytes:
 
 @settings(max_examples=120, deadline=None)
 @given(data=records(), cut=st.integers(0, 200), tail=st.binary(max_size=30), drawn=st.data())
-def test_a_walk_equals_the_plain_loop_and_a_false_index_changes_nothing(
-    data: bytes, cut: int, tail: bytes, drawn: st.DataObject
-) -> None:
+def test_a_walk_equals_the_plain_loop_and_a_false_index_changes_nothing(data, cut, tail, drawn):
     """WHY: offsets into payloads that look like records could give false samples."""
     torn = data[: len(data) - cut] + tail
     wanted, wanted_others, wanted_end = one_by_one(torn)
     if all(log_ns < 2**63 for _, _, _, log_ns in wanted):
-        others: list[bytes] = []
+        others = []
         messages, reason = walk(
             np.frombuffer(torn, np.uint8), lambda _, content: others.append(content)
         )

@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Other tools read the written bag; it is complete or does not exist."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,10 +24,10 @@ from thermo_comp.recording.writer import BagWriter
 from thermo_comp.topics import FLAGS, STAMPED
 
 STEP_NS = 2_500_000
-REQUIRED: tuple[()] = ()
+REQUIRED = ()
 
 
-def imu_columns(rng: np.random.Generator, n: int) -> ImuColumns:
+def imu_columns(rng, n):
     return ImuColumns(*(rng.normal(size=(n, width)) for width in (4, 9, 3, 9, 9)))
 
 
@@ -44,10 +41,10 @@ def imu_columns(rng: np.random.Generator, n: int) -> ImuColumns:
     seed=st.integers(0, 1000),
 )
 def test_rosbags_and_mcap_read_back_what_was_written(
-    counts: list[int], frame_id: str, compression: Any, chunk_bytes: int, is_file: bool, seed: int
-) -> None:
+    counts, frame_id, compression, chunk_bytes, is_file, seed
+):
     rng = np.random.default_rng(seed)
-    written: list[tuple[int, int, str]] = []
+    written = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap' if is_file else 'bag')
         with BagWriter(path, compression=compression, chunk_bytes=chunk_bytes) as bag:
@@ -131,14 +128,14 @@ def test_rosbags_and_mcap_read_back_what_was_written(
                     assert (getattr(message, name) == getattr(imu, name)[row]).all()
 
 
-def small(path: Path, value: float = 1.0, **options: Any) -> None:
+def small(path, value=1.0, **options):
     with BagWriter(path, **options) as bag:
         stamps = START_NS + STEP_NS * np.arange(5)
         bag.write_counts('accel/counts', stamps, np.full((5, 3), value))
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_metadata_comes_back(tmp_path: Path, name: str) -> None:
+def test_metadata_comes_back(tmp_path, name):
     pairs = {'serial': 'Ünit 7', 'git': 'a: b\n- c'}
     small(tmp_path / name, metadata=pairs)
     assert read_recording(tmp_path / name, require=()).info.metadata == pairs
@@ -148,7 +145,7 @@ def test_metadata_comes_back(tmp_path: Path, name: str) -> None:
         assert read_recording(tmp_path / name, require=()).info.metadata == pairs
 
 
-def test_the_directory_is_what_rosbag2_writes(tmp_path: Path) -> None:
+def test_the_directory_is_what_rosbag2_writes(tmp_path):
     small(tmp_path / 'bag', metadata={'serial': '7'})
     assert {p.name for p in (tmp_path / 'bag').iterdir()} == {'metadata.yaml', 'bag_0.mcap'}
     content = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
@@ -179,7 +176,7 @@ def test_the_directory_is_what_rosbag2_writes(tmp_path: Path) -> None:
     assert yaml.safe_load(metadata['rosbag2']['serialized_metadata']) == content
 
 
-def test_a_bare_file_names_itself(tmp_path: Path) -> None:
+def test_a_bare_file_names_itself(tmp_path):
     """WHY: a bag is written under a temporary name, which must not be in its metadata."""
     small(tmp_path / 'bag.mcap')
     with (tmp_path / 'bag.mcap').open('rb') as stream:
@@ -188,7 +185,7 @@ def test_a_bare_file_names_itself(tmp_path: Path) -> None:
     assert content['relative_file_paths'] == [content['files'][0]['path']] == ['bag.mcap']
 
 
-def test_own_definition_of_a_raw_message(tmp_path: Path) -> None:
+def test_own_definition_of_a_raw_message(tmp_path):
     with BagWriter(tmp_path / 'bag.mcap') as bag:
         with pytest.raises(RecordingError, match='/x: the definition of message type a/msg/B is'):
             bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'])
@@ -203,16 +200,16 @@ def test_own_definition_of_a_raw_message(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path: Path, name: str) -> None:
+def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path, name):
     path = tmp_path / name
     small(path, 1.0)
     with pytest.raises(OutputError, match='exists already'):
         small(path, 2.0)
 
-    def value() -> float:
+    def value():
         return float(read_recording(path, require=()).columns.accel[0, 0])
 
-    def fail() -> None:
+    def fail():
         with BagWriter(path, overwrite=True) as bag:
             bag.write_counts('accel/counts', [1], [[2.0, 2.0, 2.0]])
             bag.flush()
@@ -228,7 +225,7 @@ def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path: Path, nam
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path: Path) -> None:
+def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path):
     (tmp_path / 'home').mkdir()
     (tmp_path / 'home' / 'thesis.tex').write_text('ten years of work')
     with pytest.raises(OutputError, match=r'is not replaced: it holds thesis\.tex'):
@@ -244,7 +241,7 @@ def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path: Path) -
         BagWriter(tmp_path / 'folder.mcap', overwrite=True)
 
 
-def test_an_output_may_be_a_link(tmp_path: Path) -> None:
+def test_an_output_may_be_a_link(tmp_path):
     for name in ('bag', 'bag.mcap'):
         small(tmp_path / 'disk' / name, 1.0)
         (tmp_path / name).symlink_to(tmp_path / 'disk' / name)
@@ -254,7 +251,7 @@ def test_an_output_may_be_a_link(tmp_path: Path) -> None:
         assert float(columns.accel[0, 0]) == 2.0
 
 
-def test_a_target_that_cannot_be_made(tmp_path: Path) -> None:
+def test_a_target_that_cannot_be_made(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match=r'cannot be written: .*file is no directory'):
         BagWriter(tmp_path / 'file' / 'bag.mcap')
@@ -267,7 +264,7 @@ def test_a_target_that_cannot_be_made(tmp_path: Path) -> None:
             BagWriter(tmp_path / 'locked' / 'bag.mcap')
 
 
-def test_arguments_that_do_not_fit(tmp_path: Path) -> None:
+def test_arguments_that_do_not_fit(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         with pytest.raises(ValueError, match=r'`xyz` must have shape \(2, 3\), got \(2, 2\)'):
             bag.write_counts('a', [1, 2], [[1, 2], [3, 4]])
@@ -295,7 +292,7 @@ def test_arguments_that_do_not_fit(tmp_path: Path) -> None:
         bag.write_bool('a', [1], [True])
 
 
-def test_a_bag_without_messages_is_a_bag(tmp_path: Path) -> None:
+def test_a_bag_without_messages_is_a_bag(tmp_path):
     for name in ('bag', 'bag.mcap'):
         with BagWriter(tmp_path / name):
             pass
@@ -305,7 +302,7 @@ def test_a_bag_without_messages_is_a_bag(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_regime_topics_are_offered_as_the_node_offers_them(tmp_path: Path, name: str) -> None:
+def test_regime_topics_are_offered_as_the_node_offers_them(tmp_path, name):
     # WHY: a bag of `replay` offered `regime/stamped` as volatile: a late subscriber got no regime.
     with BagWriter(tmp_path / name) as bag:
         bag.write_bool('imu0/regime/dynamic', [1], [True])

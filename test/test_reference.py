@@ -17,7 +17,7 @@ def test_generated_pages_are_up_to_date():
     assert not stale, 'run: python docs/make_reference.py'
 
 
-def test_json_schema_says_the_same() -> None:
+def test_json_schema_says_the_same():
     schema = make_reference.json_schema(Drawing)
     assert schema['required'] == ['name']
     assert schema['additionalProperties'] is False

@@ -19,7 +19,7 @@ HEADLESS = (
 )
 
 
-def browser() -> str:
+def browser():
     found = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
     if found is None:
         pytest.skip('no Chromium here (Debian: apt install chromium)')

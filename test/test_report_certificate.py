@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The certificate of a laboratory: its statements, uncertainties and rounding."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,7 +42,7 @@ signatory: B. Person
 """
 
 
-def lab(folder: Path, text: str = LAB) -> Path:
+def lab(folder, text=LAB):
     path = folder / 'lab.yaml'
     path.write_text(text, encoding='utf-8')
     return path

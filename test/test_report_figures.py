@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The figures: legible without colour, with units, and equal to the numbers behind them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from builders import axis_set, calibration, regime_set, rich_calibration, term
-from matplotlib.artist import Artist
 from matplotlib.colors import to_rgb
 from report_helpers import evidence, fitted
 
@@ -102,7 +99,7 @@ def test_trace_without_a_case_sensor_follows_the_board():
     assert any(stretch.regime == Regime.DYNAMIC for stretch in shown.stretches)
 
 
-def look(line: Artist) -> tuple[object, ...]:
+def look(line):
     """Return what distinguishes lines without colour: dashes, marker, darkness."""
     dashes, colour = line._unscaled_dash_pattern, line.get_color()
     marker = f'{line.get_marker()} {line.get_markerfacecolor()}'

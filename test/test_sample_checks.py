@@ -4,8 +4,6 @@
 Invalid samples (stuck, zero, too fast, of another unit) are treated alike in streams and blocks.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

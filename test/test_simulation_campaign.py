@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Programs and whole tests in memory: runs as in a bag, physics of their errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -15,22 +13,21 @@ from triads import TRIAD_NAMES, SlipEffect, triad
 from thermo_comp.simulation.campaign import PLAN_NAMES, Position, parse_cyclogram, plan
 from thermo_comp.simulation.drift import FlowEffect, PartHistory
 from thermo_comp.simulation.run import arrays, simulate
-from thermo_comp.simulation.unit import SwitchedLoad, UnitModel
-from thermo_comp.typing import Floats
+from thermo_comp.simulation.unit import SwitchedLoad
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 10min, 30@1 20min, 24@0.5 10min')
 STATION = Position(PROGRAM, np.array([0.48, -0.6, 0.64]))
 
 
-def _history(temperature: Floats, step: float = 1.0) -> PartHistory:
+def _history(temperature, step=1.0):
     deviation = np.reshape(temperature, (len(temperature), -1))
     nodes = ('a', 'b')[: deviation.shape[1]]
     return PartHistory(nodes, deviation, np.zeros(len(nodes)), step)
 
 
 @pytest.mark.parametrize('kind', ['own-lags', 'switched-load', 'slow-noise', 'convection'])
-def test_a_record_is_the_run_of_a_bag(kind: str) -> None:
+def test_a_record_is_the_run_of_a_bag(kind):
     unit = triad(kind, 1)
     _, record = arrays(unit, [STATION, STATION], 3)
     run = simulate(unit, PROGRAM, STATION.up, rate_hz=4.0, seed=3001, start_ns=0)
@@ -44,7 +41,7 @@ def test_a_record_is_the_run_of_a_bag(kind: str) -> None:
 
 
 @pytest.mark.parametrize('kind', TRIAD_NAMES)
-def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
+def test_a_perfect_model_leaves_the_noise(kind):
     """The floor of every accuracy table: 0.65 ug of |g| over 60 s, 1.12 ug of the vector."""
     unit = triad(kind, 2)
     errors, norms = [], []
@@ -63,7 +60,7 @@ def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
         assert vector == pytest.approx(1.12, abs=0.07)
 
 
-def test_plans_are_what_their_names_say() -> None:
+def test_plans_are_what_their_names_say():
     hours = {
         name: sum(p.program.duration_s for p in plan(name, 1)) / 3600.0 for name in PLAN_NAMES
     }
@@ -85,7 +82,7 @@ def test_plans_are_what_their_names_say() -> None:
         plan('oven')
 
 
-def test_a_joint_that_slips_goes_round_a_loop() -> None:
+def test_a_joint_that_slips_goes_round_a_loop():
     """Independent of the rate: the way back differs from the way there, and time has no effect."""
     there_and_back = np.concatenate([np.linspace(0, 5, 200), np.linspace(5, 0, 200)])
     for is_gradual in (False, True):
@@ -101,7 +98,7 @@ def test_a_joint_that_slips_goes_round_a_loop() -> None:
         assert twice[-1, 0] == pytest.approx(quick[-1, 0], rel=0.02)
 
 
-def test_a_flow_is_even_and_zero_at_rest() -> None:
+def test_a_flow_is_even_and_zero_at_rest():
     up = np.stack([np.linspace(0, 3, 50), np.zeros(50)], axis=1)
     effect = FlowEffect('a', 'b', 1.25, bias=(1.0, 0.0, 0.0))
     warm, cold = (effect.change(_history(sign * up))[0] for sign in (1.0, -1.0))
@@ -110,7 +107,7 @@ def test_a_flow_is_even_and_zero_at_rest() -> None:
     assert warm[0, 0] == 0.0
 
 
-def test_a_limited_flow_is_a_matter_of_on_and_off() -> None:
+def test_a_limited_flow_is_a_matter_of_on_and_off():
     up = np.stack([np.array([0.0, 0.5, 50.0]), np.full(3, 2.0)], axis=1)
     up[:, 0] += 2.0
     effect = FlowEffect('a', 'b', 2.0, 0.5, True, 1, bias=(1.0, 0.0, 0.0))
@@ -118,12 +115,12 @@ def test_a_limited_flow_is_a_matter_of_on_and_off() -> None:
     np.testing.assert_allclose(bias[:, 0], [0.0, 1.0, 2.0], atol=1e-3)
 
 
-def test_a_switched_load_heats_its_part() -> None:
+def test_a_switched_load_heats_its_part():
     """The warming equals the heat balance of an endless spell, and is zero before it is on."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
-    loaded: UnitModel = replace(unit, load=load)
+    loaded = replace(unit, load=load)
     program = parse_cyclogram('20 16h')
     on, off = (
         simulate(one, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth
@@ -136,7 +133,7 @@ def test_a_switched_load_heats_its_part() -> None:
     assert warmer[-1] == pytest.approx(0.5 / 0.4 + 0.5 / to_air, rel=1e-6)
 
 
-def test_paper_covers_its_range_in_ramps_and_soaks() -> None:
+def test_paper_covers_its_range_in_ramps_and_soaks():
     program = parse_cyclogram('paper')
     assert min(program.temperature_c) == 5.0
     assert max(program.temperature_c) == 35.0
@@ -144,7 +141,7 @@ def test_paper_covers_its_range_in_ramps_and_soaks() -> None:
     np.testing.assert_allclose(np.abs(ramps), 0.5)
 
 
-def test_a_typed_program_is_read_as_written() -> None:
+def test_a_typed_program_is_read_as_written():
     program = parse_cyclogram('20 30min, 35@0.5 1h; -5.5@1.5\n-5.5 90s, 20')
     np.testing.assert_allclose(program.temperature_c, [20, 20, 35, 35, -5.5, -5.5, 20])
     np.testing.assert_allclose(
@@ -167,6 +164,6 @@ def test_a_typed_program_is_read_as_written() -> None:
         (f'20, {"9" * 400}', 'finite numbers'),
     ],
 )
-def test_a_typed_program_that_cannot_be_read_is_refused(text: str, message: str) -> None:
+def test_a_typed_program_that_cannot_be_read_is_refused(text, message):
     with pytest.raises(ValueError, match=message):
         parse_cyclogram(text)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ready-made units have the published properties; their converter loses no charge."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np
@@ -12,13 +10,12 @@ from triads import TRIAD_NAMES, unit_of
 
 from thermo_comp.simulation.drift import PartHistory, drift_of
 from thermo_comp.simulation.presets import UNIT_NAMES, unit_preset
-from thermo_comp.simulation.unit import UnitModel, balanced, first_charge, rounded
-from thermo_comp.typing import Floats
+from thermo_comp.simulation.unit import balanced, first_charge, rounded
 
 NAMES = (*UNIT_NAMES, *TRIAD_NAMES)
 
 
-def _static(unit: UnitModel, board: Floats) -> tuple[Floats, ...]:
+def _static(unit, board):
     """Return bias [ug] and relative scale after endless soaks at board temperatures."""
     still = []
     for temperature in board:
@@ -31,7 +28,7 @@ def _static(unit: UnitModel, board: Floats) -> tuple[Floats, ...]:
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_constants_hold_at_the_reference(name: str) -> None:
+def test_constants_hold_at_the_reference(name):
     unit = unit_of(name, 3)
     bias, scale = _static(unit, np.array([20.0]))
     np.testing.assert_allclose(bias, 0.0, atol=1e-9)
@@ -41,7 +38,7 @@ def test_constants_hold_at_the_reference(name: str) -> None:
 
 
 @pytest.mark.parametrize('seed', range(8))
-def test_bare_quartz_has_the_published_slopes(seed: int) -> None:
+def test_bare_quartz_has_the_published_slopes(seed):
     """
     Q-Flex class: scale slope 68..87 ppm/K from 5 to 35 degC with 0.31 ppm/K^2 of curvature, bias
     slope 0.3..5 ug/K.
@@ -60,13 +57,13 @@ def test_bare_quartz_has_the_published_slopes(seed: int) -> None:
 
 
 @pytest.mark.parametrize('seed', range(8))
-def test_mems_bias_moves_by_hundreds_of_micro_g(seed: int) -> None:
+def test_mems_bias_moves_by_hundreds_of_micro_g(seed):
     bias, _ = _static(unit_preset('mems', seed), np.array([19.5, 20.5]))
     slope = np.abs(bias[1] - bias[0])
     assert np.all((slope > 90.0) & (slope < 550.0))
 
 
-def test_specimens_differ_and_return() -> None:
+def test_specimens_differ_and_return():
     for name in NAMES:
         assert unit_of(name, 1) == unit_of(name, 1)
         assert unit_of(name, 1) != unit_of(name, 2)
@@ -78,7 +75,7 @@ def test_specimens_differ_and_return() -> None:
     # 0.23.
 
 
-def test_sum_of_counts_is_the_integral_within_one_count(rng: np.random.Generator) -> None:
+def test_sum_of_counts_is_the_integral_within_one_count(rng):
     charge = rng.uniform(-3000.0, 3000.0, (200_000, 3))
     start = first_charge(7)
     counts, _ = balanced(charge, start)
@@ -88,7 +85,7 @@ def test_sum_of_counts_is_the_integral_within_one_count(rng: np.random.Generator
     assert short.max() < 1.0 + 1e-6
 
 
-def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing() -> None:
+def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing():
     """
     WHY: a float sum of 1e9 counts has no digits left for the fraction.
 
@@ -106,7 +103,7 @@ def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing() -> None:
     assert abs(total - exact) < 1 + 1e-4
 
 
-def test_blocks_of_any_size_give_the_same_counts(rng: np.random.Generator) -> None:
+def test_blocks_of_any_size_give_the_same_counts(rng):
     charge = rng.normal(0.0, 2e4, (10_000, 3))
     start = first_charge(1)
     whole, last = balanced(charge, start)
@@ -119,13 +116,13 @@ def test_blocks_of_any_size_give_the_same_counts(rng: np.random.Generator) -> No
         np.testing.assert_array_equal(remainder, last)
 
 
-def test_output_saturates_at_the_words_ends_and_recovers() -> None:
+def test_output_saturates_at_the_words_ends_and_recovers():
     charge = np.array([[4e4, -4e4, 0.5], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
     counts, _ = balanced(charge, np.zeros(3, dtype=np.int64))
     np.testing.assert_array_equal(counts, [[32767, -32768, 0], [0, 0, 1], [1, 1, 0]])
 
 
-def test_without_a_carry_each_cycle_is_rounded_by_itself() -> None:
+def test_without_a_carry_each_cycle_is_rounded_by_itself():
     charge = np.full((5, 3), 10.4)
     counts, _ = rounded(charge, first_charge(0))
     np.testing.assert_array_equal(counts, 10)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The columns of a simulated run depend on its truth and its seeds only."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +11,7 @@ from simulation_helpers import noiseless, of_part, rippled
 
 from thermo_comp.simulation.campaign import Cyclogram, parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset
-from thermo_comp.simulation.run import START_NS, SimulatedRun, simulate, simulate_blocks
-from thermo_comp.simulation.unit import UnitModel
-from thermo_comp.typing import Floats
+from thermo_comp.simulation.run import START_NS, simulate, simulate_blocks
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 UP = np.array([0.48, -0.6, 0.64])
@@ -26,17 +22,17 @@ CYCLES = ('cycle_s', 'bias', 'scale')
 
 
 @pytest.fixture(scope='module')
-def unit() -> UnitModel:
+def unit():
     return unit_preset('thermostatted', 4)
 
 
-def _joined(blocks: list[SimulatedRun], name: str, *, is_truth: bool = False) -> Floats:
+def _joined(blocks, name, *, is_truth=False):
     return np.concatenate([getattr(b.truth if is_truth else b, name) for b in blocks])
 
 
 @pytest.mark.parametrize('block_size', [1777, 6000, 10**6])
 @pytest.mark.parametrize('name', ['thermostatted', 'mems'])
-def test_blocks_are_the_whole_bit_for_bit(name: str, block_size: int) -> None:
+def test_blocks_are_the_whole_bit_for_bit(name, block_size):
     options = {'rate_hz': 20.0, 'seed': 9}
     arguments = (unit_preset(name, 1), rippled(SHORT), UP)
     whole = simulate(*arguments, **options)
@@ -53,7 +49,7 @@ def test_blocks_are_the_whole_bit_for_bit(name: str, block_size: int) -> None:
         assert block.board_stamp_ns[-1] <= block.accel_stamp_ns[-1]
 
 
-def test_same_seed_same_bits_other_seed_other_bits(unit: UnitModel) -> None:
+def test_same_seed_same_bits_other_seed_other_bits(unit):
     first, again, other = (simulate(unit, SHORT, UP, seed=seed) for seed in (5, 5, 6))
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(first, column), getattr(again, column))
@@ -62,7 +58,7 @@ def test_same_seed_same_bits_other_seed_other_bits(unit: UnitModel) -> None:
     assert np.any(first.case != other.case)
 
 
-def test_stamps_are_the_ends_of_the_cycles(unit: UnitModel) -> None:
+def test_stamps_are_the_ends_of_the_cycles(unit):
     run = simulate(unit, SHORT, UP, rate_hz=300.0)
     assert len(run.counts) == SHORT.duration_s * 300
     assert run.accel_stamp_ns[0] == START_NS + 3_333_333
@@ -72,7 +68,7 @@ def test_stamps_are_the_ends_of_the_cycles(unit: UnitModel) -> None:
     )
 
 
-def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None:
+def test_an_error_source_more_leaves_the_others_numbers(unit):
     """
     Noise of the thermometer does not change the rest; a drifting bias is added to the same noise.
     """
@@ -90,7 +86,7 @@ def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
-def test_counts_follow_the_truth(unit: UnitModel) -> None:
+def test_counts_follow_the_truth(unit):
     """
     Without noise the running sum of the counts equals that of ``bias + K scale inverse(M) f``.
     """
@@ -103,7 +99,7 @@ def test_counts_follow_the_truth(unit: UnitModel) -> None:
     assert np.linalg.norm(truth.specific_force) == pytest.approx(STANDARD_GRAVITY)
 
 
-def test_white_noise_has_its_density(unit: UnitModel) -> None:
+def test_white_noise_has_its_density(unit):
     """
     Second route: Welch's spectrum is flat at ``2 density^2`` (one-sided), and the scatter of
     60 s means is ``density / sqrt(60)``.
@@ -126,7 +122,7 @@ def test_white_noise_has_its_density(unit: UnitModel) -> None:
 
 
 @pytest.mark.parametrize('quantum', [0.0625, 1.0])
-def test_quantised_readings_lie_on_the_lattice(unit: UnitModel, quantum: float) -> None:
+def test_quantised_readings_lie_on_the_lattice(unit, quantum):
     coarse = simulate(unit.with_thermometers(quantum=quantum), DEMO, UP, rate_hz=1.0)
     fine = simulate(unit, DEMO, UP, rate_hz=1.0)
     np.testing.assert_array_equal(coarse.board % quantum, 0.0)
@@ -135,7 +131,7 @@ def test_quantised_readings_lie_on_the_lattice(unit: UnitModel, quantum: float) 
 
 
 @pytest.mark.parametrize('rate_hz', [0.1, 0.7, 10.0])
-def test_thermometers_have_their_rate_and_noise(unit: UnitModel, rate_hz: float) -> None:
+def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
     run = simulate(unit, DEMO, UP, rate_hz=1.0, temperature_rate_hz=rate_hz)
     np.testing.assert_allclose(np.diff(run.case_stamp_ns) * 1e-9, 1.0 / rate_hz, atol=2e-9)
     assert run.case_stamp_ns[0] == START_NS
@@ -153,7 +149,7 @@ def test_thermometers_have_their_rate_and_noise(unit: UnitModel, rate_hz: float)
 @pytest.mark.parametrize(
     ('n', 'least'), [(6, 0.0), (9, 0.4), (12, 0.6), (18, 0.7), (24, 0.8), (26, 1.2), (40, 2.0)]
 )
-def test_positions_tell_the_nine_terms_apart(n: int, least: float) -> None:
+def test_positions_tell_the_nine_terms_apart(n, least):
     """
     Six faces determine the products of axes only by their tilts of a few degrees; nine and more
     positions determine all terms of a quadric (bias, scale, misalignment).
@@ -168,7 +164,7 @@ def test_positions_tell_the_nine_terms_apart(n: int, least: float) -> None:
     assert np.abs(up.sum(axis=0)).max() < 0.1 * n
 
 
-def test_run_refuses_what_cannot_be(unit: UnitModel) -> None:
+def test_run_refuses_what_cannot_be(unit):
     with pytest.raises(ValueError, match='`rate_hz` must be positive, got 0'):
         simulate(unit, SHORT, UP, rate_hz=0.0)
     with pytest.raises(ValueError, match='`temperature_rate_hz` must be positive, got 0'):

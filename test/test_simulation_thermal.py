@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thermal network against cases solved by hand, an integrator and its heat balance."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -21,13 +18,11 @@ from thermo_comp.simulation.presets import UNIT_NAMES, unit_preset
 ROUNDING = 1e-9
 
 
-def response_of(
-    network: ThermalNetwork, time: Sequence[float], air: Sequence[float]
-) -> ThermalResponse:
+def response_of(network, time, air):
     return ThermalResponse(network, np.array(time), np.array(air))
 
 
-def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
+def test_two_parts_follow_a_ramp_as_solved_by_hand():
     """
     Air - case - board with heat flow back: eigenvalues from the quadratic formula, lags from the
     heat balance of an endless ramp, amplitudes from the start at rest.
@@ -52,7 +47,7 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand() -> None:
 
 
 @pytest.mark.parametrize('name', [*UNIT_NAMES, *TRIAD_NAMES])
-def test_presets_agree_with_a_numerical_integrator(name: str) -> None:
+def test_presets_agree_with_a_numerical_integrator(name):
     unit = unit_of(name, 3)
     program = parse_cyclogram('demo')
     response = response_of(unit.network, program.time_s, program.temperature_c)
@@ -61,7 +56,7 @@ def test_presets_agree_with_a_numerical_integrator(name: str) -> None:
     time = np.linspace(0.0, program.duration_s, 200)
     states = response.states(time)
 
-    def air(t: float) -> float:
+    def air(t):
         return float(np.interp(t, program.time_s, program.temperature_c))
 
     solved = solve_ivp(
@@ -73,7 +68,7 @@ def test_presets_agree_with_a_numerical_integrator(name: str) -> None:
     np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
 
 
-def test_creep_relaxes_towards_its_part() -> None:
+def test_creep_relaxes_towards_its_part():
     """The creep after a step of a part lags it by its time constant."""
     step = np.full((7201, 1), 10.0)
     step[0] = 0.0
@@ -84,7 +79,7 @@ def test_creep_relaxes_towards_its_part() -> None:
     np.testing.assert_array_equal(scale, 0.0)
 
 
-def test_still_state_obeys_the_heat_balance() -> None:
+def test_still_state_obeys_the_heat_balance():
     """In the steady state all power leaves through the path to the air."""
     unit = unit_preset('bare-quartz', 5)
     warm = unit.network.equilibrium(12.0)
@@ -103,7 +98,7 @@ def test_still_state_obeys_the_heat_balance() -> None:
     )
 
 
-def test_thermostat_holds_its_part_and_spends_what_leaks() -> None:
+def test_thermostat_holds_its_part_and_spends_what_leaks():
     unit = unit_preset('thermostatted', 2)
     network = unit.network
     heat = network.thermostat
@@ -125,7 +120,7 @@ def test_thermostat_holds_its_part_and_spends_what_leaks() -> None:
     assert np.ptp(response.temperatures(grid)[:, head]) < 0.2
 
 
-def test_an_oven_refuses_air_that_it_cannot_hold_off() -> None:
+def test_an_oven_refuses_air_that_it_cannot_hold_off():
     network = unit_preset('thermostatted', 0).network
     with pytest.raises(ValueError, match=r'air of 5\.\.90 degC needs -.* W of a thermostat'):
         response_of(network, [0.0, 60.0], [5.0, 90.0])

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The generators of benchmarks/strangers.py against closed forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -39,7 +37,7 @@ def ramp(given, rate, hours, environment=CHAMBER):
     return at, integrate(A, b, h, rate * at, 10.0, np.linalg.solve(A, -h))
 
 
-def test_a_node_lags_a_ramp_by_its_time_constant() -> None:
+def test_a_node_lags_a_ramp_by_its_time_constant():
     # After many time constants x' = (u - x) / tau leaves u - x = rate * tau.
     lags = np.array([500.0, 900.0, 1500.0])
     given = unit(board_s=700.0, part_s=lags)
@@ -49,7 +47,7 @@ def test_a_node_lags_a_ramp_by_its_time_constant() -> None:
     assert board - states[-1, PARTS] == pytest.approx(0.01 * lags, rel=1e-6)
 
 
-def test_the_integration_is_exact_on_the_way() -> None:
+def test_the_integration_is_exact_on_the_way():
     # One lag behind a ramp from rest: u - x = rate * tau * (1 - exp(-t / tau)).
     A, b, h = np.array([[-1 / 300.0]]), np.array([1 / 300.0]), np.zeros(1)
     at = np.arange(0.0, 1500.0, 5.0)
@@ -58,14 +56,14 @@ def test_the_integration_is_exact_on_the_way() -> None:
     assert behind == pytest.approx(3.0 * (1.0 - np.exp(-at / 300.0)), abs=1e-12)
 
 
-def test_own_heat_warms_the_board_above_the_case() -> None:
+def test_own_heat_warms_the_board_above_the_case():
     A, b, h = network(unit(heat_k=1.5, part_s=np.full(3, 900.0)))
     at_rest = np.linalg.solve(A, -b * 20.0 - h)
     assert at_rest[BOARD] - at_rest[CASE] == pytest.approx(1.5)
     assert at_rest[PARTS] == pytest.approx([at_rest[BOARD]] * 3)
 
 
-def test_still_air_is_another_law_of_the_hidden_node() -> None:
+def test_still_air_is_another_law_of_the_hidden_node():
     # In still air the hidden node has another temperature between case and board than in the
     # chamber, so that a prediction from the board in the chamber is wrong outside.
     shares = []
@@ -76,7 +74,7 @@ def test_still_air_is_another_law_of_the_hidden_node() -> None:
     assert abs(shares[1] - shares[0]) > 0.3
 
 
-def test_noise_bias_scale_and_misalignment_follow_their_definition() -> None:
+def test_noise_bias_scale_and_misalignment_follow_their_definition():
     # corrected = M (measured - bias) / scale must give the force, except for white noise.
     given = unit(
         bias=np.array([100.0, -200.0, 300.0]), gain=np.array([0.01, -0.02, 0.03]),
@@ -94,7 +92,7 @@ def test_noise_bias_scale_and_misalignment_follow_their_definition() -> None:
     assert error.std(axis=0) == pytest.approx([sd] * 3, rel=0.03 + 4.0 / np.sqrt(2 * n))
 
 
-def test_a_support_tilts_with_the_square_of_temperature() -> None:
+def test_a_support_tilts_with_the_square_of_temperature():
     axis = np.array([1e-6, 0.0, 0.0])
     bag = record(unit(), program(20, 10, (35, 1, 60)), LEVEL, rng_of('tilt'), tilt=axis)
     case = np.interp(bag.time_s - 1.0, *bag.temperatures['case'])
@@ -105,7 +103,7 @@ def test_a_support_tilts_with_the_square_of_temperature() -> None:
     assert np.linalg.norm(bag.force, axis=1) == pytest.approx(GRAVITY)
 
 
-def test_cold_start_is_as_cold_as_the_air_and_then_warms_up() -> None:
+def test_cold_start_is_as_cold_as_the_air_and_then_warms_up():
     given = unit(heat_k=2.0)
     cold = record(given, cases.FROST, LEVEL, rng_of('cold'), is_cold=True)
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
@@ -116,14 +114,14 @@ def test_cold_start_is_as_cold_as_the_air_and_then_warms_up() -> None:
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
-def test_a_carry_on_loses_no_part_of_a_count() -> None:
+def test_a_carry_on_loses_no_part_of_a_count():
     words = np.full((1000, 3), 0.3)
     kept, lost = (quantised(words, carries) for carries in (True, False))
     assert np.abs(np.cumsum(kept, axis=0) - np.cumsum(words, axis=0)).max() <= 0.5
     assert not lost.any()
 
 
-def test_attitudes_are_unit_vectors_far_from_each_other() -> None:
+def test_attitudes_are_unit_vectors_far_from_each_other():
     up = spread(18, rng_of('spread'))
     cosine = up @ up.T - np.eye(18)
     assert np.linalg.norm(up, axis=1) == pytest.approx(1.0)
@@ -148,7 +146,7 @@ def recorded(monkeypatch):
 
 
 @pytest.mark.parametrize('case', sorted(cases.CASES))
-def test_held_out_bags_take_no_part_in_the_fit(case: str, recorded) -> None:
+def test_held_out_bags_take_no_part_in_the_fit(case, recorded):
     labels = []
     for study in cases.CASES[case][0](1):
         labels.append(study.label)
@@ -164,7 +162,7 @@ def test_held_out_bags_take_no_part_in_the_fit(case: str, recorded) -> None:
     assert len(set(labels)) == len(labels)
 
 
-def test_turn_on_draws_its_positions_and_its_shifts(recorded) -> None:
+def test_turn_on_draws_its_positions_and_its_shifts(recorded):
     found = {}
     for number in range(1, 9):
         for study in cases.turn_on(number):
@@ -178,7 +176,7 @@ def test_turn_on_draws_its_positions_and_its_shifts(recorded) -> None:
         assert np.std(shifts) == pytest.approx(sd, rel=5.0 / np.sqrt(2 * n), abs=1e-12)
 
 
-def test_the_bound_falls_with_noise_and_with_data() -> None:
+def test_the_bound_falls_with_noise_and_with_data():
     rng = rng_of('bound')
     given = cases.navigation(rng, part_s=np.zeros(3))
     up = spread(12, rng)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The judge of benchmarks/strangers.py, and the curves drawn by hand, against closed forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -41,7 +39,7 @@ def curved_unit():
     )  # fmt: skip
 
 
-def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not() -> None:
+def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
     given = curved_unit()
     fit, held = (
         of_attitudes(given, np.linspace(5, 35, 7)),
@@ -56,7 +54,7 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not() -> None:
     assert constants.vector > 50.0
 
 
-def test_constants_by_hand_keep_the_scale_of_few_attitudes() -> None:
+def test_constants_by_hand_keep_the_scale_of_few_attitudes():
     # One attitude and much scatter: the best fit is a scale that makes all forces equal.
     rng = rng_of('few')
     samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
@@ -65,7 +63,7 @@ def test_constants_by_hand_keep_the_scale_of_few_attitudes() -> None:
     assert force.std(axis=0) == pytest.approx(samples.std(axis=0), rel=0.4)
 
 
-def test_a_bias_at_the_reference_is_held_against_its_bound() -> None:
+def test_a_bias_at_the_reference_is_held_against_its_bound():
     # A calibration in counts whose bias is wrong by 1 count, 1 / 300 m/s^2, on x.
     bias = np.array([0.1, -0.2, 0.3])
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
@@ -80,7 +78,7 @@ def test_a_bias_at_the_reference_is_held_against_its_bound() -> None:
     assert found.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
 
 
-def test_a_cubic_by_hand_finds_a_pose_s_drift() -> None:
+def test_a_cubic_by_hand_finds_a_pose_s_drift():
     given = replace(curved_unit(), scale_curve=ZEROS)
     minutes_ = [
         of_attitudes(given, board) for board in (np.linspace(5, 35, 31), np.array([9.0, 22]))
@@ -94,7 +92,7 @@ def test_a_cubic_by_hand_finds_a_pose_s_drift() -> None:
     assert error.vector < 1e-6
 
 
-def test_minutes_are_means_of_whole_minutes() -> None:
+def test_minutes_are_means_of_whole_minutes():
     time_s = np.arange(1.0, 151.0)
     samples = np.repeat(time_s[:, None], 3, axis=1)
     mean = minutes(Bag('', time_s, samples, {'board': (time_s, 2.0 * time_s)}))
@@ -103,7 +101,7 @@ def test_minutes_are_means_of_whole_minutes() -> None:
     assert np.isnan(mean.force).all()
 
 
-def test_a_ratio_is_1_where_errors_are_as_claimed() -> None:
+def test_a_ratio_is_1_where_errors_are_as_claimed():
     rng = rng_of('ratio')
     n = 20000
     truth = np.broadcast_to(GRAVITY * LEVEL, (n, 3))
@@ -117,7 +115,7 @@ def test_a_ratio_is_1_where_errors_are_as_claimed() -> None:
     assert found.claim == pytest.approx(found.vector, rel=0.02)
 
 
-def test_a_claim_of_a_minute_is_the_noise_of_its_mean() -> None:
+def test_a_claim_of_a_minute_is_the_noise_of_its_mean():
     # The calibration of the tests only claims white noise and the rounding of counts.
     samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
     samples[::2] += 1.0
@@ -129,7 +127,7 @@ def test_a_claim_of_a_minute_is_the_noise_of_its_mean() -> None:
     assert out.force == pytest.approx(np.tile(GRAVITY * LEVEL, (5, 1)))
 
 
-def test_minutes_that_are_not_published_may_be_few() -> None:
+def test_minutes_that_are_not_published_may_be_few():
     truth = np.broadcast_to(GRAVITY * LEVEL, (100, 3))
     force = truth + UG
     claim = np.broadcast_to(UG**2 * np.eye(3), (100, 3, 3))
@@ -140,7 +138,7 @@ def test_minutes_that_are_not_published_may_be_few() -> None:
         assert found.ratio == pytest.approx(expected)
 
 
-def test_a_row_says_what_it_misses_and_nothing_else() -> None:
+def test_a_row_says_what_it_misses_and_nothing_else():
     baselines = {'cubic': Score(50.0, 100.0), 'constants': Score(40.0, 200.0)}
 
     def missed(fit, title='ageing'):
@@ -155,12 +153,12 @@ def test_a_row_says_what_it_misses_and_nothing_else() -> None:
     assert missed(Score(13.0, 90.0, 1.0, 1.0, 90.0), 'kink') == ['norm 13 > 12']
 
 
-def test_a_fit_that_refuses_its_bags_misses() -> None:
+def test_a_fit_that_refuses_its_bags_misses():
     [row] = rows_of([Result('ageing', 1, {'cubic': Score(1.0, 1.0)}, refused='no rest')])
     assert misses(row, [row]) == ['refused']
 
 
-def test_more_data_is_held_against_the_row_without_it() -> None:
+def test_more_data_is_held_against_the_row_without_it():
     rows = rows_of(
         [
             Result(
@@ -173,7 +171,7 @@ def test_more_data_is_held_against_the_row_without_it() -> None:
     assert misses(rows[1], rows) == ['vector / alone: its attitude 0.75 > 0.5']
 
 
-def test_units_of_a_row_join_by_their_mean_square() -> None:
+def test_units_of_a_row_join_by_their_mean_square():
     [row] = rows_of(
         [
             Result('ageing', unit, {'fit': Score(norm, 1.0, 1.0, ratio, 1.0)}, fit_s=unit)
@@ -185,14 +183,14 @@ def test_units_of_a_row_join_by_their_mean_square() -> None:
 
 
 @pytest.mark.parametrize('name', ['units', 'cases', 'baselines', 'limits'])
-def test_generators_and_judge_share_no_code_with_the_package(name: str) -> None:
+def test_generators_and_judge_share_no_code_with_the_package(name):
     source = (ROOT / 'benchmarks' / f'strangers_{name}.py').read_text(encoding='utf-8')
     imports = [line for line in source.splitlines() if 'import ' in line]
     assert imports
     assert not [line for line in imports if 'thermo_comp' in line]
 
 
-def test_each_case_has_a_limit_and_each_limit_a_case() -> None:
+def test_each_case_has_a_limit_and_each_limit_a_case():
     names = (*strangers.RECORDED, *cases.CASES)
     assert all(any(key.startswith(name) for key in LIMITS) for name in names)
     assert all(any(key.startswith(name) for name in names) for key in LIMITS)
@@ -207,14 +205,14 @@ def carried_bag():
     return Bag('day', time_s, force, {'board': (time_s, np.full(len(time_s), 20.0))})
 
 
-def test_rests_of_a_recording_are_its_long_stays() -> None:
+def test_rests_of_a_recording_are_its_long_stays():
     rows = rests_of(carried_bag())
     # Without a minute at each end.
     expected = [(60, 17940), (18060, 35940), (36180, 86340)]
     assert [(rest.start, rest.stop) for rest in rows] == expected
 
 
-def test_blocks_go_by_the_clock_and_share_no_sample() -> None:
+def test_blocks_go_by_the_clock_and_share_no_sample():
     bag = carried_bag()
     blocks = blocks_of(part(bag, slice(9000, 86400), 'rest'), 'rest')
     assert list(blocks) == list(range(8))
