@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
+import soak
 from fault_bench import bench
 from fault_rig import RATE_HZ, START_NS, bag, corrected, force_at, seconds_of, unit
 
@@ -200,3 +201,15 @@ def test_a_signal_while_samples_flow(path, number):
         assert node.process.said == ''
         node.is_ended = True
     assert sigmas(heard) < SIGMAS
+
+
+def test_slope_and_its_error(rng):
+    time = np.arange(3600.0)
+    values = 100.0 + 7.0 * time / 3600.0 + rng.standard_normal(3600)
+    # The start is not counted.
+    values[:300] += 50.0
+    slope, sd = soak.slope(list(zip(time.tolist(), values.tolist(), strict=True)), 60.0)
+    # Sd of a mean of 60, divided by sqrt(sum of squared hours) of 54 windows over 0.9 h.
+    assert sd == pytest.approx(1.0 / 60**0.5 / (54 * 0.9**2 / 12) ** 0.5, rel=0.3)
+    assert abs(slope - 7.0) < 4.0 * sd
+    assert soak.slope([(0.0, 1.0), (1.0, 1.0)], 60.0) is None

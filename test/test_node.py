@@ -15,7 +15,18 @@ from builders import calibration, rich_calibration, thermal_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_helpers import DEEP, SECOND_NS, drive, node_in_thread, stamp_of, stamped, standing
+from ros_helpers import (
+    CYCLE_NS,
+    DEEP,
+    SECOND_NS,
+    START_NS,
+    drive,
+    node_arguments,
+    node_in_thread,
+    stamp_of,
+    stamped,
+    standing,
+)
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
@@ -25,8 +36,6 @@ from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.nonlinearity import Nonlinearity
 
-START_NS = 1_767_225_600 * SECOND_NS
-CYCLE_NS = 10_000_000
 BEST_EFFORT = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -39,10 +48,8 @@ def saved(tmp_path):
     """Write a calibration and return the ROS arguments of a node with it."""
 
     def save(of, *overrides):
-        path = tmp_path / 'unit.yaml'
-        save_calibration(of, path)
-        words = [f'calibration_file:={path}', 'diagnostics_period:=0.05', *overrides]
-        return [word for override in words for word in ('-p', override)]
+        save_calibration(of, tmp_path / 'unit.yaml')
+        return node_arguments(tmp_path / 'unit.yaml', *overrides)
 
     return save
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from accuracy import corrected_by_truth
-from simulation_helpers import of_part, rates_k_min
+from simulation_helpers import of_part
 from triads import TRIAD_NAMES, SlipEffect, triad
 
 from thermo_comp.simulation.campaign import PLAN_NAMES, Position, parse_cyclogram, plan
@@ -131,14 +131,6 @@ def test_a_switched_load_heats_its_part():
     # 0.5 W through 0.4 W/K to the case and about 4 W/K to the air.
     to_air = next(link.conductance for link in unit.network.links if link.a == 'air')
     assert warmer[-1] == pytest.approx(0.5 / 0.4 + 0.5 / to_air, rel=1e-6)
-
-
-def test_paper_covers_its_range_in_ramps_and_soaks():
-    program = parse_cyclogram('paper')
-    assert min(program.temperature_c) == 5.0
-    assert max(program.temperature_c) == 35.0
-    ramps = rates_k_min(program)[rates_k_min(program) != 0.0]
-    np.testing.assert_allclose(np.abs(ramps), 0.5)
 
 
 def test_a_typed_program_is_read_as_written():
