@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders import (
+    GRAVITY,
     SECOND_NS,
     axis_set,
     calibration,
@@ -62,6 +63,17 @@ def assert_same(blocks, rows, index):
     np.testing.assert_array_equal(variance, rows[:, 12:])
     matrices = covariance.reshape(-1, 3, 3)
     np.testing.assert_array_equal(matrices, matrices.transpose(0, 2, 1))
+
+
+def test_signed_counts_and_the_printed_equations():
+    # Signed counts of +g and -g: the offset is half their sum, the scale is of half their
+    # difference. Eq. (3) and (4) as printed exchange the two.
+    plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
+    axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
+    compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
+    warm(compensator)
+    found = compensator.process(1, plus, minus, 12.0)[:3]
+    assert found == pytest.approx((GRAVITY, -GRAVITY, 0.0), abs=1e-12)
 
 
 def test_every_term_by_hand():

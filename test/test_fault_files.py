@@ -135,14 +135,16 @@ sys.exit(main())
 """
 
 
+def run(script, *arguments, cwd):
+    command = [sys.executable, '-c', script, *arguments]
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, check=False)
+
+
 @pytest.mark.parametrize(
     ('name', 'point'),
-    [
-        ('unit.yaml', 'before'),
-        ('page.html', 'before'),
-        ('bag.mcap', 'writing'),
-        ('bag.mcap', 'before'),
-    ],
+    [(name, 'before') for name in ('unit.yaml', 'page.html', 'bag.mcap')]
+    + [('bag.mcap', 'writing')],
 )
 def test_a_killed_command_leaves_the_old_file(folder, name, point):
     output = folder / name
@@ -151,10 +153,7 @@ def test_a_killed_command_leaves_the_old_file(folder, name, point):
     old = output.read_bytes()
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS[name][0]]
-    killed = subprocess.run(
-        [sys.executable, '-c', KILLED, point, name, *arguments, name], cwd=folder,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)}, capture_output=True, check=False,
-    )  # fmt: skip
+    killed = run(KILLED, point, name, *arguments, name, cwd=folder)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert output.read_bytes() == old
     (rest,) = set(folder.iterdir()) - listed
@@ -177,10 +176,7 @@ def test_a_command_that_is_asked_to_end_leaves_nothing(folder, name):
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]
     script = KILLED.replace('SIGKILL', 'SIGTERM')
-    ended = subprocess.run(
-        [sys.executable, '-c', script, 'writing', name, *arguments, name], cwd=folder,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)}, capture_output=True, check=False,
-    )  # fmt: skip
+    ended = run(script, 'writing', name, *arguments, name, cwd=folder)
     assert (ended.returncode, ended.stderr) == (143, b'')
     assert set(folder.iterdir()) == listed
 
