@@ -55,15 +55,13 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 #: The longest files first: parallel workers begin with them, so that no worker is left with a long
 #: one at the end (`make test` keeps this order).
 _LONG = (
-    *('real_data', 'cli_help', 'fitting', 'faults', 'fault_process', 'priors', 'fault_files'),
-    *('cli_demo', 'gyroscope', 'degenerate', 'fitting_selection', 'fleet_run', 'record'),
-    *('regime', 'drivers', 'few_positions', 'fitting_closing', 'properties', 'judging'),
-    *('node_parity', 'node_defence', 'report', 'compensator', 'allow', 'replay', 'attacks'),
-    *('fitting_regression', 'fitting_change', 'fitting_windows', 'docs', 'node_startup'),
-    *('report_certificate', 'fleet_unit', 'acquisition', 'third_thermometer', 'api', 'player'),
-    *('middleware', 'correction', 'plausibility', 'node_sources', 'recording_read', 'soak'),
-    *('node_reload', 'cli', 'recording_damage', 'node', 'cli_errors', 'ins', 'sample_checks'),
-    *('files', 'fleet_storage', 'calibration', 'readme', 'recording_walk', 'recording_write'),
+    *('fleet_run', 'cli_help', 'real_data', 'fitting', 'record', 'faults', 'fitting_selection'),
+    *('priors', 'regime', 'docs', 'degenerate', 'gyroscope', 'cli_demo', 'few_positions'),
+    *('report', 'fault_process', 'fault_files', 'attacks', 'allow', 'replay', 'node_defence'),
+    *('drivers', 'fleet_unit', 'node_startup', 'fitting_closing', 'fitting_windows', 'readme'),
+    *('compensator', 'report_certificate', 'acquisition', 'files', 'node_parity', 'middleware'),
+    *('fitting_change', 'fleet_storage', 'player', 'fit_api', 'report_figures', 'correction'),
+    *('node_sources', 'fitting_regression', 'judging_history', 'api', 'third_thermometer'),
 )
 
 

@@ -53,7 +53,7 @@ def recorded(rng, up, name, targets):
 
 def test_what_a_change_does_is_found_about_rest(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
-    bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(6, 3))]
+    bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
     # Two readings of 3 mK a minute for about twenty hours: 0.1 mK, and rates of minutes.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
@@ -73,6 +73,6 @@ def test_what_a_change_does_is_found_about_rest(rng):
 
 
 def test_what_is_forced_takes_part_beside_the_groups_that_may(rng):
-    bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(6, 3))]
+    bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(3, 3))]
     options = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), forced=('gradient',))
     assert {column.group for column in fit(bags, options).calibration.response} == {'gradient'}
