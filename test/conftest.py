@@ -78,6 +78,12 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+def ran(*command, check=False, **keys):
+    """Run a program in the folder of the project; return what it printed."""
+    words = [*map(str, command)]
+    return subprocess.run(words, cwd=ROOT, check=check, capture_output=True, text=True, **keys)
+
+
 def parsed(text):
     """Parse JSON printed by a command: it must be one object, without NaN, which is not JSON."""
 

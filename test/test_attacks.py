@@ -7,13 +7,13 @@ Attacks on the surroundings of the core: clocks, rates, many clients, links, ful
 import itertools
 import random
 import signal
-import subprocess
 import sys
 import threading
 
 import numpy as np
 import pytest
 from builders import calibration
+from conftest import ran
 
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
@@ -207,12 +207,7 @@ def test_a_calibration_killed_at_any_line_of_its_writing_is_the_old_or_the_new(t
     for path, serial in ((old, 'old'), (new, 'new'), (target, 'old')):
         save_calibration(calibration(unit=Unit(serial, 'counts', 32767.0, 0.01)), path)
     script = SAVING.replace(', at = load', ' = load').replace(', int(sys.argv[3])', '')
-    done = subprocess.run(
-        [sys.executable, '-c', script, new, target, old],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = ran(sys.executable, '-c', script, new, target, old, check=True)
     lines = [line.split() for line in done.stdout.splitlines()]
     *killed, last = lines
     assert last == ['0', 'new']

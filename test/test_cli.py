@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import typer
 from builders import rich_calibration
-from conftest import parsed
+from conftest import parsed, ran
 
 from thermo_comp.cli import output
 from thermo_comp.cli.app import split_arguments
@@ -60,10 +60,7 @@ class TestOutput:
 
     def test_a_reader_that_has_seen_enough_is_no_error(self, bag):
         command = f'{sys.executable} -m thermo_comp info {bag} | head -n 1'
-        finished = subprocess.run(
-            ['bash', '-c', f'set -o pipefail; {command}'], cwd=ROOT, capture_output=True,
-            text=True, check=False,
-        )  # fmt: skip
+        finished = ran('bash', '-c', f'set -o pipefail; {command}')
         assert finished.stderr == ''
         assert len(finished.stdout.splitlines()) == 1
 
@@ -88,10 +85,7 @@ def test_a_command_computes_in_one_thread():
     )
     for wanted, said in (({}, '1'), ({'OPENBLAS_NUM_THREADS': '3'}, '3')):
         environment = {k: v for k, v in os.environ.items() if k != 'OPENBLAS_NUM_THREADS'}
-        finished = subprocess.run(
-            [sys.executable, '-c', code], cwd=ROOT, env={**environment, **wanted},
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
+        finished = ran(sys.executable, '-c', code, env={**environment, **wanted}, check=True)
         assert finished.stdout.split() == ['False', said]
 
 

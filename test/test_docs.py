@@ -7,13 +7,12 @@ import io
 import json
 import re
 import shutil
-import subprocess
 import sys
 
 import matplotlib as mpl
 import pytest
 import yaml
-from conftest import ROOT, parsed
+from conftest import ROOT, parsed, ran
 from matplotlib import pyplot as plt
 from readme_helpers import is_alike
 
@@ -66,15 +65,13 @@ def test_there_are_commands_to_run():
     assert {page for page, _, _ in COMMANDS} >= {'README.md', 'integration.md', 'recording.md'}
 
 
-def test_completion_is_a_script_that_bash_takes(root):
+def test_completion_is_a_script_that_bash_takes():
     bash = shutil.which('bash')
     if bash is None:
         pytest.skip('no bash')
     # The program looks for the shell that started it; the `:` keeps that shell waiting.
-    finished = subprocess.run(
-        [bash, '-c', f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'],
-        cwd=root, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    words = f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'
+    finished = ran(bash, '-c', words)
     assert (finished.returncode, finished.stderr) == (0, '')
     assert 'thermo_comp' in finished.stdout
 
@@ -93,10 +90,8 @@ def test_every_page_is_in_the_site_s_menu():
 def test_the_site_builds_without_a_warning(tmp_path):
     for module in ('material', 'mkdocstrings', 'mkdocs_jupyter'):
         pytest.importorskip(module, reason=f'{module} is not installed: the extra `docs`')
-    finished = subprocess.run(
-        [sys.executable, '-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path / 'site'],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    words = ('-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path / 'site')
+    finished = ran(sys.executable, *words)
     assert finished.returncode == 0, finished.stderr
     assert (tmp_path / 'site' / 'index.html').is_file()
 

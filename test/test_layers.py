@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 import ast
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
 
 import pytest
+from conftest import ran
 
 PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
 
@@ -169,11 +169,7 @@ def test_no_circle(by):
 def loaded_after(statement, *watched):
     """Return which of the watched modules a new interpreter has imported after one statement."""
     code = f'{statement}\nimport sys\nprint(*[m for m in {watched!r} if m in sys.modules])'
-    finished = subprocess.run(
-        [sys.executable, '-c', code], cwd=PACKAGE.parent, capture_output=True, text=True,
-        check=True, timeout=120,
-    )  # fmt: skip
-    return finished.stdout.split()
+    return ran(sys.executable, '-c', code, check=True, timeout=120).stdout.split()
 
 
 def test_node_starts_without_the_offline_libraries():

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from conftest import ran
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
@@ -106,10 +107,7 @@ def test_closed_streams_are_no_signal(unit):
 @pytest.mark.parametrize(('sink', 'code'), [('> /dev/full', 1), ('| true', 0)])
 def test_help_that_cannot_be_written(sink, code):
     words = f'set -o pipefail; "{sys.executable}" -m thermo_comp.ros.node --help {sink}'
-    root = Path(__file__).parents[1]
-    finished = subprocess.run(
-        ['bash', '-c', words], cwd=root, capture_output=True, text=True, check=False
-    )
+    finished = ran('bash', '-c', words)
     assert finished.returncode == code
     assert 'Traceback' not in finished.stderr
 
@@ -131,9 +129,7 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path,
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
     check = f'from importlib.util import find_spec\nfor name in {ABSENT!r}:\n'
     check += '    try: find_spec(name)\n    except ModuleNotFoundError: print(name)'
-    finished = subprocess.run(
-        [sys.executable, '-c', check], capture_output=True, text=True, check=False
-    )
+    finished = ran(sys.executable, '-c', check)
     assert tuple(finished.stdout.split()) == ABSENT
     peer = Peer()
     heard = peer.listen(Imu, 'imu/data_raw')
@@ -156,10 +152,7 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path,
         assert node.stop() == 0
         assert 'rror' not in node.said.replace('[ERROR]', '')
     peer.close()
-    finished = subprocess.run(
-        [sys.executable, '-m', 'thermo_comp', 'info', unit], cwd=Path(__file__).parents[1],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    finished = ran(sys.executable, '-m', 'thermo_comp', 'info', unit)
     assert finished.returncode == 1
     said = 'thermo_comp: error: the commands need typer: pip install thermo_comp\n'
     assert (finished.stdout, finished.stderr) == ('', said)

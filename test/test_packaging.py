@@ -5,13 +5,13 @@
 import ast
 import os
 import re
-import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
 import yaml
+from conftest import ran
 
 import thermo_comp
 
@@ -42,10 +42,7 @@ def setup_literals():
 def test_one_version():
     assert MANIFEST.findtext('version') == thermo_comp.__version__
     assert re.fullmatch(r'\d+\.\d+\.\d+', thermo_comp.__version__)
-    finished = subprocess.run(
-        [sys.executable, 'setup.py', '--version'], cwd=ROOT, capture_output=True, text=True,
-        check=True,
-    )  # fmt: skip
+    finished = ran(sys.executable, 'setup.py', '--version', check=True)
     assert finished.stdout.split()[-1] == thermo_comp.__version__
 
 
@@ -70,10 +67,8 @@ def test_licence_is_the_whole_apache_text():
 
 
 def tracked(*patterns):
-    listing = subprocess.run(
-        ['git', 'ls-files', '-z', '--', *patterns], cwd=ROOT, capture_output=True, check=False
-    )
-    names = [name for name in listing.stdout.decode().split('\0') if name]
+    listing = ran('git', 'ls-files', '-z', '--', *patterns)
+    names = [name for name in listing.stdout.split('\0') if name]
     if listing.returncode or not names:
         pytest.skip('not a git working tree: an installed or unpacked copy')
     return [ROOT / name for name in names if (ROOT / name).exists()]
@@ -120,13 +115,10 @@ def test_hosted_ci_does_what_the_readme_says():
 def test_share_holds_what_ros_looks_for(tmp_path):
     # colcon installs a package in this way: setup.py's install command into a prefix. Only the
     # data files are tested here, not scripts and code.
-    subprocess.run(
-        [
-            *(sys.executable, 'setup.py', '-q', 'build', '--build-base', tmp_path / 'build'),
-            *('install_data', '--install-dir', tmp_path / 'prefix'),
-        ],
-        cwd=ROOT, check=True, capture_output=True, env={**os.environ, 'PYTHONWARNINGS': 'ignore'},
-    )  # fmt: skip
+    words = (*('build', '--build-base', tmp_path / 'build'), 'install_data', '--install-dir')
+    environment = {**os.environ, 'PYTHONWARNINGS': 'ignore'}
+    command = (sys.executable, 'setup.py', '-q', *words, tmp_path / 'prefix')
+    ran(*command, check=True, env=environment)
     share = tmp_path / 'prefix' / 'share'
     assert (share / 'ament_index/resource_index/packages/thermo_comp').is_file()
     assert (share / 'thermo_comp/package.xml').is_file()

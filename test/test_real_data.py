@@ -7,13 +7,12 @@ Skipped with a reason if the recordings are absent.
 """
 
 import re
-import subprocess
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ran
 from recorded.data import GRAVITY, faces_bag, freezer_bag, handheld_bag
 from scipy.optimize import least_squares
 
@@ -166,8 +165,6 @@ def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
 
 def test_no_recording_is_in_the_project():
     # Only plots and numbers: no file of the project contains rows of the freezer run.
-    tracked = subprocess.run(
-        ['git', 'ls-files'], cwd=ROOT, capture_output=True, text=True, check=False, timeout=60
-    ).stdout.split()
+    tracked = ran('git', 'ls-files').stdout.split()
     names = ('temp-calibration.csv', 'mk_imu', 'annotated_session.csv')
     assert not [path for path in tracked if path.rsplit('/', 1)[-1].startswith(names)]
