@@ -156,7 +156,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path):
     save_calibration(fast, path)
     # Long enough for any machine; the loop ends with the last answer.
     events = bag(rate_hz=1000.0, duration_s=60.0)
-    n_reloads = 200
+    n_reloads = 100
     with bench(path) as node:
         answers, news = list[bool](), threading.Event()
         node.take()

@@ -27,7 +27,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000
 RATE_HZ = 2
-MINUTES = 30
+MINUTES = 24
 UNIT = Unit('T-1', 'counts', 32767.0, 1.0 / RATE_HZ)
 
 

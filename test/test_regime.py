@@ -132,7 +132,7 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
     ],
 )
 def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt, end_s):
-    found, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 4, dt=dt, end_s=end_s)
+    found, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in found:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
         # The slowest: steps of 1 K in a ramp of 0.2 K/min, two edges 5 min apart behind 15 min.
