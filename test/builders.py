@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the small calibrations and blocks for the tests of the core."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -41,16 +39,11 @@ def calibration(**keys):
     function.
     """
     values = {
-        'format_version': 2,
-        'unit': Unit('T-1', 'counts', 32767.0, 0.01),
-        'reference_temperature_c': 20.0,
-        'gravity_m_s2': GRAVITY,
-        'axes': Axes(*[AxisReference(300.0, 0.0)] * 3),
-        'static': regime_set(),
-        'dynamic': regime_set(),
-        'noise_density_m_s2_sqrt_hz': (1e-4, 1e-4, 1e-4),
-        **keys,
-    }
+        'format_version': 2, 'unit': Unit('T-1', 'counts', 32767.0, 0.01),
+        'reference_temperature_c': 20.0, 'gravity_m_s2': GRAVITY,
+        'axes': Axes(*[AxisReference(300.0, 0.0)] * 3), 'static': regime_set(),
+        'dynamic': regime_set(), 'noise_density_m_s2_sqrt_hz': (1e-4, 1e-4, 1e-4), **keys,
+    }  # fmt: skip
     return Calibration(**values)
 
 
@@ -81,25 +74,20 @@ def rich_calibration():
         static=regime_set(one(1, False), one(-1, False), one(1, False)),
         dynamic=regime_set(one(-1, True), one(1, True), one(-1, True)),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (-2e-3, 3e-4, 1.0)),
-        misalignment_sd=(1e-6, 1e-6, 2e-6),
-        slow_noise_m_s2_sqrt_h=(1e-5, 2e-5, 1e-5),
+        misalignment_sd=(1e-6, 1e-6, 2e-6), slow_noise_m_s2_sqrt_h=(1e-5, 2e-5, 1e-5),
         sensors=('case', 'frame'),
         response=(
             term('gradient', (0.5, -0.5, 0.5), (2e-5, 2e-5, 2e-5)),
             term('gradient', (0.1, 0.2, -0.1), (0.0, 1e-6, 0.0), sensor='frame', during='dynamic'),
             term(
-                'rate', (3.0, 3.0, -2.0), (1e-3, -1e-3, 1e-3), during='static', range=(-0.1, 0.1)
+                'rate', (3.0, 3.0, -2.0), (1e-3, -1e-3, 1e-3), during='static', range=(-0.1, 0.1),
             ),
             term('board', (0.1, 0.1, 0.2), (1e-6, 2e-6, 1e-6), tau_s=600.0),
             term('board', (-0.05, 0.02, 0.0), (2e-6, -2e-6, 2e-6), tau_s=2400.0),
             term('gradient_lag', (0.2, -0.1, 0.1), (1e-6, 0.0, -1e-6), tau_s=240.0),
             term('board', (1e-3, -2e-3, 1e-3), group='product', tau_s=600.0, power=1),
             term(
-                'gradient_even',
-                (0.3, 0.2, 0.1),
-                (1e-6,) * 3,
-                width_k=1.5,
-                power=1,
+                'gradient_even', (0.3, 0.2, 0.1), (1e-6,) * 3, width_k=1.5, power=1,
                 range=(0.0, 1.0),
             ),
             term('play', (0.1, 0.05, -0.1), (1e-6,) * 3, width_k=0.8, range=(-1.0, 1.0)),
@@ -107,7 +95,7 @@ def rich_calibration():
             term('bend', (0.1, 0.1, 0.2), knee_k=-3.0, range=(0.0, 40.0)),
             term('play', (0.1, -0.1, 0.1), width_k=1.6, tau_s=900.0, range=(-2.0, 2.0)),
         ),
-    )
+    )  # fmt: skip
     n = parameter_layout(value).n_parameters
     return replace(
         value,
@@ -134,15 +122,11 @@ def rich_gyroscope():
     )
     n = 3 * (2 + len(response)) + 2 * (2 + 1 + 2)
     return Gyroscope(
-        bias_rad_s=(0.02, -0.03, 0.01),
-        static=one(1.0),
-        dynamic=one(-2.0),
-        noise_density_rad_s_sqrt_hz=(1e-4, 2e-4, 1e-4),
-        slow_noise_rad_s_sqrt_h=(1e-6, 1e-6, 1e-6),
-        residual_sd_rad_s=(1e-5, 2e-5, 1e-5),
-        response=response,
+        bias_rad_s=(0.02, -0.03, 0.01), static=one(1.0), dynamic=one(-2.0),
+        noise_density_rad_s_sqrt_hz=(1e-4, 2e-4, 1e-4), slow_noise_rad_s_sqrt_h=(1e-6, 1e-6, 1e-6),
+        residual_sd_rad_s=(1e-5, 2e-5, 1e-5), response=response,
         posterior=posterior_of(1e-10 * np.eye(n) + np.full((n, n), 1e-12)),
-    )
+    )  # fmt: skip
 
 
 @dataclass
@@ -170,15 +154,33 @@ def columns_from_events(events):
         np.array([s for s, _ in accel], dtype=np.int64),
         np.array([v for _, v in accel], dtype=float).reshape(-1, 3),
         {
-            name: tuple(
-                np.array(column, dtype)
-                for column, dtype in zip(
-                    zip(*rows, strict=True), (np.int64, float, np.int64), strict=True
-                )
-            )
+            name: tuple(map(np.array, zip(*rows, strict=True), (np.int64, float, np.int64)))
             for name, rows in readings.items()
         },
     )
+
+
+def stream(compensator, events):
+    """
+    Run events one by one; return the rows and the indices of the published samples.
+
+    With a gyroscope a row also contains the rate, a thousandth of the sample.
+    """
+    rows, index = [], []
+    position = 0
+    for kind, stamp, value in events:
+        if kind == 'accel':
+            row = compensator.process(stamp, *map(float, value))
+            if row is not None:
+                if compensator.corrects_rate:
+                    rate = (1e-3 * float(component) for component in value)
+                    row = (*row, *compensator.correct_rate(stamp, *rate))
+                rows.append(row)
+                index.append(position)
+            position += 1
+        else:
+            compensator.push(kind, stamp, value)
+    return np.array(rows).reshape(-1, 15 if compensator.corrects_rate else 9), index
 
 
 @dataclass(frozen=True)
@@ -187,10 +189,10 @@ class ArrayBlock:
 
     accel_stamp_ns: np.ndarray
     accel: np.ndarray
-    board_stamp_ns: np.ndarray
-    board: np.ndarray
-    case_stamp_ns: np.ndarray
-    case: np.ndarray
+    board_stamp_ns: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    board: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    case_stamp_ns: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    case: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def temperatures(self):
@@ -199,3 +201,16 @@ class ArrayBlock:
             name: (stamp_ns, celsius, np.searchsorted(self.accel_stamp_ns, stamp_ns))
             for name, (stamp_ns, celsius) in own.items()
         }
+
+
+def source_of(*arrays, name='bag', **keys):
+    """Return a bag of one block, for a fit."""
+    from thermo_comp.fitting.sources import FitSource
+
+    return FitSource(name, lambda: [ArrayBlock(*arrays)], **keys)
+
+
+def arrays_of(run, every=1):
+    """Return the arrays of a simulated run for a block, with some of its readings."""
+    readings = (run.board_stamp_ns, run.board, run.case_stamp_ns, run.case)
+    return (run.accel_stamp_ns, run.counts.astype(float), *(one[::every] for one in readings))

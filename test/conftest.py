@@ -4,8 +4,6 @@
 Owns what all tests share: a DDS domain per test process, seeds, and the command line's fixtures.
 """
 
-from __future__ import annotations
-
 import fcntl
 import gc
 import hashlib
@@ -20,17 +18,12 @@ import sys
 import tempfile
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FunctionType
-from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 from hypothesis import settings
-
-if TYPE_CHECKING:
-    import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -62,35 +55,39 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 #: The longest files first: parallel workers begin with them, so that no worker is left with a long
 #: one at the end (`make test` keeps this order).
 _LONG = (
-    *('real_data', 'cli_help', 'fitting', 'faults', 'fault_process', 'priors', 'fault_files'),
-    *('cli_demo', 'gyroscope', 'degenerate', 'fitting_selection', 'fleet_run', 'record'),
-    *('regime', 'drivers', 'few_positions', 'fitting_closing', 'properties', 'judging'),
-    *('node_parity', 'node_defence', 'report', 'compensator', 'allow', 'replay', 'attacks'),
-    *('fitting_regression', 'fitting_change', 'fitting_windows', 'docs', 'node_startup'),
-    *('report_certificate', 'fleet_unit', 'acquisition', 'third_thermometer', 'api', 'player'),
-    *('middleware', 'correction', 'plausibility', 'node_sources', 'recording_read', 'soak'),
-    *('node_reload', 'cli', 'recording_damage', 'node', 'cli_errors', 'ins', 'sample_checks'),
-    *('files', 'fleet_storage', 'calibration', 'readme', 'recording_walk', 'recording_write'),
+    *('fleet_run', 'cli_help', 'real_data', 'fitting', 'record', 'faults', 'fitting_selection'),
+    *('priors', 'regime', 'docs', 'degenerate', 'gyroscope', 'cli_demo', 'few_positions'),
+    *('report', 'fault_process', 'fault_files', 'attacks', 'allow', 'replay', 'node_defence'),
+    *('drivers', 'fleet_unit', 'node_startup', 'fitting_closing', 'fitting_windows', 'readme'),
+    *('compensator', 'report_certificate', 'acquisition', 'files', 'node_parity', 'middleware'),
+    *('fitting_change', 'fleet_storage', 'player', 'fit_api', 'report_figures', 'correction'),
+    *('node_sources', 'fitting_regression', 'judging_history', 'api', 'third_thermometer'),
 )
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     rank = {f'test_{name}': place for place, name in enumerate(_LONG)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(_LONG)))
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish():
     """
     Exclude imported objects from garbage collection, which would otherwise scan them repeatedly.
     """
     gc.freeze()
 
 
-def parsed(text: str) -> dict[str, Any]:
+def ran(*command, check=False, **keys):
+    """Run a program in the folder of the project; return what it printed."""
+    words = [*map(str, command)]
+    return subprocess.run(words, cwd=ROOT, check=check, capture_output=True, text=True, **keys)
+
+
+def parsed(text):
     """Parse JSON printed by a command: it must be one object, without NaN, which is not JSON."""
 
-    def no_nan(text: str) -> None:
+    def no_nan(text):
         raise AssertionError(f'{text} is not JSON')
 
     data = json.loads(text, parse_constant=no_nan)
@@ -98,28 +95,20 @@ def parsed(text: str) -> dict[str, Any]:
     return data
 
 
-class Cli(Protocol):
-    """Run ``thermo_comp`` with arguments and return the finished process."""
-
-    def __call__(
-        self, *args: str | Path, code: int | None = 0, cwd: Path | None = None, **env: str
-    ) -> subprocess.CompletedProcess[str]: ...
-
-
 @pytest.fixture
-def rng() -> np.random.Generator:
+def rng():
     import numpy as np
 
     return np.random.default_rng(20161)
 
 
 @pytest.fixture(scope='session')
-def root() -> Path:
+def root():
     return ROOT
 
 
 @pytest.fixture(scope='session')
-def real_data() -> Path:
+def real_data():
     """Return the folder of real recordings, which this project may not distribute."""
     folder = Path(os.environ.get('THERMO_COMP_DATA', ROOT.parent / 'shared' / 'data'))
     if not folder.is_dir():
@@ -127,9 +116,7 @@ def real_data() -> Path:
     return folder
 
 
-def _checked(
-    finished: subprocess.CompletedProcess[str], code: int | None
-) -> subprocess.CompletedProcess[str]:
+def _checked(finished, code):
     assert 'Traceback' not in finished.stderr, finished.stderr
     if code is not None:
         assert finished.returncode == code, finished.stderr + finished.stdout
@@ -137,28 +124,22 @@ def _checked(
 
 
 @pytest.fixture(scope='session')
-def program() -> Cli:
+def program():
     """Return a function that runs the command line in a separate process."""
 
-    def run(
-        *args: str | Path, code: int | None = 0, cwd: Path | None = None, **env: str
-    ) -> subprocess.CompletedProcess[str]:
+    def run(*args, code=0, cwd=None, **env):
         finished = subprocess.run(
-            [sys.executable, '-m', 'thermo_comp', *map(str, args)],
-            cwd=cwd,
+            [sys.executable, '-m', 'thermo_comp', *map(str, args)], cwd=cwd,
             env={**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80', **env},
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
+            capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
         return _checked(finished, code)
 
     return run
 
 
 @contextmanager
-def _caught(name: str, descriptor: int) -> Iterator[Callable[[], str]]:
+def _caught(name, descriptor):
     """Redirect a standard stream to a file, including output of C libraries."""
     before = getattr(sys, name)
     before.flush()
@@ -168,7 +149,7 @@ def _caught(name: str, descriptor: int) -> Iterator[Callable[[], str]]:
         stream = open(descriptor, 'w', encoding='utf-8', closefd=False)  # noqa: SIM115
         setattr(sys, name, stream)
 
-        def said() -> str:
+        def said():
             stream.flush()
             file.seek(0)
             return file.read().decode()
@@ -183,7 +164,7 @@ def _caught(name: str, descriptor: int) -> Iterator[Callable[[], str]]:
 
 
 @contextmanager
-def _as_a_process(cwd: Path | None) -> Iterator[None]:
+def _as_a_process(cwd):
     """Give a command the state of a new process, and restore the state of this one afterwards."""
     folder, environment = Path.cwd(), dict(os.environ)
     log = logging.getLogger()
@@ -207,15 +188,13 @@ def _as_a_process(cwd: Path | None) -> Iterator[None]:
 
 
 @pytest.fixture(scope='session')
-def cli(program: Cli) -> Cli:
+def cli(program):
     """
     Return a function that runs the command line in this process, or in a new one with variables.
     """
     from thermo_comp.cli.app import run as run_command
 
-    def run(
-        *args: str | Path, code: int | None = 0, cwd: Path | None = None, **env: str
-    ) -> subprocess.CompletedProcess[str]:
+    def run(*args, code=0, cwd=None, **env):
         if env:
             return program(*args, code=code, cwd=cwd, **env)
         arguments = [str(argument) for argument in args]
@@ -228,7 +207,7 @@ def cli(program: Cli) -> Cli:
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
+def small_disk(tmp_path, request):
     """Mount a file system of 4 KiB, or of the size that the test gives."""
     disk = tmp_path / 'disk'
     disk.mkdir()
@@ -245,7 +224,7 @@ def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]
 
 
 @pytest.fixture
-def peer() -> Iterator[Any]:
+def peer():
     """Return the other end of a node, a peer on DDS."""
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from ros_helpers import Peer
@@ -256,7 +235,7 @@ def peer() -> Iterator[Any]:
 
 
 @pytest.fixture
-def unit(tmp_path: Path) -> Path:
+def unit(tmp_path):
     """Write the calibration of a unit without temperature functions; return its path."""
     from builders import calibration
 
@@ -267,24 +246,19 @@ def unit(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_figures(monkeypatch):
     """Make pages without figures, whose drawing is slow; test_report.py draws them."""
     monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: [])
 
 
-class Once(Protocol):
-    """Make a folder once per test run, in the first worker that requests it."""
-
-    def __call__(self, name: str, make: Callable[[Path], object]) -> Path: ...
-
-
 @pytest.fixture(scope='session')
-def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+def once(tmp_path_factory):
+    """Return a function that makes a folder once per run, in the first worker that requests it."""
     base = tmp_path_factory.getbasetemp()
     shared = (base.parent if 'PYTEST_XDIST_WORKER' in os.environ else base) / 'once'
     shared.mkdir(exist_ok=True)
 
-    def get(name: str, make: Callable[[Path], object]) -> Path:
+    def get(name, make):
         folder, partial = shared / name, shared / f'.{name}'
         with (shared / f'.{name}.lock').open('w') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -299,42 +273,46 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
     return get
 
 
+@pytest.fixture(scope='module')
+def desk(tmp_path_factory, cli, once):
+    from desk_helpers import Desk
+
+    return Desk(tmp_path_factory.mktemp('desk'), cli, once)
+
+
 class _Pickler(pickle.Pickler):
     """Leave out the functions that read the bags of a fit; they are not needed after it."""
 
-    def persistent_id(self, value: object) -> str | None:
+    def persistent_id(self, value):
         is_local = isinstance(value, FunctionType) and '<' in value.__qualname__
         return 'nothing' if is_local else None
 
 
 class _Unpickler(pickle.Unpickler):
-    def persistent_load(self, _: str) -> Callable[[], None]:
+    def persistent_load(self, _):
         return lambda: None
 
 
 @pytest.fixture(scope='session')
-def equal_fits_once(once: Once) -> Iterator[None]:
+def equal_fits_once(once):
     """Fit equal bags with equal options once, as many pages and examples need the same fit."""
     from thermo_comp import fitting
 
     fit = fitting.fit
 
-    def remembered(
-        sources: Sequence[fitting.FitSource], options: fitting.FitOptions, *progress: Any
-    ) -> fitting.FitResult:
+    def remembered(sources, options, *progress):
         hashes = [source.sha256 for source in sources]
         key = repr((hashes, [source.name for source in sources], options))
         if None in hashes or options.prior is not None:
             return fit(sources, options, *progress)
 
-        def make(folder: Path) -> None:
+        def make(folder):
             with (folder / 'fit').open('wb') as file:
                 _Pickler(file).dump(fit(sources, options, *progress))
 
         made = once(f'fit-{hashlib.sha256(key.encode()).hexdigest()[:16]}', make)
         with (made / 'fit').open('rb') as file:
-            found: fitting.FitResult = _Unpickler(file).load()
-        return found
+            return _Unpickler(file).load()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fitting, 'fit', remembered)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A folder with every file that an example in a help text or a page names."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import shlex
@@ -15,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT, Cli, Once
+from conftest import ROOT
 from readme_helpers import shown
 
 #: Files that are made when an example needs them; all others are written by an example or present.
@@ -32,7 +30,7 @@ _EXPORTS = {
 }
 
 
-def write_fit_of_the_readme(path: Path, cli: Cli) -> None:
+def write_fit_of_the_readme(path, cli):
     """
     Write the calibration of the sample bags, and the output of the README's command beside it.
     """
@@ -46,21 +44,9 @@ def write_fit_of_the_readme(path: Path, cli: Cli) -> None:
 
 
 class Desk:
-    """
-    Prepare files once, and run examples in folders where they lie ready.
+    """Prepares files once, and runs examples in folders where they lie ready."""
 
-    Parameters
-    ----------
-    folder : Path
-        Where the files are made.
-    cli : Cli
-        The command line.
-    once : Once
-        Where files are that every desk needs.
-
-    """
-
-    def __init__(self, folder: Path, cli: Cli, once: Once) -> None:
+    def __init__(self, folder, cli, once):
         self._cli = cli
         self._once = once
         self._ready = folder / 'ready'
@@ -73,7 +59,7 @@ class Desk:
             (self._ready / name).symlink_to(ROOT / 'bags' / 'held_out.mcap')
         (self._ready / 'config').symlink_to(ROOT / 'config')
 
-    def _make(self, name: str) -> Path:
+    def _make(self, name):
         """Make a file when it is first needed; return its path."""
         made = self._ready / name
         if not made.exists():
@@ -81,7 +67,7 @@ class Desk:
             made.symlink_to(self._once(file, lambda folder: self._write(folder / file)) / file)
         return made
 
-    def _write(self, path: Path) -> None:
+    def _write(self, path):
         name = path.name
         if name == 'unit42.yaml':
             write_fit_of_the_readme(path, self._cli)
@@ -156,23 +142,10 @@ class Desk:
 
             write_new(path, np.random.default_rng(5))
 
-    def run(self, command: str, cli: Cli | None = None) -> subprocess.CompletedProcess[str]:
+    def run(self, command, cli=None):
         """
         Run one example as written, with a shorter wait; it must succeed. Each example has a new
         folder, except that fleets share one.
-
-        Parameters
-        ----------
-        command : str
-            A line that starts with ``thermo_comp``; wildcards are expanded as a shell does.
-        cli : Cli or None, optional
-            The command line; the desk's own by default.
-
-        Returns
-        -------
-        subprocess.CompletedProcess
-            With its output.
-
         """
         words = shlex.split(command, comments=True)
         assert words.pop(0) == 'thermo_comp'
@@ -207,19 +180,15 @@ class Desk:
             return self._interrupted(arguments, here)
         return (cli or self._cli)(*arguments, cwd=here)
 
-    def _interrupted(self, arguments: list[str], here: Path) -> subprocess.CompletedProcess[str]:
+    def _interrupted(self, arguments, here):
         """
         Start a command that runs until Ctrl-C, and send Ctrl-C once it has printed its first line.
         """
         process = subprocess.Popen(
-            [sys.executable, '-m', 'thermo_comp', *arguments],
-            cwd=here,
-            env={**os.environ, 'PYTHONPATH': str(ROOT)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        assert process.stdout is not None
+            [sys.executable, '-m', 'thermo_comp', *arguments], cwd=here,
+            env={**os.environ, 'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
         first = process.stdout.readline()
         process.send_signal(signal.SIGINT)
         rest, errors = process.communicate(timeout=60)

@@ -8,27 +8,20 @@ node's diagnostics account for every sample. So no message is lost by accident, 
 least one report, and the result does not depend on the machine.
 """
 
-from __future__ import annotations
-
 import struct
 import threading
-from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from fault_rig import CONFIG, STANDS_S, START_NS, Event, counts_of, force_at, seconds_of
+from fault_rig import CONFIG, STANDS_S, START_NS, counts_of, force_at, seconds_of
 from geometry_msgs.msg import Vector3Stamped
 from node_process import NodeProcess
-from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from ros_helpers import Peer
@@ -77,7 +70,7 @@ class Heard:
     reports: list[tuple[int, str]] = field(default_factory=list)
     values: dict[str, str] = field(default_factory=dict)
 
-    def says(self, text: str, level: int) -> bool:
+    def says(self, text, level):
         """Whether a report of at least this level contains a text."""
         return any(level <= found and text in message for found, message in self.reports)
 
@@ -85,7 +78,7 @@ class Heard:
 class Bench:
     """A peer of the node that acts as three drivers and an INS."""
 
-    def __init__(self, node: NodeProcess, context: Context) -> None:
+    def __init__(self, node, context):
         self.process = node
         self.node = rclpy.create_node('fault_bench', context=context)
         # The wait loop does not serve clients.
@@ -97,25 +90,25 @@ class Bench:
         self._imu = self._loop.subscribe(Imu, 'imu/data_raw', QOS)
         self._diagnostics = self._loop.subscribe(DiagnosticArray, '/diagnostics', QOS)
         self._news = threading.Condition()
-        self._frames: list[bytes] = []
-        self._reports: list[tuple[int, str]] = []
-        self._values: dict[str, str] = {}
+        self._frames = []
+        self._reports = []
+        self._values = {}
         self.n_sent = self._n_taken = self._n_reports = 0
         #: Whether the test itself has ended the node process.
         self.is_ended = False
-        self._publishers: list[Publisher] = []
+        self._publishers = []
         self._open_publishers()
         self._thread = threading.Thread(target=self._loop.run, args=(self._hear,), daemon=True)
         self._thread.start()
 
-    def _open_publishers(self) -> None:
+    def _open_publishers(self):
         self._publish = {}
         for name, (kind, topic) in _TOPICS.items():
             publisher = self.node.create_publisher(kind, topic, QOS)
             self._publishers.append(publisher)
             self._publish[name] = publisher.handle.publish_raw
 
-    def restart_publishers(self) -> None:
+    def restart_publishers(self):
         """End the drivers and start new ones, and wait until the node has discovered them."""
         for publisher in self._publishers:
             self.node.destroy_publisher(publisher)
@@ -129,13 +122,13 @@ class Bench:
         # The node's reader knows the new writer once it has acknowledged that nothing is missing.
         pause.wait(0.5)
 
-    def close(self) -> None:
+    def close(self):
         self._loop.stop()
         self._thread.join(TIMEOUT_S)
         self._operator.close()
         self.node.destroy_node()
 
-    def _hear(self) -> None:
+    def _hear(self):
         frames, _ = self._imu.drain()
         reports, _ = self._diagnostics.drain()
         with self._news:
@@ -147,7 +140,7 @@ class Bench:
                 self._values = {one.key: one.value for one in status.values}
             self._news.notify_all()
 
-    def wait_for(self, condition: Any, what: str) -> None:
+    def wait_for(self, condition, what):
         with self._news:
             found = self._news.wait_for(
                 lambda: condition() or not self.process.is_alive, TIMEOUT_S
@@ -155,7 +148,7 @@ class Bench:
         assert self.process.is_alive, self.process.said
         assert found, f'{what} did not come true; {self._values}'
 
-    def ask(self, **values: Any) -> Any:
+    def ask(self, **values):
         """Call the node's set_parameters; return the future of the answer."""
         assert self._client.wait_for_service(TIMEOUT_S)
         messages = [
@@ -163,7 +156,7 @@ class Bench:
         ]
         return self._client.call_async(SetParameters.Request(parameters=messages))
 
-    def set_parameters(self, **values: Any) -> SetParametersResult:
+    def set_parameters(self, **values):
         """Set parameters of the node and wait for the answer."""
         future = self.ask(**values)
         pause = threading.Event()
@@ -173,7 +166,7 @@ class Bench:
             assert self.process.is_alive, self.process.said
         return future.result().results[0]
 
-    def send(self, events: Iterable[Event]) -> int:
+    def send(self, events):
         """Publish messages; return the number of samples."""
         n = 0
         for topic, stamp_ns, value in events:
@@ -187,7 +180,7 @@ class Bench:
         self.n_sent += n
         return n
 
-    def meet(self) -> None:
+    def meet(self):
         """Send samples with later stamps until the first of them comes back."""
         pause = threading.Event()
         standing = _STANDING.copy()
@@ -210,10 +203,10 @@ class Bench:
         self.n_sent = int(self._values['samples in'])
         self._n_taken = int(self._values['samples out']) - len(self._frames)
 
-    def settle(self) -> None:
+    def settle(self):
         """Wait until the node has counted every sample and all of its output has arrived."""
 
-        def is_done() -> bool:
+        def is_done():
             values = self._values
             return (
                 int(values.get('samples in', -1)) == self.n_sent
@@ -222,7 +215,7 @@ class Bench:
 
         self.wait_for(is_done, f'{self.n_sent} samples')
 
-    def play(self, events: list[Event]) -> Heard:
+    def play(self, events):
         """Play messages in order of arrival; return the node's output."""
         self.take()
         for lot in lots(events):
@@ -234,7 +227,7 @@ class Bench:
                 self.wait_for(lambda n=n_reports: self._n_reports > n + 2, 'three reports')
         return self.take()
 
-    def take(self) -> Heard:
+    def take(self):
         """Return the output received since the last call."""
         with self._news:
             frames, self._frames = self._frames, []
@@ -247,14 +240,14 @@ class Bench:
         return Heard(stamps, numbers[:, 25:28], numbers[:, 28:].reshape(-1, 3, 3), reports, values)
 
 
-def _stamp_of(frame: bytes) -> int:
+def _stamp_of(frame):
     sec, nanosec = struct.unpack_from('<iI', frame, 4)
     return int(sec * 1_000_000_000 + nanosec)
 
 
-def lots(events: list[Event]) -> Iterator[list[Event]]:
+def lots(events):
     """Divide messages into lots."""
-    lot: list[Event] = []
+    lot = []
     edge = None
     for event in events:
         span = int(seconds_of(event[1]) // LOT_S)
@@ -269,7 +262,7 @@ def lots(events: list[Event]) -> Iterator[list[Event]]:
 
 
 @contextmanager
-def bench(calibration: Path, *parameters: str) -> Iterator[Bench]:
+def bench(calibration, *parameters):
     """Start a node process and a peer, and wait until they have discovered each other."""
     overrides = [f'calibration_file:={calibration}', *PARAMETERS, *parameters]
     arguments = [word for one in overrides for word in ('-p', one)]

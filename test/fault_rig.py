@@ -9,8 +9,6 @@ to the fault, and every published number can be compared with the truth. The lag
 instead of minutes, so that the bag is short.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,7 +21,7 @@ from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set, term
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
-from thermo_comp.unit.calibration import Axes, AxisReference, Calibration, Unit
+from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 
 START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5
@@ -61,10 +59,10 @@ Event = tuple[str, int, Any]
 Inject = Callable[[list[Event]], list[Event]]
 
 
-def unit(**changes: Any) -> Calibration:
+def unit(**changes):
     """Return the calibration of the unit."""
 
-    def one(dynamic: bool) -> Any:
+    def one(dynamic):
         return axis_set(
             (0.0, BIAS_SLOPE, BIAS_CURVE),
             (1.0, SCALE_SLOPE),
@@ -85,18 +83,15 @@ def unit(**changes: Any) -> Calibration:
         ),
         'board_lag_s': BOARD_LAG_S,
         'detector': DetectorSettings(
-            smallest_ramp_k_min=1.0,
-            relaxed_rate_k_min=0.4,
-            dwell_s=5.0,
-            case=sensor,
+            smallest_ramp_k_min=1.0, relaxed_rate_k_min=0.4, dwell_s=5.0, case=sensor,
             board=replace(sensor, lag_s=BOARD_LAG_S),
         ),
         **changes,
-    }
+    }  # fmt: skip
     return calibration(**values)
 
 
-def force_at(seconds: np.ndarray) -> np.ndarray:
+def force_at(seconds):
     """Return the true specific force: a slow turn, then rest."""
     angle = 0.02 * np.minimum(seconds, STANDS_S)
     up = np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)]).T
@@ -112,19 +107,19 @@ class Truth:
     board: np.ndarray
     memory: np.ndarray
 
-    def at(self, seconds: np.ndarray) -> tuple[np.ndarray, ...]:
+    def at(self, seconds):
         return tuple(
             np.interp(seconds, self.time, c) for c in (self.case, self.board, self.memory)
         )
 
 
-def truth(ramp_s: tuple[float, float] = RAMP_S, duration_s: float = DURATION_S) -> Truth:
+def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
     """Compute the temperatures of case, board and memory from the air's, each through its lag."""
     step = 0.01
     time = np.arange(0.0, duration_s + 1.0, step)
     air = 15.0 + RAMP_K_S * (np.clip(time, *ramp_s) - ramp_s[0])
 
-    def follow(source: np.ndarray, lag: float) -> np.ndarray:
+    def follow(source, lag):
         share = step / lag
         result = np.empty_like(source)
         value = source[0]
@@ -138,7 +133,7 @@ def truth(ramp_s: tuple[float, float] = RAMP_S, duration_s: float = DURATION_S) 
     return Truth(time, case, board, board - follow(board, MEMORY_S))
 
 
-def counts_of(force: np.ndarray, case: np.ndarray, board: np.ndarray, memory: np.ndarray) -> Any:
+def counts_of(force, case, board, memory):
     """Return the counts of the converter for a specific force (Eq. (6) to (9))."""
     t = board - 20.0
     drift = BIAS_SLOPE * t + BIAS_CURVE * t**2
@@ -148,12 +143,7 @@ def counts_of(force: np.ndarray, case: np.ndarray, board: np.ndarray, memory: np
 
 
 @cache
-def bag(
-    rate_hz: float = RATE_HZ,
-    ramp_s: tuple[float, float] = RAMP_S,
-    duration_s: float = DURATION_S,
-    start_s: float = 0.0,
-) -> list[Event]:
+def bag(rate_hz=RATE_HZ, ramp_s=RAMP_S, duration_s=DURATION_S, start_s=0.0):
     """Return the undisturbed messages in order of arrival."""
     rng = np.random.default_rng(7)
     thermal = truth(ramp_s, duration_s)
@@ -176,9 +166,7 @@ def bag(
     return sorted(events, key=lambda event: event[1])
 
 
-def corrected(
-    events: list[Event], compensator: Compensator | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def corrected(events, compensator=None):
     """Return stamps and rows (force, covariance) of the published samples, without DDS."""
     compensator = compensator or Compensator(unit(), CONFIG)
     stamps, rows = [], []
@@ -191,18 +179,18 @@ def corrected(
     return np.array(stamps, np.int64), np.array(rows).reshape(-1, 9)
 
 
-def seconds_of(stamp_ns: int) -> float:
+def seconds_of(stamp_ns):
     return (stamp_ns - START_NS) * 1e-9
 
 
-def changed(topic: str, begin_s: float, end_s: float, change: Callable[..., Any]) -> Inject:
+def changed(topic, begin_s, end_s, change):
     """
     Change the messages of a topic within a span.
 
     `change(event)` returns the events that replace it.
     """
 
-    def inject(events: list[Event]) -> list[Event]:
+    def inject(events):
         result = []
         for event in events:
             if event[0] == topic and begin_s <= seconds_of(event[1]) < end_s:
@@ -214,32 +202,32 @@ def changed(topic: str, begin_s: float, end_s: float, change: Callable[..., Any]
     return inject
 
 
-def value(topic: str, begin_s: float, end_s: float, change: Callable[[Any], Any]) -> Inject:
+def value(topic, begin_s, end_s, change):
     """Change the values of a topic within a span."""
     return changed(topic, begin_s, end_s, lambda e: [(e[0], e[1], change(e[2]))])
 
 
-def stop(topic: str, begin_s: float, end_s: float) -> Inject:
+def stop(topic, begin_s, end_s):
     """Drop the messages of a topic within a span."""
     return changed(topic, begin_s, end_s, lambda _: [])
 
 
-def frozen(topic: str, begin_s: float, end_s: float) -> Inject:
+def frozen(topic, begin_s, end_s):
     """Repeat the last value of a topic throughout a span, with new stamps."""
-    last: list[Any] = []
+    last = []
 
-    def hold(event: Event) -> list[Event]:
+    def hold(event):
         last.append(event[2])
         return [(event[0], event[1], last[0])]
 
     return changed(topic, begin_s, end_s, hold)
 
 
-def late(topic: str, delay_s: float, begin_s: float, end_s: float) -> Inject:
+def late(topic, delay_s, begin_s, end_s):
     """Deliver the messages of a topic later than their stamps."""
 
-    def inject(events: list[Event]) -> list[Event]:
-        def arrival(event: Event) -> float:
+    def inject(events):
+        def arrival(event):
             seconds = seconds_of(event[1])
             is_late = event[0] == topic and begin_s <= seconds < end_s
             return seconds + delay_s * is_late
@@ -249,10 +237,10 @@ def late(topic: str, delay_s: float, begin_s: float, end_s: float) -> Inject:
     return inject
 
 
-def shuffled(topic: str, begin_s: float, end_s: float) -> Inject:
+def shuffled(topic, begin_s, end_s):
     """Exchange each message of a topic with the next one."""
 
-    def inject(events: list[Event]) -> list[Event]:
+    def inject(events):
         result = list(events)
         places = [
             k
@@ -266,10 +254,10 @@ def shuffled(topic: str, begin_s: float, end_s: float) -> Inject:
     return inject
 
 
-def chain(*steps: Inject) -> Inject:
+def chain(*steps):
     """Apply several changes one after the other."""
 
-    def inject(events: list[Event]) -> list[Event]:
+    def inject(events):
         for step in steps:
             events = step(events)
         return events
@@ -277,10 +265,10 @@ def chain(*steps: Inject) -> Inject:
     return inject
 
 
-def shifted(begin_s: float, by_s: float) -> Inject:
+def shifted(begin_s, by_s):
     """Let the stamps of all topics jump."""
 
-    def inject(events: list[Event]) -> list[Event]:
+    def inject(events):
         by_ns = round(by_s * 1e9)
         return [
             (topic, stamp + by_ns * (seconds_of(stamp) >= begin_s), v)

@@ -7,8 +7,6 @@ Times are seconds of the bag of `fault_rig`: the unit turns until 40, the ramp i
 and the lag of the board has decayed by 270. docs/faults.md describes each row.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 
@@ -59,21 +57,21 @@ class Row:
     source: list[Event] | None = field(default=None, repr=False)
 
 
-def swap_topics(events: list[Event]) -> list[Event]:
+def swap_topics(events):
     other = {'board': 'case', 'case': 'board'}
     return [(other.get(topic, topic), stamp, v) for topic, stamp, v in events]
 
 
-def lose(share: float) -> Inject:
+def lose(share):
     rng = np.random.default_rng(3)
     return changed('counts', 0.0, 999.0, lambda e: [e] if rng.random() >= share else [])
 
 
-def faster(begin_s: float, end_s: float, factor: int) -> Inject:
+def faster(begin_s, end_s, factor):
     """Shorten the conversion cycle: a sample becomes `factor` samples with fewer counts each."""
     step_ns = round(1e9 / RATE_HZ / factor)
 
-    def split(event: Event) -> list[Event]:
+    def split(event):
         topic, stamp_ns, sample = event
         part = tuple(float(round(one / factor)) for one in sample)
         return [
@@ -84,257 +82,122 @@ def faster(begin_s: float, end_s: float, factor: int) -> Inject:
     return changed('counts', begin_s, end_s, split)
 
 
-def half_time(begin_s: float) -> Inject:
+def half_time(begin_s):
     """Let a bag restart: play its beginning, then the whole bag."""
     return lambda events: [e for e in events if seconds_of(e[1]) < begin_s] + events
 
 
-def sensor_rows(name: str) -> list[Row]:
+def sensor_rows(name):
     """Return the rows of one thermometer; only faults of the board stop the output."""
     is_board = name == 'board'
     lost = 'nothing is published' if is_board else 'the board sensor decides the regime'
     level = ERROR if is_board else WARN
     held = (WARN, 'board temperature') if is_board else (WARN, 'case temperature lost')
     return [
-        Row(
-            f'{name} stops',
-            stop(name, 80.0, 130.0),
-            ((level, lost),),
-            3600,
-            silent=((100.5, 129.5),) if is_board else (),
-            recovered=165.0,
-        ),
-        Row(
-            f'{name} freezes in the ramp',
-            frozen(name, 80.0, 130.0),
-            ((WARN, f'{name} temperature frozen'), (level, lost)),
-            3650,
-            silent=((107.8, 129.5),) if is_board else (),
-            recovered=165.0,
-        ),
-        Row(
-            f'{name} freezes in the soak',
-            frozen(name, 45.0, 130.0),
+        Row(f'{name} stops', stop(name, 80.0, 130.0), ((level, lost),), 3600,
+            silent=((100.5, 129.5),) if is_board else (), recovered=165.0),
+        Row(f'{name} freezes in the ramp', frozen(name, 80.0, 130.0),
+            ((WARN, f'{name} temperature frozen'), (level, lost)), 3650,
+            silent=((107.8, 129.5),) if is_board else (), recovered=165.0),
+        Row(f'{name} freezes in the soak', frozen(name, 45.0, 130.0),
             ((WARN, f'{name} temperature stands still'), (WARN, f'{name} temperature frozen')),
-            3450,
-            recovered=200.0,
-        ),
-        Row(
-            f'{name} jumps by 40 K',
-            value(name, 80.0, 95.0, lambda v: v + 40.0),
-            ((WARN, f'{name} temperature jumped by +'),),
-            N_SAMPLES,
-            recovered=125.0,
-        ),
-        Row(
-            f'{name} jumps by 40 K and stays',
-            value(name, 80.0, 130.0, lambda v: v + 40.0),
+            3450, recovered=200.0),
+        Row(f'{name} jumps by 40 K', value(name, 80.0, 95.0, lambda v: v + 40.0),
+            ((WARN, f'{name} temperature jumped by +'),), N_SAMPLES, recovered=125.0),
+        Row(f'{name} jumps by 40 K and stays', value(name, 80.0, 130.0, lambda v: v + 40.0),
             ((WARN, f'{name} temperature jumped by +'), (WARN, 'outside the calibrated range')),
-            3950,
-            recovered=230.0,
-        ),
-        Row(
-            f'{name} jumps by 2 K',
-            value(name, 80.0, 130.0, lambda v: v + 2.0),
-            (),
-            N_SAMPLES,
-            recovered=220.0,
-        ),
+            3950, recovered=230.0),
+        Row(f'{name} jumps by 2 K', value(name, 80.0, 130.0, lambda v: v + 2.0), (), N_SAMPLES,
+            recovered=220.0),
         *(
-            Row(
-                f'{name} is {word}',
-                value(name, 80.0, 95.0, lambda _, bad=bad: bad),
-                (held,),
-                N_SAMPLES,
-                recovered=125.0,
-            )
+            Row(f'{name} is {word}', value(name, 80.0, 95.0, lambda _, bad=bad: bad), (held,),
+                N_SAMPLES, recovered=125.0)
             for word, bad in (('NaN', math.nan), ('infinite', -math.inf))
         ),
-        Row(
-            f'{name} in whole degrees',
-            value(name, 45.0, 160.0, lambda v: float(round(v))),
-            ((WARN, f'{name} temperature'),),
-            3850,
-            recovered=220.0,
-        ),
+        Row(f'{name} in whole degrees', value(name, 45.0, 160.0, lambda v: float(round(v))),
+            ((WARN, f'{name} temperature'),), 3850, recovered=220.0),
         Row(f'{name} twice', changed(name, 45.0, 160.0, lambda e: [e, e]), (), N_SAMPLES),
         Row(f'{name} out of order', shuffled(name, 45.0, 160.0), (), N_SAMPLES, recovered=170.0),
-        Row(
-            f'{name} late by 5 s',
-            late(name, 5.0, 45.0, 160.0),
-            ((WARN, 'board temperature 5'),) if is_board else (),
-            N_SAMPLES,
-            recovered=200.0,
-        ),
-    ]
+        Row(f'{name} late by 5 s', late(name, 5.0, 45.0, 160.0),
+            ((WARN, 'board temperature 5'),) if is_board else (), N_SAMPLES, recovered=200.0),
+    ]  # fmt: skip
 
 
 SENSOR_ROWS = [*sensor_rows('board'), *sensor_rows('case')]
 
 BOTH_ROWS = [
-    Row(
-        'both temperatures freeze',
+    Row('both temperatures freeze',
         chain(frozen('board', 80.0, 130.0), frozen('case', 80.0, 130.0)),
         ((WARN, 'board temperature stands still'), (WARN, 'case temperature stands still')),
-        N_SAMPLES,
-        recovered=230.0,
-    ),
-    Row(
-        'both temperatures stop',
-        chain(stop('board', 80.0, 130.0), stop('case', 80.0, 130.0)),
-        ((ERROR, 'nothing is published'), (WARN, 'case temperature lost')),
-        3600,
-        silent=((100.5, 129.5),),
-        recovered=170.0,
-    ),
+        N_SAMPLES, recovered=230.0),
+    Row('both temperatures stop', chain(stop('board', 80.0, 130.0), stop('case', 80.0, 130.0)),
+        ((ERROR, 'nothing is published'), (WARN, 'case temperature lost')), 3600,
+        silent=((100.5, 129.5),), recovered=170.0),
     Row('topics swapped', swap_topics, ((ERROR, 'swapped'),), N_SAMPLES, recovered=math.inf),
-]
+]  # fmt: skip
 
 SAMPLE_ROWS = [
-    Row(
-        'counts are NaN',
-        value('counts', 80.0, 95.0, lambda v: (math.nan, v[1], v[2])),
-        ((WARN, 'samples not finite, dropped'),),
-        3800,
-        silent=((80.0, 95.0),),
-    ),
-    Row(
-        'counts saturated',
-        value('counts', 80.0, 95.0, lambda v: (v[0], -FULL_SCALE, v[2])),
-        ((ERROR, 'samples saturated'),),
-        3800,
-        silent=((80.0, 95.0),),
-    ),
-    Row(
-        'counts stuck',
-        frozen('counts', 80.0, 130.0),
-        ((ERROR, 'samples stuck or all zero, dropped'),),
-        3375,
-        silent=((84.1, 130.0),),
-        recovered=130.0,
-    ),
-    Row(
-        'counts stuck in motion',
-        frozen('counts', 10.0, 20.0),
-        ((ERROR, 'samples stuck or all zero, dropped'),),
-        3850,
-        silent=((14.1, 20.0),),
-        blind=(10.0, 14.1),
-        recovered=20.0,
-    ),
-    Row(
-        'counts all zero',
-        value('counts', 80.0, 95.0, lambda _: (0.0, 0.0, 0.0)),
-        ((ERROR, 'samples stuck or all zero, dropped'),),
-        3800,
-        silent=((80.0, 95.0),),
-    ),
-    Row(
-        'an axis reversed',
-        value('counts', 130.0, 220.0, lambda v: (v[0], v[1], -v[2])),
-        ((ERROR, 'or an axis reversed? Nothing is published'),),
-        2800,
-        silent=((138.1, 220.0),),
-        blind=(130.0, 138.1),
-        recovered=220.0,
-    ),
-    Row(
-        'an axis reversed from the start',
+    Row('counts are NaN', value('counts', 80.0, 95.0, lambda v: (math.nan, v[1], v[2])),
+        ((WARN, 'samples not finite, dropped'),), 3800, silent=((80.0, 95.0),)),
+    Row('counts saturated', value('counts', 80.0, 95.0, lambda v: (v[0], -FULL_SCALE, v[2])),
+        ((ERROR, 'samples saturated'),), 3800, silent=((80.0, 95.0),)),
+    Row('counts stuck', frozen('counts', 80.0, 130.0),
+        ((ERROR, 'samples stuck or all zero, dropped'),), 3375, silent=((84.1, 130.0),),
+        recovered=130.0),
+    Row('counts stuck in motion', frozen('counts', 10.0, 20.0),
+        ((ERROR, 'samples stuck or all zero, dropped'),), 3850, silent=((14.1, 20.0),),
+        blind=(10.0, 14.1), recovered=20.0),
+    Row('counts all zero', value('counts', 80.0, 95.0, lambda _: (0.0, 0.0, 0.0)),
+        ((ERROR, 'samples stuck or all zero, dropped'),), 3800, silent=((80.0, 95.0),)),
+    Row('an axis reversed', value('counts', 130.0, 220.0, lambda v: (v[0], v[1], -v[2])),
+        ((ERROR, 'or an axis reversed? Nothing is published'),), 2800,
+        silent=((138.1, 220.0),), blind=(130.0, 138.1), recovered=220.0),
+    Row('an axis reversed from the start',
         value('counts', 0.0, 999.0, lambda v: (v[0], v[1], -v[2])),
-        ((ERROR, 'or an axis reversed? Nothing is published'),),
-        500,
-        silent=((48.1, 320.0),),
-        blind=(0.0, 48.1),
-        recovered=math.inf,
-    ),
+        ((ERROR, 'or an axis reversed? Nothing is published'),), 500, silent=((48.1, 320.0),),
+        blind=(0.0, 48.1), recovered=math.inf),
     *(
-        Row(
-            f'{share:.0%} of the counts lost',
-            lose(share),
-            (),
-            round(0.95 * N_SAMPLES * (1.0 - share)),
-        )
+        Row(f'{share:.0%} of the counts lost', lose(share), (),
+            round(0.95 * N_SAMPLES * (1.0 - share)))
         for share in (0.01, 0.1, 0.5)
     ),
-    Row(
-        'counts lost in bursts',
+    Row('counts lost in bursts',
         changed('counts', 0.0, 999.0, lambda e: [e] if seconds_of(e[1]) // 7 % 2 else []),
-        ((WARN, 'samples/s, calibrated for'),),
-        1950,
-        recovered=300.0,
-    ),
-    Row(
-        'counts twice',
-        changed('counts', 0.0, 999.0, lambda e: [e, e]),
-        ((WARN, 'samples out of order, dropped'),),
-        N_SAMPLES,
-    ),
-    Row(
-        'counts out of order',
-        shuffled('counts', 0.0, 999.0),
-        ((WARN, 'samples out of order, dropped'),),
-        N_SAMPLES // 2,
-        recovered=300.0,
-    ),
-    Row(
-        'counts 20 times as fast',
-        faster(150.0, 160.0, 20),
-        ((ERROR, 'samples too fast for their conversion cycle, dropped'),),
-        3800,
-        silent=((151.0, 160.0),),
-        blind=(149.9, 151.0),
-        recovered=165.0,
-    ),
-]
+        ((WARN, 'samples/s, calibrated for'),), 1950, recovered=300.0),
+    Row('counts twice', changed('counts', 0.0, 999.0, lambda e: [e, e]),
+        ((WARN, 'samples out of order, dropped'),), N_SAMPLES),
+    Row('counts out of order', shuffled('counts', 0.0, 999.0),
+        ((WARN, 'samples out of order, dropped'),), N_SAMPLES // 2, recovered=300.0),
+    Row('counts 20 times as fast', faster(150.0, 160.0, 20),
+        ((ERROR, 'samples too fast for their conversion cycle, dropped'),), 3800,
+        silent=((151.0, 160.0),), blind=(149.9, 151.0), recovered=165.0),
+]  # fmt: skip
 
 TIME_ROWS = [
-    Row(
-        'a gap of 10 min',
-        chain(stop('counts', 130, 730), stop('board', 130, 730), stop('case', 130, 730)),
-        (),
-        2300,
-        recovered=820.0,
-        source=bag(duration_s=850.0),
-    ),
+    Row('a gap of 10 min',
+        chain(stop('counts', 130, 730), stop('board', 130, 730), stop('case', 130, 730)), (),
+        2300, recovered=820.0, source=bag(duration_s=850.0)),
     Row('counts alone pause for 2 min', stop('counts', 80.0, 200.0), (), 2500),
-    Row(
-        'time jumps back',
-        half_time(100.0),
-        ((WARN, 'jumps of time backwards, estimators reset'),),
-        5000,
-    ),
+    Row('time jumps back', half_time(100.0),
+        ((WARN, 'jumps of time backwards, estimators reset'),), 5000),
     *(
-        Row(
-            f'time jumps forward by {word}{where}',
-            shifted(at, by),
-            (),
-            3995,
-            shift=(at, by),
-            recovered=at + 80.0,
-        )
+        Row(f'time jumps forward by {word}{where}', shifted(at, by), (), 3995, shift=(at, by),
+            recovered=at + 80.0)
         for word, by in (('10 min', 600.0), ('a day', 86400.0))
         for where, at in ((' in the ramp', 90.0), (' in the soak', 220.0))
     ),
-    Row(
-        'temperatures of another clock',
-        lambda events: [
-            (topic, stamp + (topic != 'counts') * 3_600_000_000_000, v)
-            for topic, stamp, v in events
-        ],
-        (
-            (ERROR, 'no board temperature yet, nothing is published'),
-            (WARN, 'temperatures are stamped 36'),
-        ),
-        0,
-        silent=((0.0, 320.0),),
-        recovered=math.inf,
-    ),
-]
+    Row('temperatures of another clock',
+        lambda events: [(topic, stamp + (topic != 'counts') * 3_600_000_000_000, v)
+                        for topic, stamp, v in events],
+        ((ERROR, 'no board temperature yet, nothing is published'),
+         (WARN, 'temperatures are stamped 36')),
+        0, silent=((0.0, 320.0),), recovered=math.inf),
+]  # fmt: skip
 
 ROWS = [*SENSOR_ROWS, *BOTH_ROWS, *SAMPLE_ROWS, *TIME_ROWS]
 
 
-def true_seconds(row: Row, stamps: np.ndarray) -> np.ndarray:
+def true_seconds(row, stamps):
     """Return the times of the bag that belong to stamps."""
     seconds = (stamps - START_NS) * 1e-9
     at, by = row.shift

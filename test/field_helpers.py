@@ -2,15 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns rests of a unit with any calibration, for tests: what its node would have logged."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 
 from thermo_comp.field.rest import Rest, Start, encode
-from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.prediction import ramp_states
@@ -20,15 +14,7 @@ DAY_NS = 86_400 * 10**9
 FIRST_DAY = 21_915
 
 
-def rests(
-    calibration: Calibration,
-    attitudes: Callable[[np.random.Generator], np.ndarray],
-    error: Callable[[float], np.ndarray],
-    days: int = 20,
-    seed: int = 1,
-    turn_on: float = 20.0 * MICRO_G,
-    rate: float = 0.0,
-) -> list[tuple[Start, Rest]]:
+def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
     """
     Log three starts a day with four windows each, in soaks (or ramps of `rate` [K/s]) at 15 to 25
     degC; `error` gives the bias [m/s^2] that the calibration lacks after some days.
@@ -42,13 +28,9 @@ def rests(
         since = k / 3.0
         begin = int((FIRST_DAY + 0.3 + since) * DAY_NS)
         start = Start(
-            begin,
-            calibration.unit.serial,
-            calibration.unit.input,
-            calibration.gravity_m_s2,
-            'laboratory',
-            correction.memory,
-        )
+            begin, calibration.unit.serial, calibration.unit.input, calibration.gravity_m_s2,
+            'laboratory', correction.memory,
+        )  # fmt: skip
         offset = error(since) + turn_on * rng.standard_normal(3)
         state = ramp_states(calibration, rng.uniform(15.0, 25.0, 1), rate, 3600.0)
         state[:, 1] = 1e-8
@@ -63,7 +45,7 @@ def rests(
     return found
 
 
-def write_log(folder: Path, found: list[tuple[Start, Rest]]) -> Path:
+def write_log(folder, found):
     """Write rests as the node does, a file for each day."""
     folder.mkdir(parents=True)
     for start, rest in found:
@@ -73,12 +55,12 @@ def write_log(folder: Path, found: list[tuple[Start, Rest]]) -> Path:
     return folder
 
 
-def upright(_rng: np.random.Generator) -> np.ndarray:
+def upright(_rng):
     """Give the attitude of a vehicle on level ground."""
     return np.array([0.0, 0.0, 1.0])
 
 
-def any_way(rng: np.random.Generator) -> np.ndarray:
+def any_way(rng):
     """Give the attitude of something that is carried."""
     u = rng.standard_normal(3)
     return np.asarray(u / np.linalg.norm(u))

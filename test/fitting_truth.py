@@ -2,21 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns window tables with known truth for tests of the regression, without samples or sensors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from thermo_comp.fitting.beginning import STEEPEST
 from thermo_comp.fitting.equations import as_vector, moved_by
-from thermo_comp.fitting.regression import Posterior, Regression
+from thermo_comp.fitting.regression import Regression
 from thermo_comp.fitting.selection import Candidates
-from thermo_comp.fitting.unknowns import WHITE, Layout, Noise, Prior, State, Windows, tangent_basis
+from thermo_comp.fitting.unknowns import WHITE, Noise, Prior, Windows, tangent_basis
 from thermo_comp.fitting.windows import N_SECTIONS
 from thermo_comp.simulation.campaign import positions
-from thermo_comp.typing import Floats, Ints
+from thermo_comp.typing import Floats
 
 GRAVITY = 9.81
 NOMINAL = np.array([1000.0, 1010.0, 990.0])
@@ -49,11 +46,11 @@ class Truth:
     tilt_sd: float = 0.0
 
     @property
-    def weights(self) -> Floats:
+    def weights(self):
         """Weights in bias and scale, shape (2, 3, m)."""
         return np.stack((self.on_bias, self.on_scale))
 
-    def errors(self, regression: Regression, found: Posterior) -> dict[str, Floats]:
+    def errors(self, regression, found):
         """Return errors divided by claimed standard deviations, for each kind of unknown."""
         errors, sd = {}, np.sqrt(found.variance)
         for name in ('kappa', 'bias', 'misalignment', 'weights'):
@@ -64,15 +61,7 @@ class Truth:
         return errors
 
 
-def table_of(
-    truth: Truth,
-    n_positions: int,
-    rng: np.random.Generator,
-    *,
-    n_windows: int = 40,
-    step_s: float = 120.0,
-    up: Floats | None = None,
-) -> tuple[Windows, Floats]:
+def table_of(truth, n_positions, rng, *, n_windows=40, step_s=120.0, up=None):
     """Draw a table of windows, one bag per position; also return the true directions."""
     up = positions(n_positions, 3) if up is None else up
     time = step_s * (np.arange(n_windows) + 0.5)
@@ -107,25 +96,17 @@ def table_of(
     columns = np.concatenate(shapes)
     steepest = np.array([1.0, 2.0 * np.abs(columns[:, 0]).max(), 1.0, 1.0, 1.0, 1.0])
     windows = Windows(
-        position=number,
-        bag=number,
+        position=number, bag=number,
         section=np.tile(np.arange(n_windows) * N_SECTIONS // n_windows, n_positions),
-        time=np.tile(time, n_positions),
-        weight=np.ones(len(number)),
-        mean=np.concatenate(means),
-        columns=columns,
-        groups=GROUPS,
-        kelvins=np.sqrt(np.mean(columns**2, axis=0)) / steepest,
-        lag=np.array([-1, -1, 0, 1, -1, -1]),
-        start=np.tile(share, (n_positions, 1)),
-        start_covariance=START,
-        in_scale=np.ones(len(GROUPS), dtype=bool),
-        tilt=tilt,
-    )
+        time=np.tile(time, n_positions), weight=np.ones(len(number)), mean=np.concatenate(means),
+        columns=columns, groups=GROUPS, kelvins=np.sqrt(np.mean(columns**2, axis=0)) / steepest,
+        lag=np.array([-1, -1, 0, 1, -1, -1]), start=np.tile(share, (n_positions, 1)),
+        start_covariance=START, in_scale=np.ones(len(GROUPS), dtype=bool), tilt=tilt,
+    )  # fmt: skip
     return windows, up
 
 
-def _columns(time: Floats, step_s: float, turns: float) -> Floats:
+def _columns(time, step_s, turns):
     end = time[-1] + 0.5 * step_s
     fine = np.linspace(0.0, end, 2000)
     t = 15.0 * np.sin(2.0 * np.pi * turns * fine / end)
@@ -141,7 +122,7 @@ def _columns(time: Floats, step_s: float, turns: float) -> Floats:
     return np.column_stack([np.interp(time, fine, column) for column in table.T])
 
 
-def rows_of(windows: Windows, rows: Ints) -> Windows:
+def rows_of(windows, rows):
     """Select rows of a table, position by position; positions and bags are renumbered."""
     names = ('section', 'time', 'weight', 'mean', 'columns', 'start', 'tilt')
     taken = {name: getattr(windows, name)[rows] for name in names}
@@ -153,7 +134,7 @@ def rows_of(windows: Windows, rows: Ints) -> Windows:
     return replace(windows, **taken)
 
 
-def without_starts(windows: Windows) -> Windows:
+def without_starts(windows):
     """Remove the unknown start states, as their products with the weights are not linear."""
     return replace(
         windows, lag=np.full_like(windows.lag, -1), start=np.zeros_like(windows.start),
@@ -161,28 +142,23 @@ def without_starts(windows: Windows) -> Windows:
     )  # fmt: skip
 
 
-def column_sd(names: tuple[str, ...], bias_sd: float, scale_sd: float) -> Floats:
+def column_sd(names, bias_sd, scale_sd):
     """Prior sd of each column in bias and scale; 0 excludes a column."""
     return np.outer((bias_sd, scale_sd), np.isin(GROUPS, names))
 
 
-def prior_of(truth: Truth, names: tuple[str, ...] = ('curve', 'board'), **changes: Any) -> Prior:
+def prior_of(truth, names=('curve', 'board'), **changes):
     """Return a wide prior with the true noise parameters."""
-    known: dict[str, Any] = {
-        'bias_mean': np.zeros(3),
-        'bias_sd': np.full(3, 1.0),
-        'scale_sd': 0.05,
-        'misalignment_sd': 1e-2,
-        'column_sd': column_sd(names, 1e-2, 1e-3),
-        'offset_sd': max(truth.offset_sd, 1e-9),
-        'tilt_sd': max(truth.tilt_sd, 1e-9),
-        'sigma': truth.sigma,
-        'noise': truth.noise,
-    }
+    known = {
+        'bias_mean': np.zeros(3), 'bias_sd': np.full(3, 1.0), 'scale_sd': 0.05,
+        'misalignment_sd': 1e-2, 'column_sd': column_sd(names, 1e-2, 1e-3),
+        'offset_sd': max(truth.offset_sd, 1e-9), 'tilt_sd': max(truth.tilt_sd, 1e-9),
+        'sigma': truth.sigma, 'noise': truth.noise,
+    }  # fmt: skip
     return Prior(**(known | changes))
 
 
-def candidates_of(windows: Windows, forced: tuple[str, ...] = ()) -> Candidates:
+def candidates_of(windows, forced=()):
     """Include all columns, with slopes of some ug/K."""
     none = np.zeros((2, len(windows.groups)), dtype=bool)
     typical, largest = (
@@ -192,7 +168,7 @@ def candidates_of(windows: Windows, forced: tuple[str, ...] = ()) -> Candidates:
     return Candidates(typical, largest, np.isin(windows.groups, forced), none)
 
 
-def begin(windows: Windows, up: Floats) -> tuple[Regression, State]:
+def begin(windows, up):
     """Return a regression and a state close to the truth."""
     regression = Regression(windows, GRAVITY, NOMINAL)
     turned = up + np.array([2e-3, -1e-3, 3e-3])
@@ -200,7 +176,7 @@ def begin(windows: Windows, up: Floats) -> tuple[Regression, State]:
     return regression, regression.initial_state(np.zeros(3), np.zeros(3), turned)
 
 
-def mode_of(regression: Regression, state: State, prior: Prior) -> Posterior:
+def mode_of(regression, state, prior):
     """Find the mode to full precision: Newton steps from the result of a fit."""
     found = regression.solve(state, prior, n_steps=12)
     state, grams = found.state, regression.products(found.layout.used).whole
@@ -210,6 +186,6 @@ def mode_of(regression: Regression, state: State, prior: Prior) -> Posterior:
     return regression.solve(state, prior, n_steps=0)
 
 
-def unit_of(state: State, layout: Layout) -> Floats:
+def unit_of(state, layout):
     """Return the unit's own unknowns as a vector."""
     return as_vector(state, layout)[: layout.n_unit]

@@ -2,11 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns small fleets of units that are quick to simulate (10 ms) and to fit (0.5 s)."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
-
 import numpy as np
 
 from thermo_comp.fitting import FitOptions
@@ -15,7 +10,6 @@ from thermo_comp.recording.writer import BagWriter
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset as preset
 from thermo_comp.simulation.run import simulate
-from thermo_comp.simulation.unit import UnitModel
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 #: Half an hour over 36 K, with the fast ramps of a freezer.
@@ -25,18 +19,18 @@ OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='golovach'), c
 
 
 def write_unit(
-    folder: Path,
-    seed: int,
-    n_bags: int = 6,
+    folder,
+    seed,
+    n_bags=6,
     *,
-    unit: UnitModel | None = None,
-    serial: str | None = None,
-    test: int = 0,
-    metadata: dict[str, str] | None = None,
-    names: Sequence[str] | None = None,
-    is_exchanged: bool = False,
-    counts: str = 'accel/counts',
-) -> list[Path]:
+    unit=None,
+    serial=None,
+    test=0,
+    metadata=None,
+    names=None,
+    is_exchanged=False,
+    counts='accel/counts',
+):
     """
     Simulate a thermal test of a unit, one bag per position; its thermometers may be exchanged.
     """
@@ -45,14 +39,10 @@ def write_unit(
     paths = []
     for number, up in enumerate(positions(n_bags, 1)):
         run = simulate(
-            unit,
-            PROGRAM,
-            up,
-            rate_hz=1.0,
-            temperature_rate_hz=0.5,
+            unit, PROGRAM, up, rate_hz=1.0, temperature_rate_hz=0.5,
             seed=1000 * seed + 100 * test + number,
             start_ns=1_767_225_600_000_000_000 + test * 30 * 86400 * 10**9,
-        )
+        )  # fmt: skip
         path = folder / (names[number] if names else f'{number + 1:02d}.mcap')
         facts = {'serial': unit.serial if serial is None else serial, **(metadata or {})}
         with BagWriter(path, metadata={k: v for k, v in facts.items() if v}) as bag:
@@ -64,7 +54,7 @@ def write_unit(
     return paths
 
 
-def damage(path: Path) -> None:
+def damage(path):
     """Overwrite some bytes in the middle of a bag, as a damaged disk does."""
     content = bytearray(path.read_bytes())
     middle = len(content) // 3

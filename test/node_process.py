@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the node as a separate process, for tests and benchmarks."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -17,10 +15,10 @@ _STOPPING_S = 10.0  # time for the node to end [s]
 class NodeProcess:
     """The node in a separate process, which ends with the context."""
 
-    def __init__(self, *ros_args: str) -> None:
+    def __init__(self, *ros_args):
         self._ros_args = ros_args
 
-    def __enter__(self) -> NodeProcess:
+    def __enter__(self):
         self._log = tempfile.TemporaryFile()
         command = [sys.executable, '-m', 'thermo_comp.ros.node', '--ros-args', *self._ros_args]
         # Run this source tree, not an installed package.
@@ -31,23 +29,23 @@ class NodeProcess:
         )
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         """End the process as a launch system does."""
         self.stop()
         self._log.close()
 
     @property
-    def is_alive(self) -> bool:
+    def is_alive(self):
         """Whether the process still runs."""
         return self.process.poll() is None
 
     @property
-    def said(self) -> str:
+    def said(self):
         """The text on its standard output and error."""
         # Read without changing the position at which the process writes.
         return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors='replace').strip()
 
-    def stop(self, number: int = signal.SIGTERM) -> int:
+    def stop(self, number=signal.SIGTERM):
         """Send a signal, wait for the end, return the exit code."""
         # Popen sends no signal to a process that has ended.
         self.process.send_signal(number)

@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the simulated positions for the tests of partial fits."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -24,7 +22,7 @@ class Imu:
     angular_velocity: np.ndarray
 
     @property
-    def angular_velocity_covariance(self) -> np.ndarray:
+    def angular_velocity_covariance(self):
         return np.zeros((len(self.angular_velocity), 9))
 
 
@@ -50,21 +48,21 @@ class Rest:
     fall: float = 20.0
     pace_s: float = 200.0
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         n = round(self.duration_s * self.rate_hz)
         self.time = np.arange(n) / self.rate_hz
         self.accel = np.array(self.level) + self.sd * self.rng.standard_normal((n, 3))
         self.gyro = 0.002 * self.rng.standard_normal((n, 3))
         self.board_time = np.arange(0.0, self.duration_s, 0.5)
 
-    def temperature(self, time: np.ndarray) -> np.ndarray:
+    def temperature(self, time):
         return self.warm - self.fall * (1.0 - np.exp(-time / self.pace_s))
 
-    def add(self, vector, from_s: float, to_s: float = np.inf) -> None:
+    def add(self, vector, from_s, to_s=np.inf):
         rows = (self.time >= from_s) & (self.time < to_s)
         self.accel[rows] += np.asarray(vector)
 
-    def source(self, n_blocks: int = 1, with_gyro: bool = False, name: str = 'rest') -> FitSource:
+    def source(self, n_blocks=1, with_gyro=False, name='rest'):
         stamp_ns = START_NS + np.rint(self.time * 1e9).astype(np.int64)
         board_ns = START_NS + np.rint(self.board_time * 1e9).astype(np.int64)
         board = self.temperature(self.board_time) + 0.02 * np.random.default_rng(
@@ -76,16 +74,8 @@ class Rest:
             begin = stamp_ns[first] if first else 0
             end = stamp_ns[last] if last < len(stamp_ns) else np.iinfo(np.int64).max
             use = (board_ns >= begin) & (board_ns < end)
-            nothing_ns, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
-            block = ImuBlock(
-                stamp_ns[first:last],
-                self.accel[first:last],
-                board_ns[use],
-                board[use],
-                nothing_ns,
-                nothing,
-            )
-            if with_gyro:
-                block = replace(block, imu=Imu(self.gyro[first:last]))
-            blocks.append(block)
+            rows = slice(first, last)
+            imu = Imu(self.gyro[rows]) if with_gyro else None
+            readings = (board_ns[use], board[use])
+            blocks.append(ImuBlock(stamp_ns[rows], self.accel[rows], *readings, imu=imu))
         return FitSource(name, lambda: blocks)

@@ -7,8 +7,6 @@ Owns the outputs shown in the README and on the page of the command line, and th
 and the picture of the demonstration into docs/images.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -25,7 +23,7 @@ FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
 _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
-def shown() -> dict[str, tuple[list[str], str]]:
+def shown():
     """
     Return the console examples of the page: sub-command -> (words of the command line, output).
     """
@@ -39,13 +37,13 @@ def shown() -> dict[str, tuple[list[str], str]]:
     return found
 
 
-def shown_of_demo() -> list[str]:
+def shown_of_demo():
     """Return the output of the demonstration in the README."""
     (text,) = (text for kind, text in FENCE.findall(README) if kind == 'text')
     return str(text).splitlines()
 
 
-def is_alike(got: str, expected: str) -> bool:
+def is_alike(got, expected):
     """
     Compare two outputs: words exactly, numbers within a third.
 
@@ -58,23 +56,19 @@ def is_alike(got: str, expected: str) -> bool:
     return all(abs(float(a) - float(b)) <= max(abs(float(b)) / 3.0, 5.0) for a, b in numbers)
 
 
-def refresh() -> None:
+def refresh():
     """Write the real output of the console examples into their page."""
     environment = {**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80'}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, 'bags').symlink_to(ROOT / 'bags')
 
-        def run(match: re.Match[str]) -> str:
+        def run(match):
             command = match[1].partition('\n')[0]
             program = f'{shlex.quote(sys.executable)} -m thermo_comp'
             finished = subprocess.run(
-                ['bash', '-c', command.replace('$ thermo_comp', program, 1)],
-                cwd=folder,
-                env=environment,
-                capture_output=True,
-                text=True,
-                check=True,
-            )
+                ['bash', '-c', command.replace('$ thermo_comp', program, 1)], cwd=folder,
+                env=environment, capture_output=True, text=True, check=True,
+            )  # fmt: skip
             return f'```console\n{command}\n{finished.stdout.rstrip()}\n```'
 
         page = SESSION.read_text(encoding='utf-8')

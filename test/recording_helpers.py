@@ -2,12 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns bags made by other tools, and the plain-Python result that a reader must give for them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType
@@ -18,20 +14,14 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from thermo_comp.recording.blocks import Block
-
 VECTOR = 'geometry_msgs/msg/Vector3Stamped'
 IMU = 'sensor_msgs/msg/Imu'
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
 STRING = 'std_msgs/msg/String'
 
 ACCEL, IMU_IN, BOARD, CASE, OTHER = (
-    '/accel/counts',
-    '/imu/uncompensated',
-    '/temperature/board',
-    '/temperature/case',
-    '/chatter',
-)
+    '/accel/counts', '/imu/uncompensated', '/temperature/board', '/temperature/case', '/chatter',
+)  # fmt: skip
 TYPES = {ACCEL: VECTOR, IMU_IN: IMU, BOARD: TEMPERATURE, CASE: TEMPERATURE, OTHER: STRING}
 START_NS = 1_600_000_000_000_000_000
 
@@ -49,11 +39,11 @@ class Message:
 
 
 @lru_cache(maxsize=2)
-def typestore(ros: int = 2) -> Any:
+def typestore(ros=2):
     return get_typestore(Stores.ROS2_JAZZY if ros == 2 else Stores.ROS1_NOETIC)
 
 
-def to_ros(message: Message, ros: int = 2) -> Any:
+def to_ros(message, ros=2):
     types = typestore(ros).types
     if message.topic == OTHER:
         return types[STRING]('x' * (message.stamp_ns % 50))
@@ -66,50 +56,40 @@ def to_ros(message: Message, ros: int = 2) -> Any:
         return types[VECTOR](header, vector(*values))
     if message.topic == IMU_IN:
         return types[IMU](
-            header,
-            types['geometry_msgs/msg/Quaternion'](*values[0:4]),
-            np.array(values[4:13]),
-            vector(*values[13:16]),
-            np.array(values[16:25]),
-            vector(*values[25:28]),
+            header, types['geometry_msgs/msg/Quaternion'](*values[0:4]), np.array(values[4:13]),
+            vector(*values[13:16]), np.array(values[16:25]), vector(*values[25:28]),
             np.array(values[28:37]),
-        )
+        )  # fmt: skip
     return types[TEMPERATURE](header, *values)
 
 
-def serialize(message: Message) -> bytes:
+def serialize(message):
     kind = TYPES[message.topic]
     return bytes(typestore().serialize_cdr(to_ros(message), kind, little_endian=message.is_little))
 
 
 def write_mcap(
-    path: Path,
-    messages: list[Message],
+    path,
+    messages,
     *,
-    chunk_size: int = 1 << 20,
-    compression: str = 'none',
-    use_chunking: bool = True,
-    index_types: IndexType = IndexType.ALL,
-    use_statistics: bool = True,
-    repeat: bool = True,
-    enable_crcs: bool = True,
-) -> None:
+    chunk_size=1 << 20,
+    compression='none',
+    use_chunking=True,
+    index_types=IndexType.ALL,
+    use_statistics=True,
+    repeat=True,
+    enable_crcs=True,
+):
     """Write a bare file with the `mcap` library."""
     with path.open('wb') as file:
         writer = McapWriter(
-            file,
-            chunk_size=chunk_size,
-            compression=getattr(CompressionType, compression.upper()),
-            index_types=index_types,
-            use_chunking=use_chunking,
-            use_statistics=use_statistics,
-            repeat_channels=repeat,
-            repeat_schemas=repeat,
-            enable_crcs=enable_crcs,
-        )
+            file, chunk_size=chunk_size, compression=getattr(CompressionType, compression.upper()),
+            index_types=index_types, use_chunking=use_chunking, use_statistics=use_statistics,
+            repeat_channels=repeat, repeat_schemas=repeat, enable_crcs=enable_crcs,
+        )  # fmt: skip
         writer.start('ros2')
-        channels: dict[str, int] = {}
-        schemas: dict[str, int] = {}
+        channels = {}
+        schemas = {}
         for message in messages:
             kind = TYPES[message.topic]
             if kind not in schemas:
@@ -125,16 +105,14 @@ def write_mcap(
         writer.finish()
 
 
-def write_rosbag2(
-    path: Path, messages: list[Message], *, storage: str = 'mcap', compression: str = ''
-) -> None:
+def write_rosbag2(path, messages, *, storage='mcap', compression=''):
     """Write a rosbag2 directory with `rosbags`."""
     plugin = StoragePlugin.MCAP if storage == 'mcap' else StoragePlugin.SQLITE3
     writer = Writer2(path, version=9, storage_plugin=plugin)
     if compression:
         writer.set_compression(getattr(CompressionMode, compression), CompressionFormat.ZSTD)
     with writer:
-        connections: dict[str, Any] = {}
+        connections = {}
         for message in messages:
             if message.topic not in connections:
                 connections[message.topic] = writer.add_connection(
@@ -143,11 +121,11 @@ def write_rosbag2(
             writer.write(connections[message.topic], message.log_ns, serialize(message))
 
 
-def write_rosbag1(path: Path, messages: list[Message]) -> None:
+def write_rosbag1(path, messages):
     """Write a ROS 1 bag with `rosbags`."""
     store = typestore(1)
     with Writer1(path) as writer:
-        connections: dict[str, Any] = {}
+        connections = {}
         for message in messages:
             kind = TYPES[message.topic]
             if message.topic not in connections:
@@ -158,7 +136,7 @@ def write_rosbag1(path: Path, messages: list[Message]) -> None:
             writer.write(connections[message.topic], message.log_ns, data)
 
 
-def read_with_rosbags(path: Path) -> list[tuple[str, int, Any]]:
+def read_with_rosbags(path):
     """Return topic, log time and content of each message, in the order of `rosbags`."""
     with Reader2(path) as reader:
         return [
@@ -167,9 +145,9 @@ def read_with_rosbags(path: Path) -> list[tuple[str, int, Any]]:
         ]
 
 
-def columns_of(messages: list[Message]) -> dict[str, list[Any]]:
+def columns_of(messages):
     """Build the columns that a reader must give for messages in reading order."""
-    columns: dict[str, list[Any]] = {
+    columns = {
         f'{role}_{name}': []
         for role in ('accel', 'board', 'case')
         for name in ('stamp_ns', 'log_ns', 'values', 'after')
@@ -190,7 +168,7 @@ def columns_of(messages: list[Message]) -> dict[str, list[Any]]:
     return columns
 
 
-def assert_columns(block: Block, messages: list[Message]) -> None:
+def assert_columns(block, messages):
     """Check that the block holds exactly these messages in this order."""
     expected = columns_of(messages)
     accel = (block.accel_stamp_ns, block.accel, np.arange(len(block)))
@@ -206,9 +184,9 @@ def assert_columns(block: Block, messages: list[Message]) -> None:
         assert np.ascontiguousarray(values).tobytes() == wanted.tobytes(), role
 
 
-def regular_messages(n: int = 40, accel: str = ACCEL, every: int = 8) -> list[Message]:
+def regular_messages(n=40, accel=ACCEL, every=8):
     """Make a small regular bag: counts, and both temperatures after every few counts."""
-    messages: list[Message] = []
+    messages = []
     width = 3 if accel == ACCEL else 37
     for row in range(n):
         time_ns = START_NS + 2_500_000 * row

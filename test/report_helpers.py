@@ -2,23 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the small simulated thermal tests of the report's tests."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
-from builders import ArrayBlock
+from builders import arrays_of, source_of
 
 from thermo_comp import fitting
-from thermo_comp.fitting import FitOptions, FitResult, FitSource
+from thermo_comp.fitting import FitOptions
 from thermo_comp.recording.writer import BagWriter
-from thermo_comp.report.evidence import Evidence, evidence_of_fit
+from thermo_comp.report.evidence import evidence_of_fit
 from thermo_comp.report.page import render_report
 from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.presets import unit_preset
-from thermo_comp.simulation.run import SimulatedRun, simulate
+from thermo_comp.simulation.run import simulate
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = '15 12min, 30@1.5 14min, 15@1.5 8min'
@@ -28,47 +25,31 @@ LEFT_OUT_RMS = [1e-6 * STANDARD_GRAVITY * (1 + k) for k in range(N_POSITIONS - 1
 
 
 @cache
-def run(position: int = 0) -> SimulatedRun:
+def run(position=0):
     """Run one position of a thermostatted unit through 54 minutes of ramps and soaks."""
     return simulate(
-        unit_preset('thermostatted', 1),
-        parse_cyclogram(PROGRAM),
-        positions(N_POSITIONS, 0)[position],
-        rate_hz=RATE_HZ,
-        temperature_rate_hz=0.4,
+        unit_preset('thermostatted', 1), parse_cyclogram(PROGRAM),
+        positions(N_POSITIONS, 0)[position], rate_hz=RATE_HZ, temperature_rate_hz=0.4,
         seed=position,
-    )
+    )  # fmt: skip
 
 
 @cache
-def fitted() -> FitResult:
+def fitted():
     """Fit all positions of that unit."""
     sources = []
     for position in range(N_POSITIONS):
         one = run(position)
-        block = ArrayBlock(
-            one.accel_stamp_ns,
-            one.counts.astype(float),
-            one.board_stamp_ns,
-            one.board,
-            one.case_stamp_ns,
-            one.case,
-        )
-        sources.append(
-            FitSource(
-                name=f'{position + 1:02d}.mcap',
-                blocks=lambda block=block: [block],
-                sha256=f'{position + 1:064x}',
-                serial='thermostatted-0001',
-            )
-        )
+        number = position + 1
+        keys = {'sha256': f'{number:064x}', 'serial': 'thermostatted-0001'}
+        sources.append(source_of(*arrays_of(one), name=f'{number:02d}.mcap', **keys))
     # Without products the bank of columns is a third as large.
     groups = ('curve', 'set', 'gradient', 'board')
     return fitting.fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))
 
 
 @cache
-def evidence() -> Evidence:
+def evidence():
     """
     Gather the evidence of that fit, with assumed left-out residuals of 1, 2, ... ug for all
     positions but the last.
@@ -82,12 +63,12 @@ def evidence() -> Evidence:
 
 
 @cache
-def certificate() -> str:
+def certificate():
     """Render the page of that fit once, as drawing takes seconds."""
     return render_report(evidence())
 
 
-def write_bag(path: Path, position: int = 0, frame_id: str = 'imu_link', **metadata: str) -> Path:
+def write_bag(path, position=0, frame_id='imu_link', **metadata):
     """Write the run of a position as a bag."""
     one = run(position)
     facts = {'serial': 'thermostatted-0001', 'truth': '{}', **metadata}

@@ -5,19 +5,11 @@ Owns the other end of the node in tests: a peer on real DDS that publishes, list
 services.
 """
 
-from __future__ import annotations
-
 import contextlib
 import threading
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import DescribeParameters, SetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -35,17 +27,17 @@ TIMEOUT = 30.0
 DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 
 
-def stamped(message: Any, stamp_ns: int, frame_id: str = '') -> Any:
+def stamped(message, stamp_ns, frame_id=''):
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, SECOND_NS)
     message.header.frame_id = frame_id
     return message
 
 
-def stamp_of(message: Any) -> int:
+def stamp_of(message):
     return message.header.stamp.sec * SECOND_NS + message.header.stamp.nanosec
 
 
-def standing(k: int) -> tuple[float, float, float]:
+def standing(k):
     """Return distinct counts of a unit of 300 counts per m/s^2 at rest, with |f| close to g."""
     return 30.0 + k % 3, -20.0 + k % 2, 2941.0 + k % 5
 
@@ -53,35 +45,33 @@ def standing(k: int) -> tuple[float, float, float]:
 class Peer:
     """A node with a separate thread; every received message wakes `wait_for`."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.context = Context()
         rclpy.init(args=[], context=self.context)
         self.node = rclpy.create_node('peer', context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._news = threading.Condition()
-        self._clients: dict[str, Any] = {}
+        self._clients = {}
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
 
-    def _spin(self) -> None:
+    def _spin(self):
         with contextlib.suppress(ExternalShutdownException):
             self._executor.spin()
 
-    def close(self) -> None:
+    def close(self):
         self.context.try_shutdown()
         self._thread.join(TIMEOUT)
         assert not self._thread.is_alive()
         self._executor.shutdown()
         self.node.destroy_node()
 
-    def listen(
-        self, kind: Any, topic: str, qos: QoSProfile = DEEP, raw: bool = False
-    ) -> list[Any]:
+    def listen(self, kind, topic, qos=DEEP, raw=False):
         """Collect the messages of a topic in the returned list."""
-        heard: list[Any] = []
+        heard = []
 
-        def hear(message: Any) -> None:
+        def hear(message):
             with self._news:
                 heard.append(message)
                 self._news.notify_all()
@@ -89,11 +79,11 @@ class Peer:
         self.node.create_subscription(kind, topic, hear, qos, raw=raw)
         return heard
 
-    def wait_for(self, condition: Callable[[], Any], what: str = 'the condition') -> None:
+    def wait_for(self, condition, what='the condition'):
         with self._news:
             assert self._news.wait_for(condition, TIMEOUT), f'{what} did not come true'
 
-    def poll(self, condition: Callable[[], Any], what: str) -> None:
+    def poll(self, condition, what):
         """Wait by polling for a condition without a message, such as a discovery."""
         pause = threading.Event()
         for _ in range(int(TIMEOUT / 0.02)):
@@ -102,12 +92,12 @@ class Peer:
             pause.wait(0.02)
         raise AssertionError(f'{what} did not come true')
 
-    def publisher(self, kind: Any, topic: str, qos: QoSProfile = DEEP) -> Any:
+    def publisher(self, kind, topic, qos=DEEP):
         publisher = self.node.create_publisher(kind, topic, qos)
         self.poll(publisher.get_subscription_count, f'a subscriber to {topic}')
         return publisher
 
-    def join(self, node: CompensationNode) -> None:
+    def join(self, node):
         """
         Wait until both ends of every topic have discovered each other, so that nothing is lost.
         """
@@ -125,7 +115,7 @@ class Peer:
             'the match of all topics',
         )
 
-    def call(self, kind: Any, name: str, request: Any) -> Any:
+    def call(self, kind, name, request):
         # Clients are kept, as discovering a service takes longer than its answer.
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
@@ -137,68 +127,56 @@ class Peer:
         assert done.wait(TIMEOUT), f'{name} did not answer'
         return future.result()
 
-    def set_parameters(self, **values: Any) -> list[SetParametersResult]:
+    def set_parameters(self, **values):
         request = SetParameters.Request(parameters=_messages(values))
         return self.call(SetParameters, 'thermo_comp/set_parameters', request).results
 
-    def set_atomically(self, **values: Any) -> SetParametersResult:
+    def set_atomically(self, **values):
         request = SetParametersAtomically.Request(parameters=_messages(values))
         name = 'thermo_comp/set_parameters_atomically'
         return self.call(SetParametersAtomically, name, request).result
 
-    def describe(self, *names: str) -> list[Any]:
+    def describe(self, *names):
         request = DescribeParameters.Request(names=list(names))
         return self.call(
             DescribeParameters, 'thermo_comp/describe_parameters', request
         ).descriptors
 
 
-def _messages(values: dict[str, Any]) -> list[ParameterMessage]:
+def _messages(values):
     return [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
 
 
 class Driver:
     """Publishes samples and temperatures like a unit's drivers, and records what it sent."""
 
-    def __init__(
-        self,
-        peer: Peer,
-        kind: Any = Vector3Stamped,
-        topic: str = 'accel/counts',
-        qos: QoSProfile = DEEP,
-    ) -> None:
+    def __init__(self, peer, kind=Vector3Stamped, topic='accel/counts', qos=DEEP):
         self._samples = peer.publisher(kind, topic, qos)
         self._board = peer.publisher(Temperature, 'temperature/board')
         self._case = peer.publisher(Temperature, 'temperature/case')
 
-    def temperatures(self, stamp_ns: int, board: float, case: float | None = None) -> None:
+    def temperatures(self, stamp_ns, board, case=None):
         self._board.publish(stamped(Temperature(temperature=board), stamp_ns))
         if case is not None:
             self._case.publish(stamped(Temperature(temperature=case), stamp_ns))
 
-    def counts(self, stamp_ns: int, x: float, y: float, z: float, frame_id: str = 'imu') -> None:
+    def counts(self, stamp_ns, x, y, z, frame_id='imu'):
         message = stamped(Vector3Stamped(), stamp_ns, frame_id)
         message.vector.x, message.vector.y, message.vector.z = x, y, z
         self._samples.publish(message)
 
-    def imu(self, message: Imu) -> None:
+    def imu(self, message):
         self._samples.publish(message)
 
 
-def drive(
-    peer: Peer,
-    node: CompensationNode,
-    kind: Any = Vector3Stamped,
-    topic: str = 'accel/counts',
-    qos: QoSProfile = DEEP,
-) -> Driver:
+def drive(peer, node, kind=Vector3Stamped, topic='accel/counts', qos=DEEP):
     """Connect drivers to a node in this process."""
     driver = Driver(peer, kind, topic, qos)
     peer.join(node)
     return driver
 
 
-def node_arguments(unit: Path, *overrides: str) -> list[str]:
+def node_arguments(unit, *overrides):
     """Make the arguments of a node with 20 reports a second."""
     words = [f'calibration_file:={unit}', 'diagnostics_period:=0.05', *overrides]
     return [word for override in words for word in ('-p', override)]
@@ -207,32 +185,32 @@ def node_arguments(unit: Path, *overrides: str) -> list[str]:
 class Samples:
     """Sends samples of a unit at rest and collects the node's output."""
 
-    def __init__(self, peer: Peer, node: CompensationNode) -> None:
+    def __init__(self, peer, node):
         self._peer = peer
         self.heard = peer.listen(Imu, 'imu/data_raw')
         self.driver = drive(peer, node)
         self.n_sent = 0
 
-    def send(self, n: int = 20) -> None:
+    def send(self, n=20):
         for k in range(self.n_sent, self.n_sent + n):
             if k % 10 == 0:
                 self.driver.temperatures(START_NS + k * CYCLE_NS, 20.0, 20.0)
             self.driver.counts(START_NS + k * CYCLE_NS, *standing(k))
         self.n_sent += n
 
-    def go_on(self) -> None:
+    def go_on(self):
         """Check that all samples of a further burst are published."""
         before = len(self.heard)
         self.send()
         self._peer.wait_for(lambda: len(self.heard) >= before + 20, '20 further samples')
 
 
-def status_with(peer: Peer, heard: list[DiagnosticArray], text: str) -> DiagnosticStatus:
+def status_with(peer, heard, text):
     """Wait for the next status whose message contains a text."""
     del heard[:]
-    found: list[DiagnosticStatus] = []
+    found = []
 
-    def look() -> bool:
+    def look():
         found.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
         return bool(found)
 

@@ -2,43 +2,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns functions for simulated runs that only tests need."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
 from thermo_comp.simulation.campaign import Cyclogram
-from thermo_comp.simulation.run import SimulatedRun, Truth
-from thermo_comp.simulation.unit import UnitModel
-from thermo_comp.typing import Bools, Floats
 
 
-def of_part(truth: Truth, node: str) -> Floats:
+def of_part(truth, node):
     """Return the temperature [degC] of a part on the thermal grid."""
     return truth.temperatures[:, truth.unit.network.nodes.index(node)]
 
 
-def ideal_regime(run: SimulatedRun, threshold_k_min: float = 0.02) -> Bools:
+def ideal_regime(run, threshold_k_min=0.02):
     """Return where, on the thermal grid, the board's temperature really changes."""
     truth = run.truth
     rate = np.gradient(of_part(truth, truth.unit.board.node), truth.grid_s)
     return np.asarray(np.abs(rate) * 60.0 > threshold_k_min)
 
 
-def noiseless(unit: UnitModel) -> UnitModel:
+def noiseless(unit):
     """Return the unit without white noise on axes and thermometers."""
     return replace(unit.with_thermometers(noise_sd=0.0), noise_density=(0.0, 0.0, 0.0))
 
 
-def rates_k_min(program: Cyclogram) -> Floats:
+def rates_k_min(program):
     """Return the rate of each line between points, shape (n - 1,), K/min; 0 in a soak."""
     return np.diff(program.temperature_c) / np.diff(program.time_s) * 60.0
 
 
-def rippled(
-    program: Cyclogram, seed: int = 1, amplitude: float = 0.1, period: float = 300.0
-) -> Cyclogram:
+def rippled(program, seed=1, amplitude=0.1, period=300.0):
     """Return a program with the ripple of a chamber's control: a sine with a random-walk phase."""
     # Twelve lines per period; sd of the phase after one period: half a radian.
     time = np.arange(0.0, program.duration_s, period / 12.0)

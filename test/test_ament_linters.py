@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The linters of a ROS installation, declared in package.xml, find nothing."""
 
-from __future__ import annotations
-
 import pytest
 from conftest import ROOT
 
@@ -13,18 +11,18 @@ STYLE = ['D200', 'D205', 'D400', 'D403']
 pytestmark = pytest.mark.filterwarnings('ignore')
 
 
-def test_flake8() -> None:
+def test_flake8():
     linter = pytest.importorskip('ament_flake8.main')
     code, errors = linter.main_with_errors(argv=['--config', str(ROOT / 'setup.cfg'), *SOURCES])
     assert code == 0, '\n'.join(errors)
 
 
-def test_pep257() -> None:
+def test_pep257():
     linter = pytest.importorskip('ament_pep257.main')
     assert linter.main(argv=['--add-ignore', *STYLE, '--', *SOURCES]) == 0
 
 
-def test_xmllint() -> None:
+def test_xmllint():
     linter = pytest.importorskip('ament_xmllint.main')
     assert (
         linter.main(argv=[str(ROOT / name) for name in ('package.xml', 'config', 'launch')]) == 0

@@ -2,14 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sample bags agree with their README: small, complete, and made by its two commands."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Cli
 
 from thermo_comp.recording.reader import read_recording
 
@@ -19,13 +16,13 @@ COMMANDS = [line for line in README.splitlines() if line.startswith('thermo_comp
 SHIPPED = sorted((ROOT / 'bags').rglob('*.mcap'))
 
 
-def test_they_are_small() -> None:
+def test_they_are_small():
     assert len(SHIPPED) == 10
     assert sum(path.stat().st_size for path in (ROOT / 'bags').rglob('*')) <= 6_000_000
 
 
 @pytest.mark.parametrize('command', COMMANDS, ids=['fit', 'held_out'])
-def test_their_commands_make_them(command: str, tmp_path: Path, cli: Cli) -> None:
+def test_their_commands_make_them(command, tmp_path, cli):
     arguments = shlex.split(command)[1:]
     # The same content with a faster compression.
     arguments[arguments.index('--level') + 1] = '1'
@@ -52,7 +49,7 @@ def test_their_commands_make_them(command: str, tmp_path: Path, cli: Cli) -> Non
             np.testing.assert_allclose(readings.celsius, before.celsius, rtol=1e-12)
 
 
-def test_every_sample_can_be_corrected() -> None:
+def test_every_sample_can_be_corrected():
     # Both temperatures come before the first sample, so that every sample is corrected.
     for path in SHIPPED:
         block = read_recording(path).columns
@@ -60,7 +57,7 @@ def test_every_sample_can_be_corrected() -> None:
         assert (np.diff(block.accel_stamp_ns) > 0).all()
 
 
-def test_the_readme_counts_right() -> None:
+def test_the_readme_counts_right():
     for name, samples in (('fit/01.mcap', '18 236'), ('held_out.mcap', '15 407')):
         n = len(read_recording(ROOT / 'bags' / name).columns)
         assert n == int(samples.replace(' ', ''))

@@ -2,13 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demonstration works as described: over real DDS, without loss, equal to the offline run."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import pytest
-from conftest import Cli
 from readme_helpers import ROOT, is_alike, shown, shown_of_demo
 
 from thermo_comp.recording.reader import inspect_recording
@@ -17,11 +13,11 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 
 @pytest.fixture(autouse=True)
-def needs_ros() -> None:
+def needs_ros():
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 
-def test_end_to_end(tmp_path: Path, cli: Cli) -> None:
+def test_end_to_end(tmp_path, cli):
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     said = cli('demo', cwd=tmp_path).stdout
     assert 'messages in 15407, messages out 15407' in said
@@ -51,7 +47,7 @@ def test_end_to_end(tmp_path: Path, cli: Cli) -> None:
         assert max(one_set, two_sets) < 0.2 * raw
 
 
-def test_without_sample_bags_it_says_where_to_get_them(tmp_path: Path, cli: Cli) -> None:
+def test_without_sample_bags_it_says_where_to_get_them(tmp_path, cli):
     finished = cli('demo', '--bags', tmp_path, code=1, cwd=tmp_path)
     assert 'no sample bags in' in finished.stderr
     assert list(tmp_path.iterdir()) == []

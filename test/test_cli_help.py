@@ -4,14 +4,10 @@
 The output on a terminal is right: examples run, JSON parses, --quiet prints nothing, lines fit.
 """
 
-from __future__ import annotations
-
 import re
-from typing import Any
 
 import pytest
-from conftest import Cli, Once, parsed
-from desk_helpers import Desk
+from conftest import parsed
 from typer import rich_utils
 from typer.main import get_command
 
@@ -20,9 +16,9 @@ from thermo_comp.cli.app import app
 pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 
-def leaves(group: Any, prefix: str = '') -> dict[str, Any]:
+def leaves(group, prefix=''):
     """Return every command by the words that call it, including those of groups."""
-    found: dict[str, Any] = {}
+    found = {}
     for name, one in group.commands.items():
         inner = hasattr(one, 'commands')
         found |= leaves(one, f'{prefix}{name} ') if inner else {f'{prefix}{name}': one}
@@ -41,24 +37,17 @@ EXAMPLES = [
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
 # One example of each command that prints figures and ends by itself; `play`, `report` and `fit`
 # are tested in test_cli, test_cli_errors and test_docs.
-WITH_JSON = list(
-    {
-        one.split()[1]: one
-        for one in EXAMPLES
-        if one.split()[1] not in ('play', 'report')
-        and 'record --positions' not in one
-        and 'bags/unit42/*' not in one
-    }.values()
-)
+WITH_JSON = {
+    one.split()[1]: one
+    for one in EXAMPLES
+    if one.split()[1] not in ('play', 'report')
+    and 'record --positions' not in one
+    and 'bags/unit42/*' not in one
+}.values()
 QUICK = [one for one in EXAMPLES if one.split()[1] in ('info', 'convert', 'export', 'import')]
 
 
-@pytest.fixture(scope='module')
-def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli, once: Once) -> Desk:
-    return Desk(tmp_path_factory.mktemp('desk'), cli, once)
-
-
-def test_every_command_has_an_example() -> None:
+def test_every_command_has_an_example():
     with_example = {
         name
         for name in COMMANDS
@@ -71,7 +60,7 @@ def test_every_command_has_an_example() -> None:
 
 
 @pytest.mark.parametrize('example', EXAMPLES)
-def test_the_example_runs_and_fits_a_pipe(example: str, desk: Desk, program: Cli) -> None:
+def test_the_example_runs_and_fits_a_pipe(example, desk, program):
     finished = desk.run(example, program if example == OF_ITS_OWN else None)
     assert '\x1b' not in finished.stdout + finished.stderr
     long = [line for line in finished.stdout.splitlines() if len(line) > 80]
@@ -80,19 +69,19 @@ def test_the_example_runs_and_fits_a_pipe(example: str, desk: Desk, program: Cli
 
 
 @pytest.mark.parametrize('example', WITH_JSON)
-def test_json_is_one_object_and_nothing_else(example: str, desk: Desk) -> None:
+def test_json_is_one_object_and_nothing_else(example, desk):
     finished = desk.run(f'{example} --json -q')
     assert finished.stderr == ''
     assert parsed(finished.stdout)
 
 
 @pytest.mark.parametrize('example', QUICK)
-def test_quiet_says_nothing(example: str, desk: Desk) -> None:
+def test_quiet_says_nothing(example, desk):
     finished = desk.run(f'{example} -q')
     assert (finished.stdout, finished.stderr) == ('', '')
 
 
-def test_commands_that_print_figures_have_json() -> None:
+def test_commands_that_print_figures_have_json():
     lacking = {
         name for name, one in COMMANDS.items() if not any('--json' in p.opts for p in one.params)
     }
@@ -100,16 +89,20 @@ def test_commands_that_print_figures_have_json() -> None:
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_help_cuts_no_name(name: str, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_cuts_no_name(name, cli, monkeypatch):
     # WHY: a terminal of 80 columns showed `--reference-tempera…`, an incomplete option name.
     monkeypatch.setattr(rich_utils, 'MAX_WIDTH', 80)
     said = cli(*name.split(), '--help').stdout
     assert '…' not in said
+    assert max(map(len, said.splitlines())) <= 80
+    # The help printer takes square brackets as mark-up and drops their content.
+    assert not re.search(r' \.\s', said)
+    assert said == cli(*name.split(), '-h').stdout
     for parameter in COMMANDS[name].params:
         assert all(option in said for option in parameter.opts if option.startswith('-')), said
 
 
-def test_every_option_says_what_it_is_for() -> None:
+def test_every_option_says_what_it_is_for():
     bare = [
         f'{name} {parameter.name}'
         for name, one in COMMANDS.items()

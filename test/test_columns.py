@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of columns: all columns, the memory they need, and each value by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -124,7 +122,7 @@ def test_each_value_by_hand():
     assert at_edge[2] == 0.5
 
 
-def test_a_bend_moves_with_the_board_and_its_lag() -> None:
+def test_a_bend_moves_with_the_board_and_its_lag():
     columns = [Column('bend', 'bend', tau_s=tau, knee_k=2.0, **WIDE) for tau in (0.0, 60.0)]
     spec = memory_of(columns)
     table = ColumnTable(columns, spec, 20.0)
@@ -160,23 +158,6 @@ def test_one_state_has_the_bits_of_many(boards):
     many = table.values(states)
     for k in range(len(rows)):
         np.testing.assert_array_equal(table.values(states[:, [k]])[:, 0], many[:, k])
-
-
-def test_lags_of_a_gradient_in_a_ramp():
-    # The gradient of a sensor that departs from the board at r K/s: L = r (t - tau (1 - e)).
-    rate, n = 0.002, 3000
-    columns = [Column('gradient_lag', 'gradient_lag', 'tip', tau, **WIDE) for tau in BANK_TAUS]
-    spec = memory_of(columns, ('case', 'tip'))
-    tracker = ThermalTracker(DetectorSettings(), spec)
-    for second in range(n + 1):
-        tracker.read('board', second * SECOND_NS, 20.0)
-        tracker.read('case', second * SECOND_NS, 20.0)
-        tracker.read('tip', second * SECOND_NS, 20.0 + rate * second)
-    state = np.array(tracker.sample(n * SECOND_NS))[:, np.newaxis]
-    found = ColumnTable(columns, spec, 20.0).values(state)[:, 0]
-    expected = [rate * (n - tau * -math.expm1(-n / tau)) for tau in BANK_TAUS]
-    # The thermometer needs some readings to follow the ramp: a few mK.
-    assert found == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.parametrize(

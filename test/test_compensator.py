@@ -13,12 +13,12 @@ import pytest
 from builders import (
     GRAVITY,
     SECOND_NS,
-    Columns,
     axis_set,
     calibration,
     columns_from_events,
     regime_set,
     rich_calibration,
+    stream,
     term,
     thermal_calibration,
 )
@@ -44,29 +44,6 @@ def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=
         compensator.push('case', second * SECOND_NS, (celsius if case is None else case) + noise)
 
 
-def stream(compensator, events):
-    """
-    Run events one by one; return the rows and the indices of the published samples.
-
-    With a gyroscope a row also contains the rate, a thousandth of the sample.
-    """
-    rows, index = [], []
-    position = 0
-    for kind, stamp, value in events:
-        if kind == 'accel':
-            row = compensator.process(stamp, *map(float, value))
-            if row is not None:
-                if compensator.corrects_rate:
-                    rate = (1e-3 * float(component) for component in value)
-                    row = (*row, *compensator.correct_rate(stamp, *rate))
-                rows.append(row)
-                index.append(position)
-            position += 1
-        else:
-            compensator.push(kind, stamp, value)
-    return np.array(rows).reshape(-1, 15 if compensator.corrects_rate else 9), index
-
-
 def batch(compensator, events):
     columns = columns_from_events(events)
     return process_block(compensator, columns, 1e-3 * columns.accel)
@@ -89,20 +66,14 @@ def assert_same(blocks, rows, index):
 
 
 def test_signed_counts_and_the_printed_equations():
-    # A channel of 300 counts per m/s^2 with an offset of 12 counts sees +g and -g.
-    offset, K = 12.0, 300.0
-    plus = K * GRAVITY + offset
-    minus = -K * GRAVITY + offset
-    # Signed counts: offset = half the sum, centred count = half the difference.
-    assert (plus + minus) / 2.0 == pytest.approx(offset)
-    assert (plus - minus) / 2.0 == pytest.approx(K * GRAVITY)
-    # Eq. (3) and (4) as printed exchange the two: the "offset" would be the whole signal.
-    assert (plus - minus) / 2.0 != pytest.approx(offset)
-    compensator = Compensator(calibration(axes=Axes(*[AxisReference(K, offset)] * 3)))
+    # Signed counts of +g and -g: the offset is half their sum, the scale is of half their
+    # difference. Eq. (3) and (4) as printed exchange the two.
+    plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
+    axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
+    compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
     warm(compensator)
-    assert compensator.process(1, plus, minus, offset)[:3] == pytest.approx(
-        (GRAVITY, -GRAVITY, 0.0), abs=1e-12
-    )
+    found = compensator.process(1, plus, minus, 12.0)[:3]
+    assert found == pytest.approx((GRAVITY, -GRAVITY, 0.0), abs=1e-12)
 
 
 def test_every_term_by_hand():
@@ -122,15 +93,6 @@ def test_every_term_by_hand():
     a, b, c = ((n - bias) / scale for n in (1000.0, -500.0, 3000.0))
     # Constant temperature: the thermometer is exact, only rounding remains.
     assert (x, y, z) == pytest.approx((a, 1e-3 * a + b, 2e-3 * a - 3e-3 * b + c), abs=1e-12)
-
-
-def test_gradient_has_the_sign_of_the_ramp():
-    unit = calibration(response=(term('gradient', (30.0,) * 3),))
-    for sign in (1.0, -1.0):
-        compensator = Compensator(unit)
-        warm(compensator, 20.0, 20.0 + sign * 2.0, until_s=300)
-        x = compensator.process(300 * SECOND_NS, 0.0, 0.0, 1.0)[0]
-        assert x == pytest.approx(-sign * 30.0 * 2.0 / 300.0, rel=1e-6)
 
 
 #: One calibration for all examples, as it does not change.
@@ -185,7 +147,7 @@ def at_seconds(*events):
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
 @example(at_seconds('B', 12, 'B', 7.1, 'A', 7.1, 'B', 6.1), 1, 0.0)
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, transition_s):
     config = CompensatorConfig(transition_time_s=transition_s, case_timeout_s=2.0)
     streamed = Compensator(RICH, config)
@@ -217,64 +179,6 @@ def assert_sound(block, counters, events):
     assert np.count_nonzero(backward) <= counters.n_time_jumps
 
 
-def test_long_run_batch_equals_stream(rng):
-    events = []
-    for k in range(40_000):
-        stamp = 1_790_000_000 * SECOND_NS + k * 40_000_000
-        if k % 25 == 0:
-            # A soak, so that the regime becomes known, then a slow wave of +-14 K.
-            case = 20.0 + 14.0 * math.sin(max(k / 25.0 - 1000.0, 0.0) / 300.0)
-            events.append(('board', stamp, case - 2.0 + 0.005 * rng.standard_normal()))
-            events.append(('case', stamp, case + 0.005 * rng.standard_normal()))
-        events.append(('accel', stamp, (rng.normal(0, 900), rng.normal(0, 900), 2900.0)))
-    streamed, whole = Compensator(rich_calibration()), Compensator(rich_calibration())
-    rows, index = stream(streamed, events)
-    assert_same([batch(whole, events)], rows, index)
-    assert len(rows) == 40_000
-    assert {value for _, value in whole.take_flags()} == {True, False}
-
-
-def test_axes_are_treated_alike():
-    one = axis_set((0.0, 0.3), (1.0, 8e-5), delta=1.0)
-    two = axis_set((0.0, -0.1), (1.0, 5e-5))
-    three = axis_set((0.0, 0.7, 0.01), (1.0, -5e-5))
-
-    def run(order, sample):
-        sets = [(one, two, three)[i] for i in order]
-        compensator = Compensator(calibration(static=regime_set(*sets)))
-        warm(compensator, 27.0, until_s=60)
-        return compensator.process(60 * SECOND_NS, *(sample[i] for i in order))[:3]
-
-    sample = (500.0, -1200.0, 2500.0)
-    plain = run((0, 1, 2), sample)
-    assert run((2, 0, 1), sample) == (plain[2], plain[0], plain[1])
-
-
-def test_beyond_the_range_curves_go_on_along_their_tangent_and_the_covariance_grows():
-    one = axis_set((0.0, 0.5), (1.0, 1e-4), residual_sd_m_s2=1e-5)
-    two = axis_set((0.0, 0.6), (1.0, 1e-4), residual_sd_m_s2=1e-5)
-    unit = calibration(static=regime_set(one, one, one), dynamic=regime_set(two, two, two))
-
-    def at(celsius):
-        compensator = Compensator(unit)
-        warm(compensator, celsius, until_s=400, flicker=1e-6)
-        return compensator.process(400 * SECOND_NS, 10.0, 20.0, 3000.0), compensator.status()
-
-    edge, inside = at(35.0)
-    out, outside = at(41.0)
-    assert inside.excess.temperature == pytest.approx(0.0, abs=1e-6)
-    assert outside.excess.temperature == pytest.approx(6.0, abs=1e-6)
-    assert outside.excess.relative == pytest.approx(6.0 / 15.0, rel=1e-6)
-    for axis, raw in enumerate((10.0, 20.0, 3000.0)):
-        # The tangent of a straight line is the line: t is 21 K at 41 degC.
-        bias, scale = 0.5 * 21.0, 300.0 * (1.0 + 1e-4 * 21.0)
-        assert out[axis] == pytest.approx((raw - bias) / scale, abs=1e-8)
-    # The error is at least the slope at the edge times the excess: 0.5 counts/K * 6 K / 300
-    # counts.
-    assert math.sqrt(out[3]) > 0.5 * 6.0 / 300.0
-    assert out[3] - NOISE > 100.0 * (edge[3] - NOISE)
-
-
 def test_unknown_regime_is_paid_for_in_the_covariance():
     unit = calibration(dynamic=regime_set(axis_set(delta=3.0)))
     compensator = Compensator(unit)
@@ -302,20 +206,6 @@ def test_nothing_goes_out_before_a_temperature_or_long_after_one():
     assert compensator.process(30 * SECOND_NS, 0.0, 0.0, 1.0) is not None
     counters = compensator.counters
     assert (counters.n_out, counters.n_no_temperature, counters.n_stale) == (4, 1, 1)
-
-
-def test_bad_samples_are_dropped_and_counted():
-    compensator = Compensator(calibration())
-    warm(compensator)
-    bad = [(math.nan, 0, 0), (0, math.inf, 0), (0, 0, 32767.0), (-32768.0, 0, 0), (0, 0, 0)]
-    for k, sample in enumerate(bad):
-        assert compensator.process(k + 1, *map(float, sample)) is None
-    assert compensator.process(5, 0.0, 0.0, 1.0) is None  # repeats the previous stamp
-    counters = compensator.counters
-    assert (counters.n_not_finite, counters.n_saturated, counters.n_out_of_order) == (2, 2, 1)
-    # Three exact zeros are a broken wire.
-    assert counters.n_stuck == 1
-    assert counters.n_in == 6
 
 
 @pytest.mark.parametrize(
@@ -347,19 +237,6 @@ def test_a_reading_that_is_stamped_there_confirms_a_leap(is_read):
     if is_read:
         compensator.push('board', 19 * SECOND_NS, 20.0)
     assert (compensator.process(20 * SECOND_NS, 2.0, 3.0, 4.0) is not None) == is_read
-
-
-def test_time_that_jumps_back_starts_anew():
-    compensator = Compensator(calibration())
-    for lap in range(2):
-        warm(compensator, until_s=1500)
-        assert compensator.process(1500 * SECOND_NS, 0.0, 0.0, 1.0) is not None
-        assert compensator.counters.n_time_jumps == lap
-        flags = compensator.take_flags()
-        assert flags
-        assert not any(value for _, value in flags)
-        compensator.push('board', 0, 20.0)
-        assert compensator.process(0, 0.0, 0.0, 1.0) is not None
 
 
 def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
@@ -408,30 +285,6 @@ def test_flush_lets_the_regime_go_on_without_samples():
     compensator.flush(1500 * SECOND_NS)
     flags = compensator.take_flags()
     assert flags[-1] == (1499 * SECOND_NS, False)
-
-
-@pytest.mark.parametrize(
-    ('values', 'message'),
-    [
-        ({'temperature_timeout_s': 0.0}, '`temperature_timeout_s` must be positive'),
-        ({'transition_time_s': -1.0}, '`transition_time_s` must be zero or positive and finite'),
-        ({'case_timeout_s': math.inf}, '`case_timeout_s` must be positive'),
-        ({'stuck_timeout_s': -1.0}, '`stuck_timeout_s` must be zero or positive'),
-        ({'local_gravity_m_s2': math.nan}, '`local_gravity_m_s2` must be zero or positive'),
-        ({'gravity_tolerance_m_s2': -0.1}, '`gravity_tolerance_m_s2` must be zero or positive'),
-    ],
-)
-def test_config_refusals(values, message):
-    with pytest.raises(ValueError, match=message):
-        CompensatorConfig(**values)
-
-
-def test_empty_block():
-    block = process_block(
-        Compensator(calibration()), Columns(np.empty(0, np.int64), np.empty((0, 3)))
-    )
-    assert block.specific_force.shape == (0, 3)
-    assert block.covariance.shape == (0, 9)
 
 
 def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags by others: topics of any name, ROS 1 and 2, and units checked at rest."""
-
-from __future__ import annotations
-
-from pathlib import Path
+"""Bags by others: topics of any name, ROS 1 and 2, and units recognised at rest."""
 
 import numpy as np
 import pytest
@@ -14,7 +10,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from thermo_comp.convert.bag import bag_log, find_topics
-from thermo_comp.convert.log import write_log
+from thermo_comp.convert.log import believed_unit, contradiction, find_stillness, write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
 
@@ -27,7 +23,7 @@ IMU, TEMPERATURE, PRESSURE = (
 NAMES = {'/mpu/data': IMU, '/mpu/die': TEMPERATURE, '/baro/air': TEMPERATURE}
 
 
-def messages(ros: int, rng, scale: float, names: dict[str, str]):
+def messages(ros, rng, scale, names):
     """Yield (topic, type, log_ns, message) of a driver at rest that publishes `scale` per g."""
     types = typestore(ros).types
     vector = types['geometry_msgs/msg/Vector3']
@@ -50,7 +46,7 @@ def messages(ros: int, rng, scale: float, names: dict[str, str]):
                 yield topic, kind, now, types[kind](header(now), value, 0.0)
 
 
-def write_ros2(path: Path, rng, scale: float = G, names: dict[str, str] | None = None) -> Path:
+def write_ros2(path, rng, scale=G, names=None):
     names = names or NAMES
     with Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         store = typestore(2)
@@ -60,7 +56,7 @@ def write_ros2(path: Path, rng, scale: float = G, names: dict[str, str] | None =
     return path
 
 
-def write_ros1(path: Path, rng) -> Path:
+def write_ros1(path, rng):
     with Writer1(path) as writer:
         store = typestore(1)
         links = {t: writer.add_connection(t, kind, typestore=store) for t, kind in NAMES.items()}
@@ -158,3 +154,73 @@ def test_command(tmp_path, rng, cli):
     table.write_text('1,2,3\n')
     wrong = cli('convert', table, '--unit', 'g', '-o', tmp_path / 'two.mcap', code=2)
     assert 'a table needs no --unit; it has --columns, --rate-hz' in wrong.stderr
+
+
+@pytest.mark.parametrize(
+    ('magnitude', 'unit'),
+    [
+        (1.019, 'g'),  # an MPU6050 with 2 % of bias
+        (0.85, 'g'),
+        (9.78, 'm/s^2'),
+        (10.4, 'm/s^2'),
+        (1003.0, 'mg'),
+        (2051.0, 'counts'),
+        (16100.0, 'counts'),
+        (3003.0, 'counts'),
+        (0.1, 'unknown'),
+        (32.2, 'unknown'),  # ft/s^2
+    ],
+)
+def test_what_a_still_sensor_reads_says_its_unit(magnitude, unit):
+    believed, reason = believed_unit(magnitude)
+    assert believed == unit
+    assert f'{magnitude:.4g}' in reason
+
+
+def test_nothing_is_said_against_what_may_be_true():
+    assert contradiction('g', 1.15, None) is None
+    assert contradiction('m/s^2', 9.6, None) is None
+    # Values above those of all units are counts of a precise converter.
+    assert contradiction('counts', 2941.7, None) is None
+    assert contradiction('counts', 2060.0, 2048.0) is None
+    # Never at rest: the unit cannot be recognised.
+    assert contradiction('g', float('nan'), None) is None
+
+
+def shaken(rng, n, scale, noise):
+    """At rest, except for a shaken middle fifth."""
+    accel = scale * np.array([0.6, 0.0, 0.8]) + noise * rng.standard_normal((n, 3))
+    middle = slice(2 * n // 5, 3 * n // 5)
+    accel[middle] += 20.0 * noise * rng.standard_normal((len(accel[middle]), 3))
+    return accel
+
+
+@pytest.mark.parametrize('scale', [1.0, 9.81, 2048.0])
+def test_movement_is_found_in_any_unit(rng, scale):
+    n = 5000
+    stamp_ns = np.arange(1, n + 1) * 10_000_000
+    found = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
+    # 50 s in cells of half a second: the middle fifth is 20..30 s, on the edges of cells.
+    assert [(t0 * 1e-9, t1 * 1e-9) for t0, t1 in found.moving_ns] == [
+        (pytest.approx(20.01), pytest.approx(30.01))
+    ]
+    # The mean over 2 s of noise of 0.1 % has an sd of 0.1 % / sqrt(200).
+    assert found.magnitude == pytest.approx(scale, rel=3e-4)
+    assert found.noise == pytest.approx(1e-3 * scale, rel=0.1)
+    assert found.still_s == pytest.approx(40.0, abs=0.5)
+
+
+def test_a_sensor_that_shows_no_noise_is_not_moving(rng):
+    # Rounded to steps larger than the noise, the value changes by a step from time to time.
+    accel = np.tile([0.0, 0.0, 1.0], (1000, 1))
+    accel[::97, 0] = 0.1
+    found = find_stillness(np.arange(1000) * 10_000_000, accel)
+    assert found.moving_ns == ()
+    assert found.magnitude == pytest.approx(1.0, rel=1e-3)
+
+
+def test_too_short_to_tell():
+    found = find_stillness(np.arange(5), np.ones((5, 3)))
+    assert np.isnan(found.magnitude)
+    assert found.moving_ns == ()
+    assert np.isnan(find_stillness(np.arange(1), np.ones((1, 3))).magnitude)

@@ -6,10 +6,7 @@ ArduPilot logs: a converted DataFlash file gives the data of each sensor.
 The writer below follows the public description of the format and shares no code with the reader.
 """
 
-from __future__ import annotations
-
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,22 +31,22 @@ STEP_US = 20_000
 class DataflashWriter:
     """A minimal DataFlash log: formats, then messages."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.body = b''
-        self.types: dict[str, tuple[int, str]] = {}
+        self.types = {}
         self._format(0x80, 'FMT', 89, 'BBnNZ', 'Type,Length,Name,Format,Columns')
 
-    def _format(self, number: int, name: str, length: int, layout: str, columns: str) -> None:
+    def _format(self, number, name, length, layout, columns):
         self.body += b'\xa3\x95\x80' + struct.pack(
             '<BB4s16s64s', number, length, name.encode(), layout.encode(), columns.encode()
         )
 
-    def define(self, name: str, layout: str, columns: str) -> None:
+    def define(self, name, layout, columns):
         number = 0x81 + len(self.types)
         self.types[name] = (number, layout)
         self._format(number, name, 3 + sum(SIZES[c] for c in layout), layout, columns)
 
-    def write(self, name: str, *values: object) -> None:
+    def write(self, name, *values):
         number, layout = self.types[name]
         code = '<' + ''.join({'c': 'h', 'N': '16s'}.get(c, c) for c in layout)
         self.body += b'\xa3\x95' + bytes([number]) + struct.pack(code, *values)
@@ -59,7 +56,7 @@ def still(rng):
     return np.float32(np.array([0.2, -0.1, -9.8]) + 0.03 * rng.standard_normal((N, 3)))
 
 
-def write_new(path: Path, rng, parameters=(('INS_TCAL1_ENABLE', 0.0),)) -> np.ndarray:
+def write_new(path, rng, parameters=(('INS_TCAL1_ENABLE', 0.0),)):
     log = DataflashWriter()
     log.define('IMU', *NEW_IMU)
     log.define('BARO', *NEW_BARO)

@@ -1,24 +1,27 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of other programs: headings, dates with time zones, 24-bit words."""
-
-from __future__ import annotations
+"""Tables of other programs: headings, dates, units by physics, 24-bit words."""
 
 from datetime import datetime, timedelta, timezone
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from conftest import Cli
 from position_helpers import Rest
 
-from thermo_comp.convert.column_map import guess_columns, load_column_map, table_log
+from thermo_comp.convert.column_map import (
+    guess_columns,
+    load_column_map,
+    spoken_columns,
+    table_log,
+)
 from thermo_comp.convert.headings import map_lines, read_headings
-from thermo_comp.convert.log import NO_STAMP
+from thermo_comp.convert.log import NO_STAMP, write_log
 from thermo_comp.convert.table import exact_ns
 from thermo_comp.errors import RecordingError
 from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.recording.reader import read_recording
+from thermo_comp.simulation.campaign import positions
 
 N, STEP_NS = 1200, 10**7
 START = datetime(2026, 3, 29, 1, 30, tzinfo=timezone.utc)
@@ -30,6 +33,7 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
     ('text', 'seconds'),
     [
         ('2026-03-29T01:30:00Z', 0),
+        ('2026-03-29T01:30:00.123456789Z', 0.123456789),
         ('2026-03-29 01:30:00', 0),  # without a zone: UTC
         ('2026-03-29T03:30:00.5+02:00', 0.5),
         ('2026-03-29T03:30:00+0200', 0),  # GGIR
@@ -38,20 +42,16 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
         ('2026-03-29 01:30', 0),
     ],
 )
-def test_dates_with_their_zones(text: str, seconds: float) -> None:
+def test_dates_with_their_zones(text, seconds):
     assert exact_ns(text, 'iso') == START_NS + round(seconds * 1e9)
 
 
-def test_nanoseconds_of_a_date_are_exact() -> None:
-    assert exact_ns('2026-03-29T01:30:00.123456789Z', 'iso') == START_NS + 123456789
-
-
 @pytest.mark.parametrize('text', ['', '01:30', '2026-13-29 01:30:00', '2026-03-29T01:30:00+2'])
-def test_what_is_no_date_is_no_stamp(text: str) -> None:
+def test_what_is_no_date_is_no_stamp(text):
     assert exact_ns(text, 'iso') == NO_STAMP
 
 
-def times(kind: str) -> list[str]:
+def times(kind):
     """Write the stamps of the rows in a program's format."""
     if kind == 'pandas':
         zone = timezone(timedelta(hours=2))
@@ -80,9 +80,7 @@ def times(kind: str) -> list[str]:
         ),
     ],
 )
-def test_a_table_is_read_by_its_headings(
-    tmp_path: Path, rng: np.random.Generator, kind: str, headings: str, unit: str, one_g: float
-) -> None:
+def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, one_g):
     path = tmp_path / 'log.csv'
     accel = one_g * (UP + 0.002 * rng.standard_normal(UP.shape))
     rate = 0.01 * rng.standard_normal(UP.shape)
@@ -106,9 +104,7 @@ def test_a_table_is_read_by_its_headings(
 
 
 @pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])
-def test_a_parquet_table_is_read_by_its_headings(
-    tmp_path: Path, rng: np.random.Generator, kind: str
-) -> None:
+def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
     # WHY: Parquet needed a column map, although it contains more information than text.
     pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
     import pyarrow.parquet as pq
@@ -131,7 +127,7 @@ def test_a_parquet_table_is_read_by_its_headings(
     assert log.temperatures['board'].celsius[0] == 20.5
 
 
-def test_the_right_triad_and_thermometers_are_taken() -> None:
+def test_the_right_triad_and_thermometers_are_taken():
     found = read_headings(
         [
             *('now[ms]', 'magx', 'magy', 'magz', 'linear_acc_x', 'linear_acc_y', 'linear_acc_z'),
@@ -139,7 +135,6 @@ def test_the_right_triad_and_thermometers_are_taken() -> None:
             *('gtemp', 'AHT_tmp[C]', 'BMP_temp[K]'),
         ]
     )
-    assert found is not None
     assert (found.time, found.time_unit, found.accel_unit) == ('now[ms]', 'ms', 'mg')
     assert found.accel == ('acc_x [mg]', 'acc_y [mg]', 'acc_z [mg]')
     assert (found.gyro, found.gyro_unit) == (('gx[deg/s]', 'gy[deg/s]', 'gz[deg/s]'), 'deg/s')
@@ -151,7 +146,7 @@ def test_the_right_triad_and_thermometers_are_taken() -> None:
     assert read_headings(['time', 'magx', 'magy', 'magz']) is None
 
 
-def test_headings_that_name_nothing_are_listed(tmp_path: Path) -> None:
+def test_headings_that_name_nothing_are_listed(tmp_path):
     path = tmp_path / 'log.csv'
     path.write_text('a,b,c\n1,2,3\n2,3,4\n')
     with pytest.raises(
@@ -160,7 +155,7 @@ def test_headings_that_name_nothing_are_listed(tmp_path: Path) -> None:
         guess_columns(path)
 
 
-def test_headings_without_a_time_take_a_rate(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_headings_without_a_time_take_a_rate(tmp_path, rng):
     # WHY: --rate-hz only worked for tables without headings, and was ignored with them.
     path, rows = tmp_path / 'log.csv', UP + 0.002 * rng.standard_normal(UP.shape)
     path.write_text('\n'.join(['ax,ay,az', *(f'{x:.5f},{y:.5f},{z:.5f}' for x, y, z in rows)]))
@@ -175,7 +170,7 @@ def test_headings_without_a_time_take_a_rate(tmp_path: Path, rng: np.random.Gene
         guess_columns(path, 100.0)
 
 
-def test_the_guessed_map_is_printed(tmp_path: Path, rng: np.random.Generator, cli: Cli) -> None:
+def test_the_guessed_map_is_printed(tmp_path, rng, cli):
     accel = UP + 0.002 * rng.standard_normal(UP.shape)
     rows = [f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f}' for k, (x, y, z) in enumerate(accel)]
     (tmp_path / 'log.csv').write_text('\n'.join(['time (s),ax,ay,az', *rows]))
@@ -188,11 +183,100 @@ def test_the_guessed_map_is_printed(tmp_path: Path, rng: np.random.Generator, cl
 
 
 @pytest.mark.parametrize(('one_g', 'bits'), [(4096.0, 15), (524288.0, 23), (1e8, 31)])
-def test_words_of_24_and_32_bits_are_not_saturated(
-    rng: np.random.Generator, one_g: float, bits: int
-) -> None:
+def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
     rest = Rest(rng, level=(0.0, 0.0, one_g), sd=0.002 * one_g)
     rest.accel[:] = np.rint(rest.accel)
     rest.accel[100] = 2.0**bits - 1.0  # a valid one
     bag = reduce_source(rest.source(), full_scale=32767.0)
     assert (bag.n_saturated, len(bag.intervals)) == (1, 1)
+
+
+def write(path, rng, unit, **columns):
+    """Write three rests with other data before and after."""
+    accel = unit * (UP + 0.002 * rng.standard_normal(UP.shape))
+    parts = [columns['time'][:, None]] if 'time' in columns else []
+    parts += [accel, columns['rate']] if 'rate' in columns else [accel]
+    np.savetxt(path, np.hstack(parts), fmt='%.9g')
+    return path
+
+
+@pytest.mark.parametrize(
+    ('unit', 'said'), [(9.80665, 'm/s^2'), (1.0, 'g'), (1000.0, 'mg'), (4096.0, 'counts')]
+)
+def test_the_unit_is_that_of_gravity(tmp_path, rng, unit, said):
+    path = write(tmp_path / 'log.txt', rng, unit, time=0.01 * np.arange(len(UP)))
+    columns = guess_columns(path)
+    assert spoken_columns(columns) == f'time [s], x y z [{said}]'
+    log = table_log(path, columns)
+    assert log.input == ('counts' if said == 'counts' else 'imu')
+    write_log(log, tmp_path / 'bag.mcap')
+    force = read_recording(tmp_path / 'bag.mcap', require=('accel',)).columns.accel
+    expected = unit if said == 'counts' else 9.80665
+    np.testing.assert_allclose(np.linalg.norm(force, axis=1), expected, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ('step', 'unit', 'rate_hz'),
+    [(0.01, 's', 100), (5.0, 'ms', 200), (10000.0, 'us', 100), (5e6, 'ns', 200)],
+)
+def test_the_unit_of_times_is_that_of_a_sample_rate(tmp_path, rng, step, unit, rate_hz):
+    path = write(tmp_path / 'log.txt', rng, 9.8, time=step * np.arange(1, len(UP) + 1))
+    columns = guess_columns(path)
+    assert columns.stamp.unit == unit
+    np.testing.assert_array_equal(np.diff(table_log(path, columns).stamp_ns), 10**9 // rate_hz)
+
+
+def test_a_second_is_told_from_a_millisecond_by_how_fast_a_hand_turns(tmp_path, rng):
+    # WHY: samples at 1 Hz were taken for 1 kHz. Half a turn takes 1 s or 0.8 s.
+    angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
+    ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
+    for turned, unit in ((angle, 's'), (ramp, 'ms')):
+        up = np.column_stack((np.cos(turned), np.sin(turned), 0.0 * turned))
+        accel = 9.8 * (up + 0.002 * rng.standard_normal(up.shape))
+        path = tmp_path / f'{unit}.txt'
+        np.savetxt(path, np.column_stack((np.arange(1600.0), accel)), fmt='%.9g')
+        assert guess_columns(path).stamp.unit == unit
+
+
+@pytest.mark.parametrize(('rest_s', 'gap_s'), [(30, 0), (30, 670), (60, 1), (45, 3)])
+def test_short_rests_at_1_hz_tell_their_unit(tmp_path, rng, rest_s, gap_s):
+    # WHY: cells of 30 and more samples contained two rests, whose mean is shorter than gravity.
+    ups = positions(18, 1)
+    accel = np.repeat(ups, rest_s, axis=0) + 2e-5 * rng.standard_normal((18 * rest_s, 3))
+    times = (np.arange(18)[:, None] * (rest_s + gap_s) + np.arange(rest_s)).ravel()
+    path = tmp_path / 'log.txt'
+    np.savetxt(path, np.column_stack((times, 9.8 * accel)), fmt='%.9g')
+    columns = guess_columns(path)
+    assert spoken_columns(columns) == 'time [s], x y z [m/s^2]'
+    write_log(table_log(path, columns), tmp_path / 'bag.mcap')
+
+
+@pytest.mark.parametrize(('fastest', 'unit'), [(3.0, 'rad/s'), (170.0, 'deg/s')])
+def test_a_hand_s_turns_tell_the_unit_of_the_rate(tmp_path, rng, fastest, unit):
+    rate = np.linspace(-fastest, fastest, 3 * len(UP)).reshape(-1, 3)
+    path = write(tmp_path / 'log.txt', rng, 9.8, rate=rate)
+    columns = guess_columns(path, 100.0)
+    assert spoken_columns(columns) == f'100 Hz, x y z [m/s^2], angular rate x y z [{unit}]'
+    expected = rate if unit == 'rad/s' else np.radians(rate)
+    gyro = table_log(path, columns).gyro
+    assert gyro is not None
+    np.testing.assert_allclose(gyro, expected, atol=1e-6)
+
+
+def test_what_does_not_tell_itself_is_asked_for(tmp_path, rng):
+    path = tmp_path / 'log.txt'
+    time = 0.01 * np.arange(len(UP))
+    with pytest.raises(RecordingError, match='it has no times: give --rate-hz'):
+        guess_columns(write(path, rng, 9.8))
+    with pytest.raises(RecordingError, match='its first column has the times'):
+        guess_columns(write(path, rng, 9.8, time=time), 100.0)
+    with pytest.raises(RecordingError, match='is not a rising time'):
+        guess_columns(write(path, rng, 9.8, time=time[::-1]))
+    with pytest.raises(RecordingError, match=r'not gravity in any known unit: give a column map'):
+        guess_columns(write(path, rng, 3.3, time=time))
+    path.write_text('t,a,b,c\n' + '0,0,0,9.8\n' * 100)
+    with pytest.raises(RecordingError, match='its headings name no accelerometer'):
+        guess_columns(path)
+    path.write_text('0 0 0 9.8 20\n' * 100)
+    with pytest.raises(RecordingError, match='5 columns without headings cannot be identified'):
+        guess_columns(path)

@@ -6,10 +6,7 @@ PX4 logs: a converted ULog file gives the data of each sensor.
 The writer below follows the public description of the format and shares no code with the reader.
 """
 
-from __future__ import annotations
-
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +31,7 @@ STEP_US = 10_000
 class UlogWriter:
     """A minimal ULog: header, flag bits, formats, subscriptions, data."""
 
-    def __init__(self, *formats: str) -> None:
+    def __init__(self, *formats):
         self.body = b'ULog\x01\x12\x35\x01' + struct.pack('<Q', 0)
         self.message('B', bytes(40))
         for text in formats:
@@ -42,15 +39,15 @@ class UlogWriter:
         self.message('I', b'\x0echar[5] ver_hwTESTB')
         self.n_subscribed = 0
 
-    def message(self, kind: str, payload: bytes) -> None:
+    def message(self, kind, payload):
         self.body += struct.pack('<HB', len(payload), ord(kind)) + payload
 
-    def subscribe(self, topic: str, instance: int) -> int:
+    def subscribe(self, topic, instance):
         self.message('A', struct.pack('<BH', instance, self.n_subscribed) + topic.encode())
         self.n_subscribed += 1
         return self.n_subscribed - 1
 
-    def data(self, subscription: int, payload: bytes) -> None:
+    def data(self, subscription, payload):
         self.message('D', struct.pack('<H', subscription) + payload)
 
 
@@ -59,7 +56,7 @@ def still(rng, n=N, sd=0.03):
     return np.float32(np.array([0.2, -0.1, -9.8]) + sd * rng.standard_normal((n, 3)))
 
 
-def write_two_imus(path: Path, rng, gyro_every=1) -> dict[str, np.ndarray]:
+def write_two_imus(path, rng, gyro_every=1):
     log = UlogWriter(ACCEL, GYRO, BARO)
     ids = [log.subscribe('sensor_accel', i) for i in (0, 1)]
     gyro_id = log.subscribe('sensor_gyro', 0)
@@ -179,7 +176,7 @@ COMBINED += 'uint32_t accelerometer_integral_dt;'
 AIR = 'vehicle_air_data:uint64_t timestamp;uint64_t timestamp_sample;float baro_temp_celcius;'
 
 
-def write_combined(path: Path, rng, later=None, **parameters: int) -> np.ndarray:
+def write_combined(path, rng, later=None, **parameters):
     """Write a log with PX4's default profile, from before it logged single sensors."""
     log = UlogWriter(COMBINED, AIR)
     for name, value in parameters.items():
@@ -207,7 +204,7 @@ def write_combined(path: Path, rng, later=None, **parameters: int) -> np.ndarray
     return force
 
 
-def parameter(name: str, value: int) -> bytes:
+def parameter(name, value):
     key = f'int32_t {name}'.encode()
     return bytes([len(key)]) + key + struct.pack('<i', value)
 
@@ -284,16 +281,3 @@ def test_format_without_a_time_stamp_is_left_out(tmp_path):
     path.write_bytes(log.body)
     with pytest.raises(RecordingError, match=r'not a ULog file|holds no IMU'):
         read_autopilot(path)
-
-
-def test_command(tmp_path, rng, cli):
-    log = tmp_path / 'flight.ulg'
-    write_two_imus(log, rng)
-    finished = cli('convert', log, '--imu', '1', '-o', tmp_path / 'bag.mcap')
-    assert 'SDLOG_PROFILE' not in finished.stdout
-    assert f'{N:8} imu/uncompensated' in finished.stdout
-    finished = cli('convert', log, '--columns', log, '-o', tmp_path / 'two.mcap', code=2)
-    assert 'needs no --columns' in finished.stderr
-    finished = cli('convert', log, '--imu', '7', '-o', tmp_path / 'two.mcap', code=1)
-    assert 'no IMU 7' in finished.stderr
-    assert not (tmp_path / 'two.mcap').exists()

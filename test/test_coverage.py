@@ -4,8 +4,6 @@
 The value of further directions: against closed forms, a second route and the scatter of estimates.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -26,21 +24,21 @@ NOTHING = np.empty((0, 3))
 SD = 2e-5
 
 
-def units(rng: np.random.Generator, n: int) -> np.ndarray:
+def units(rng, n):
     vectors = rng.standard_normal((n, 3))
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def mean_variance(ups: np.ndarray, at: np.ndarray) -> float:
+def mean_variance(ups, at):
     covariance = constants_covariance(ups, np.full(len(ups), SD))
     columns = force_columns(at)
     return float(np.mean(np.trace(columns @ covariance @ columns.transpose(0, 2, 1), 0, 1, 2)))
 
 
-def test_columns_are_the_derivatives_of_the_measured_force(rng: np.random.Generator) -> None:
+def test_columns_are_the_derivatives_of_the_measured_force(rng):
     up, step = units(rng, 20), 1e-6
 
-    def force(constants: np.ndarray) -> np.ndarray:
+    def force(constants):
         bias, scale, skew = constants.reshape(3, 3)
         inverse = np.eye(3)
         inverse[1, 0], inverse[2, 0], inverse[2, 1] = skew
@@ -55,21 +53,21 @@ def test_columns_are_the_derivatives_of_the_measured_force(rng: np.random.Genera
         )
 
 
-def test_without_positions_the_prior_is_left() -> None:
+def test_without_positions_the_prior_is_left():
     covariance = constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
     # Bias and scale of one vertical axis: their variances add.
     assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
 
 
-def test_two_opposite_faces_tell_bias_and_scale_of_their_axis() -> None:
+def test_two_opposite_faces_tell_bias_and_scale_of_their_axis():
     sd = np.sqrt(np.diag(constants_covariance(FACES[:2], np.full(2, SD))))
     # Half the difference and half the sum of two numbers.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
     np.testing.assert_allclose(sd[[1, 2, 4, 5, 6, 7, 8]], PRIOR_SD[[1, 2, 4, 5, 6, 7, 8]])
 
 
-def test_the_covariance_is_the_scatter_of_estimates(rng: np.random.Generator) -> None:
+def test_the_covariance_is_the_scatter_of_estimates(rng):
     up, n = positions(12, 3), 4000
     covariance = constants_covariance(up, np.full(12, SD))
     truth = rng.standard_normal((n, 9)) * PRIOR_SD
@@ -85,7 +83,7 @@ def test_the_covariance_is_the_scatter_of_estimates(rng: np.random.Generator) ->
 
 
 @pytest.mark.parametrize('n', [0, 1, 4, 7, 11])
-def test_the_next_direction_lowers_the_mean_variance(n: int, rng: np.random.Generator) -> None:
+def test_the_next_direction_lowers_the_mean_variance(n, rng):
     up, at = units(rng, n), units(rng, 2000)
     covariance = constants_covariance(up, np.full(n, SD))
     proposed = next_direction(covariance, SD, up)
@@ -97,7 +95,7 @@ def test_the_next_direction_lowers_the_mean_variance(n: int, rng: np.random.Gene
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 
 
-def test_who_follows_the_proposals_gets_a_good_test() -> None:
+def test_who_follows_the_proposals_gets_a_good_test():
     up = NOTHING
     for _ in range(18):
         covariance = constants_covariance(up, np.full(len(up), SD))
@@ -111,7 +109,7 @@ def test_who_follows_the_proposals_gets_a_good_test() -> None:
     assert farthest(up)[1] < 36.0
 
 
-def test_the_hole_in_the_sphere() -> None:
+def test_the_hole_in_the_sphere():
     # The corners of a cube are equally far from its faces.
     up, angle = farthest(FACES)
     assert np.abs(up) == pytest.approx(1.0 / np.sqrt(3.0))
@@ -129,5 +127,5 @@ def test_the_hole_in_the_sphere() -> None:
         ((3, 1, 0), '+x and +y up in part: x +0.95 g, y +0.32 g, z +0.00 g'),
     ],
 )
-def test_a_direction_in_words(up: tuple[float, ...], words: str) -> None:
+def test_a_direction_in_words(up, words):
     assert spoken_direction(np.array(up, float) / np.linalg.norm(up)) == words

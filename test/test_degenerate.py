@@ -7,44 +7,34 @@ silently.
 `benchmarks/degenerate.py` runs every command on every input.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import degenerate
 import pytest
-from conftest import Cli
 
 
 @pytest.mark.parametrize(
-    ('name', 'commands'),
+    ('name', 'command'),
     [
-        ('jump of a year', ('evaluate',)),
-        ('jump from 1970', ('fit',)),
-        ('equal stamps', ('info', 'replay')),
-        ('reversed stamps', ('info', 'fit')),
-        ('stamps of the limits', ('info',)),
-        ('one sample', ('fit',)),
-        ('all zeros', ('fit',)),
-        ('readings of one stamp', ('info',)),
-        ('all values 1e308', ('report',)),
-        ('name not UTF-8', ('replay',)),
-        ('csv after 2038', ('convert',)),
-        ('parquet of large uint64', ('convert',)),
+        ('jump of a year', 'evaluate'),
+        ('jump from 1970', 'fit'),
+        ('equal stamps', 'replay'),
+        ('reversed stamps', 'fit'),
+        ('stamps of the limits', 'info'),
+        ('one sample', 'fit'),
+        ('all zeros', 'fit'),
+        ('readings of one stamp', 'info'),
+        ('all values 1e308', 'report'),
+        ('name not UTF-8', 'replay'),
     ],
 )
-def test_it_ends_with_a_sentence_in_bounded_memory(
-    name: str, commands: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_it_ends_with_a_sentence_in_bounded_memory(name, command, tmp_path):
     folder = tmp_path / 'in' / 'unit'
     folder.mkdir(parents=True)
     path = degenerate.INPUTS[name].make(folder)
-    for command in commands:
-        out = tmp_path / command
-        out.mkdir()
-        (out / 'map.yaml').write_text(degenerate.MAP)
-        done = degenerate.run(name, command, path, out)
-        assert not done.is_bad, done
+    out = tmp_path / command
+    out.mkdir()
+    (out / 'map.yaml').write_text(degenerate.MAP)
+    done = degenerate.run(name, command, path, out)
+    assert not done.is_bad, done
 
 
 @pytest.mark.parametrize(
@@ -60,9 +50,7 @@ def test_it_ends_with_a_sentence_in_bounded_memory(
         ('axes that lean', 'with one unit for three axes at right angles?'),
     ],
 )
-def test_the_cause_is_said_in_the_users_words(
-    name: str, said: str, tmp_path: Path, cli: Cli
-) -> None:
+def test_the_cause_is_said_in_the_users_words(name, said, tmp_path, cli):
     path = degenerate.INPUTS[name].make(tmp_path)
     failed = cli('fit', path, '--gravity', '9.81', '-o', tmp_path / 'out.yaml', code=1)
     (line,) = [one for one in failed.stderr.splitlines() if ': error: ' in one]

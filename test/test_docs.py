@@ -2,22 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands and snippets on the pages work, and every page is in the site."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
 import re
 import shutil
-import subprocess
 import sys
-from pathlib import Path
 
 import matplotlib as mpl
 import pytest
 import yaml
-from conftest import ROOT, Cli, Once, parsed
-from desk_helpers import Desk
+from conftest import ROOT, parsed, ran
 from matplotlib import pyplot as plt
 from readme_helpers import is_alike
 
@@ -35,7 +30,7 @@ ELSEWHERE = (
 )
 
 
-def commands() -> list[tuple[str, str, str]]:
+def commands():
     """Return page, command, and the output shown for it (empty for none)."""
     found = []
     for page in PAGES:
@@ -55,15 +50,8 @@ def commands() -> list[tuple[str, str, str]]:
 COMMANDS = commands()
 
 
-@pytest.fixture(scope='module')
-def desk(tmp_path_factory: pytest.TempPathFactory, cli: Cli, once: Once) -> Desk:
-    return Desk(tmp_path_factory.mktemp('desk'), cli, once)
-
-
 @pytest.mark.parametrize(('page', 'command', 'output'), COMMANDS, ids=[c for _, c, _ in COMMANDS])
-def test_the_command_does_what_the_page_says(
-    page: str, command: str, output: str, desk: Desk
-) -> None:
+def test_the_command_does_what_the_page_says(page, command, output, desk):
     if '--install-completion' in command:
         pytest.skip('writes into the home of who runs it')
     finished = desk.run(command)
@@ -73,28 +61,23 @@ def test_the_command_does_what_the_page_says(
         assert is_alike(finished.stdout, output), finished.stdout
 
 
-def test_there_are_commands_to_run() -> None:
+def test_there_are_commands_to_run():
     assert {page for page, _, _ in COMMANDS} >= {'README.md', 'integration.md', 'recording.md'}
 
 
-def test_completion_is_a_script_that_bash_takes(root: Path) -> None:
+def test_completion_is_a_script_that_bash_takes():
     bash = shutil.which('bash')
     if bash is None:
         pytest.skip('no bash')
     # The program looks for the shell that started it; the `:` keeps that shell waiting.
-    finished = subprocess.run(
-        [bash, '-c', f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'
+    finished = ran(bash, '-c', words)
     assert (finished.returncode, finished.stderr) == (0, '')
     assert 'thermo_comp' in finished.stdout
 
 
-def test_every_page_is_in_the_site_s_menu() -> None:
-    def listed(entry: object) -> list[str]:
+def test_every_page_is_in_the_site_s_menu():
+    def listed(entry):
         if isinstance(entry, str):
             return [entry]
         inner = entry.values() if isinstance(entry, dict) else entry
@@ -104,24 +87,19 @@ def test_every_page_is_in_the_site_s_menu() -> None:
     assert sorted(listed(nav)) == sorted(page.name for page in [*PAGES[1:], TUTORIAL])
 
 
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+def test_the_site_builds_without_a_warning(tmp_path):
     for module in ('material', 'mkdocstrings', 'mkdocs_jupyter'):
         pytest.importorskip(module, reason=f'{module} is not installed: the extra `docs`')
-    finished = subprocess.run(
-        [sys.executable, '-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path / 'site'],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = ('-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path / 'site')
+    finished = ran(sys.executable, *words)
     assert finished.returncode == 0, finished.stderr
     assert (tmp_path / 'site' / 'index.html').is_file()
 
 
-def test_the_tutorial_prints_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_tutorial_prints_what_it_shows(monkeypatch):
     mpl.use('Agg')
     monkeypatch.chdir(ROOT / 'docs')
-    names: dict[str, object] = {}
+    names = {}
     n_figures = 0
     for cell in json.loads(TUTORIAL.read_text())['cells']:
         if cell['cell_type'] != 'code':
@@ -138,7 +116,7 @@ def test_the_tutorial_prints_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> N
     assert n_figures == 2
 
 
-def test_refusals_are_quoted_as_they_are_said() -> None:
+def test_refusals_are_quoted_as_they_are_said():
     text = (ROOT / 'docs' / 'recording.md').read_text()
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10

@@ -2,14 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Topics of a driver over DDS: a temperature in another message, or without a stamp."""
 
-from __future__ import annotations
-
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -23,7 +18,6 @@ from ros_helpers import (
     SECOND_NS,
     START_NS,
     TIMEOUT,
-    Peer,
     node_arguments,
     node_in_thread,
     stamped,
@@ -44,20 +38,20 @@ NAMES = {'board': '/pack:temperature', 'case': '/case_t'}
 
 
 @pytest.fixture
-def unit(tmp_path: Path) -> Path:
+def unit(tmp_path):
     path = tmp_path / 'unit.yaml'
     save_calibration(thermal_calibration(), path)
     return path
 
 
-def sample(stamp_ns: int) -> Vector3Stamped:
+def sample(stamp_ns):
     message = stamped(Vector3Stamped(), stamp_ns, 'imu')
     message.vector.x, message.vector.y, message.vector.z = standing(0)
     return message
 
 
 @pytest.mark.parametrize('is_file', [False, True])
-def test_the_node_finds_the_type_while_it_runs(peer: Peer, unit: Path, is_file: bool) -> None:
+def test_the_node_finds_the_type_while_it_runs(peer, unit, is_file):
     topics = ','.join(f'{name}={topic}' for name, topic in NAMES.items())
     if is_file:
         (unit.parent / 'lab.yaml').write_text(
@@ -66,8 +60,8 @@ def test_the_node_finds_the_type_while_it_runs(peer: Peer, unit: Path, is_file: 
         topics = str(unit.parent / 'lab.yaml')
     heard = peer.listen(DiagnosticArray, '/diagnostics')
 
-    def values(**expected: float) -> Callable[[], bool]:
-        def look() -> bool:
+    def values(**expected):
+        def look():
             found = {one.key: one.value for array in heard for one in array.status[0].values}
             return all(
                 found.get(name, 'x').replace('.', '').lstrip('-').isdecimal()
@@ -105,18 +99,14 @@ def test_the_node_finds_the_type_while_it_runs(peer: Peer, unit: Path, is_file: 
         ('imu=/imu/data_raw', "must be 'm/s^2' (parameter `input` is imu), got 'counts'"),
     ],
 )
-def test_topics_that_cannot_be(
-    unit: Path, topics: str, text: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_topics_that_cannot_be(unit, topics, text, capfd):
     command = ['thermo_comp_node', '--ros-args', *node_arguments(unit, f'topics:={topics}')]
     assert main(command) == 1
     (line,) = capfd.readouterr().err.splitlines()
     assert text in line
 
 
-def test_a_drivers_imu_data_raw_needs_another_output(
-    unit: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_drivers_imu_data_raw_needs_another_output(unit, capfd):
     calibration = replace(thermal_calibration(), unit=Unit('T-1', 'm/s^2', 160.0, 0.01))
     save_calibration(calibration, unit, overwrite=True)
     command = [
@@ -132,10 +122,10 @@ def test_a_drivers_imu_data_raw_needs_another_output(
         assert node.node.count_publishers('/imu/compensated') == 1
 
 
-def test_record_writes_them_as_temperatures(peer: Peer) -> None:
-    found: dict[str, list[bytes]] = {}
+def test_record_writes_them_as_temperatures(peer):
+    found = {}
     pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
-    messages: list[tuple[str, Any]] = [
+    messages = [
         ('accel', sample(START_NS)),
         ('case', Float64(data=23.0)),
         ('board', stamped(BatteryState(temperature=25.0), START_NS + 5)),
@@ -146,9 +136,9 @@ def test_record_writes_them_as_temperatures(peer: Peer) -> None:
             'case': peer.publisher(Float64, '/case_t'),
             'board': peer.publisher(BatteryState, '/pack'),
         }
-        sent: list[str] = []
+        sent = []
 
-        def wait(_seconds: float) -> bool:
+        def wait(_seconds):
             """
             Send each message after the previous one has arrived; return when all have arrived.
             """
@@ -168,7 +158,7 @@ def test_record_writes_them_as_temperatures(peer: Peer) -> None:
     assert (board.temperature, board.header.stamp.nanosec) == (25.0, 5)
 
 
-def test_a_live_field_reads_what_rclpy_wrote() -> None:
+def test_a_live_field_reads_what_rclpy_wrote():
     message = stamped(BatteryState(temperature=25.0, cell_temperature=[1.0, 2.5]), START_NS + 7)
     data = serialize_message(message)
     for path, value in (('temperature', 25.0), ('cell_temperature[1]', 2.5)):

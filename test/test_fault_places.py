@@ -8,8 +8,6 @@ fault at the start of the ramp, or when a sensor came back with another value. P
 published sample is within five of its standard deviations.
 """
 
-from __future__ import annotations
-
 import math
 import re
 
@@ -20,7 +18,6 @@ from fault_rig import (
     BOARD_LAG_S,
     RAMP_K_S,
     START_NS,
-    Inject,
     bag,
     chain,
     corrected,
@@ -31,7 +28,7 @@ from fault_rig import (
     unit,
     value,
 )
-from fault_rows import ROWS, Row
+from fault_rows import ROWS
 
 PAGE = ROOT / 'docs' / 'faults.md'
 SIGMAS = 5.0
@@ -51,7 +48,7 @@ SIGMAS = 5.0
     ],
     ids=['both stop early', 'both stop later', 'both freeze', 'case steps', 'both step'],
 )
-def test_nothing_wrong_is_published(inject: Inject) -> None:
+def test_nothing_wrong_is_published(inject):
     stamps, table = corrected(inject(bag()))
     seconds = (stamps - START_NS) * 1e-9
     sd = np.sqrt(table[:, [3, 6, 8]])
@@ -61,14 +58,14 @@ def test_nothing_wrong_is_published(inject: Inject) -> None:
     assert sd[450:540].max() < 3e-4
 
 
-def settling_s() -> float:
+def settling_s():
     """Return the time until the board's lag has reduced the rate of a ramp, plus the dwell [s]."""
     detector = unit().detector
     ramp = 60.0 * RAMP_K_S
     return BOARD_LAG_S * math.log(ramp / detector.relaxed_rate_k_min) + detector.dwell_s
 
 
-def ended_s(row: Row) -> float:
+def ended_s(row):
     """Return the time from which the messages are those of the undisturbed bag again."""
     at, _ = row.shift
     if math.isfinite(at):
@@ -81,7 +78,7 @@ def ended_s(row: Row) -> float:
     return seconds_of(clean[-1 - n_same][1])
 
 
-def test_every_transient_fault_is_over_within_the_detector_s_settling_time() -> None:
+def test_every_transient_fault_is_over_within_the_detector_s_settling_time():
     back = {
         row.fault: row.recovered - ended_s(row) for row in ROWS if 0 < row.recovered < math.inf
     }
@@ -91,7 +88,7 @@ def test_every_transient_fault_is_over_within_the_detector_s_settling_time() -> 
     assert f'after {max(back.values()):.0f} s' in page
 
 
-def test_the_page_has_every_row_and_names_tests_that_are_there() -> None:
+def test_the_page_has_every_row_and_names_tests_that_are_there():
     named = re.findall(r'`(test_\w+\.py)::(\w+)(?:\[(.+)\])?` \|$', PAGE.read_text(), re.MULTILINE)
     assert [row for *_, row in named if row] == [row.fault for row in ROWS]
     for file, name, _ in named:

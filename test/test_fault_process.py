@@ -2,22 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults of processes and files around the node: restarts, signals, reloads, calibration files."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-from fault_bench import Bench, Heard, bench
+import soak
+from fault_bench import bench
 from fault_rig import RATE_HZ, START_NS, bag, corrected, force_at, seconds_of, unit
 
 from thermo_comp.unit.calibration import Unit
@@ -27,25 +24,25 @@ SIGMAS = 5.0
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     save_calibration(unit(), tmp_path / 'unit.yaml')
     return tmp_path / 'unit.yaml'
 
 
 @pytest.fixture
-def node(path: Path) -> Iterator[Bench]:
+def node(path):
     with bench(path) as started:
         yield started
 
 
-def sigmas(heard: Heard) -> float:
+def sigmas(heard):
     """Return the largest error in units of the published standard deviation."""
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
     return float((np.abs(heard.force - force_at(seconds)) / sd).max())
 
 
-def test_a_publisher_restarts(node: Bench) -> None:
+def test_a_publisher_restarts(node):
     events = bag(duration_s=100.0)
     first = node.play([e for e in events if seconds_of(e[1]) < 50.0])
     node.restart_publishers()
@@ -55,7 +52,7 @@ def test_a_publisher_restarts(node: Bench) -> None:
     assert second.values['lost'] == '0'
 
 
-def test_the_node_is_killed_and_restarts_in_the_ramp(path: Path) -> None:
+def test_the_node_is_killed_and_restarts_in_the_ramp(path):
     events = [e for e in bag() if seconds_of(e[1]) < 300.0]
     _, undisturbed = corrected(events)
     with bench(path) as node:
@@ -81,15 +78,15 @@ def test_the_node_is_killed_and_restarts_in_the_ramp(path: Path) -> None:
     )
 
 
-def replaced(path: Path) -> None:
+def replaced(path):
     path.write_text(dump_calibration(unit(unit=Unit('F-2', 'counts', 8388607.0, 0.08))))
 
 
-def truncated(path: Path) -> None:
+def truncated(path):
     path.write_bytes(path.read_bytes()[:-300])
 
 
-def unreadable(path: Path) -> None:
+def unreadable(path):
     if os.geteuid():
         path.chmod(0)
     else:
@@ -98,39 +95,35 @@ def unreadable(path: Path) -> None:
         path.symlink_to('/proc/self/mem')
 
 
-def huge(path: Path) -> None:
+def huge(path):
     os.truncate(path, 1 << 30)
 
 
-def aliases(path: Path) -> None:
+def aliases(path):
     lines = ['a0: &a0 [x, x, x, x, x, x, x, x, x]']
     lines += [f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]' for k in range(1, 30)]
     path.write_text('\n'.join(lines))
 
 
-def directory(path: Path) -> None:
+def directory(path):
     path.unlink()
     path.mkdir()
 
 
-def fifo(path: Path) -> None:
+def fifo(path):
     path.unlink()
     os.mkfifo(path)
 
 
-DAMAGES: dict[Callable[[Path], None], str] = {
-    replaced: "unit.serial: must be 'F-1'",
-    truncated: '',
-    unreadable: 'cannot be read: ',
-    huge: f'at most {SIZE_LIMIT} are accepted',
-    aliases: 'YAML aliases are not accepted',
-    directory: 'cannot be read: ',
-    fifo: 'cannot be read: not a regular file',
+DAMAGES = {
+    replaced: "unit.serial: must be 'F-1'", truncated: '', unreadable: 'cannot be read: ',
+    huge: f'at most {SIZE_LIMIT} are accepted', aliases: 'YAML aliases are not accepted',
+    directory: 'cannot be read: ', fifo: 'cannot be read: not a regular file',
     Path.unlink: 'cannot be read: No such file or directory',
-}
+}  # fmt: skip
 
 
-def test_calibration_files_that_go_bad(path: Path, tmp_path: Path) -> None:
+def test_calibration_files_that_go_bad(path, tmp_path):
     events = bag(duration_s=90.0)
     good = path.read_bytes()
     heard = []
@@ -157,18 +150,18 @@ def test_calibration_files_that_go_bad(path: Path, tmp_path: Path) -> None:
     assert n == sum(e[0] == 'counts' for e in events if seconds_of(e[1]) < 80.0)
 
 
-def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
+def test_a_storm_of_reloads_at_1_khz(tmp_path):
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
     # Long enough for any machine; the loop ends with the last answer.
     events = bag(rate_hz=1000.0, duration_s=60.0)
-    n_reloads = 200
+    n_reloads = 100
     with bench(path) as node:
         answers, news = list[bool](), threading.Event()
         node.take()
 
-        def ask() -> Any:
+        def ask():
             future = node.ask(calibration_file=str(path))
             future.add_done_callback(lambda _: news.set())
             return future
@@ -200,7 +193,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_samples_flow(path: Path, number: int) -> None:
+def test_a_signal_while_samples_flow(path, number):
     with bench(path) as node:
         heard = node.play(bag(duration_s=20.0))
         node.send(bag(duration_s=40.0, start_s=20.0))
@@ -208,3 +201,15 @@ def test_a_signal_while_samples_flow(path: Path, number: int) -> None:
         assert node.process.said == ''
         node.is_ended = True
     assert sigmas(heard) < SIGMAS
+
+
+def test_slope_and_its_error(rng):
+    time = np.arange(3600.0)
+    values = 100.0 + 7.0 * time / 3600.0 + rng.standard_normal(3600)
+    # The start is not counted.
+    values[:300] += 50.0
+    slope, sd = soak.slope(list(zip(time.tolist(), values.tolist(), strict=True)), 60.0)
+    # Sd of a mean of 60, divided by sqrt(sum of squared hours) of 54 windows over 0.9 h.
+    assert sd == pytest.approx(1.0 / 60**0.5 / (54 * 0.9**2 / 12) ** 0.5, rel=0.3)
+    assert abs(slope - 7.0) < 4.0 * sd
+    assert soak.slope([(0.0, 1.0), (1.0, 1.0)], 60.0) is None

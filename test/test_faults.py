@@ -5,10 +5,7 @@ The fault table: each row through the compensator and the node's diagnostics, ev
 the truth; rows about the order of arrival also over DDS into the node process, which must agree.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, fields
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +13,8 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from fault_bench import Heard, bench, lots
-from fault_rig import CONFIG, Event, bag, corrected, force_at, unit
-from fault_rows import ROWS, Row, true_seconds
+from fault_rig import CONFIG, bag, corrected, force_at, unit
+from fault_rows import ROWS, true_seconds
 
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.ros.conversion import Traffic
@@ -36,7 +33,7 @@ OVER_DDS = (
 )
 
 
-def direct(events: list[Event]) -> Heard:
+def direct(events):
     """Return what the node publishes for these messages, computed without DDS."""
     compensator = Compensator(unit(), CONFIG)
     loaded = LoadedCalibration(compensator.calibration, 'unit.yaml', '')
@@ -59,7 +56,7 @@ def direct(events: list[Event]) -> Heard:
     return Heard(stamps, table[:, :3], covariance, reports)
 
 
-def wrong(row: Row, heard: Heard) -> np.ndarray:
+def wrong(row, heard):
     """Return the times of wrong published samples outside the blind span."""
     seconds = true_seconds(row, heard.stamp_ns)
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
@@ -69,12 +66,12 @@ def wrong(row: Row, heard: Heard) -> np.ndarray:
 
 
 @pytest.fixture(scope='module')
-def reference() -> tuple[np.ndarray, np.ndarray]:
+def reference():
     return corrected(bag())
 
 
 @pytest.mark.parametrize('row', ROWS, ids=[row.fault for row in ROWS])
-def test_row(row: Row, reference: tuple[np.ndarray, np.ndarray]) -> None:
+def test_row(row, reference):
     source = row.source or bag()
     heard = direct(row.inject(list(source)))
     seconds = true_seconds(row, heard.stamp_ns)
@@ -100,7 +97,7 @@ def test_row(row: Row, reference: tuple[np.ndarray, np.ndarray]) -> None:
     assert late.any() == np.isfinite(row.recovered)
 
 
-def test_the_node_gives_the_same_over_dds(tmp_path: Path) -> None:
+def test_the_node_gives_the_same_over_dds(tmp_path):
     save_calibration(unit(), tmp_path / 'unit.yaml')
     rows = [row for row in ROWS if row.fault in OVER_DDS]
     assert len(rows) == len(OVER_DDS)

@@ -2,16 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Updates in the field against the truth, the best filter and closed forms; the drift watch."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from builders import calibration, rich_calibration
-from conftest import ROOT, Cli, parsed
+from conftest import ROOT, parsed
 from field_helpers import any_way, rests, upright, write_log
 from scipy.stats import norm
 
@@ -48,15 +45,15 @@ def known(**keys):
     return replace(value, posterior=posterior_of(to_file @ to_file.T + np.diag(sd**2)))
 
 
-def no_error(_days: float) -> np.ndarray:
+def no_error(_days):
     return ZERO
 
 
-def jump_of(size: float, day: float):
+def jump_of(size, day):
     return lambda days: size * MICRO_G * np.array([0.0, 0.0, float(days >= day)])
 
 
-def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit() -> None:
+def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     # Every column and both sets, on a ramp; the second route is a difference of two evaluations.
     unit = rich_calibration()
     found = rests(unit, any_way, no_error, days=1, rate=0.5 / 60.0)
@@ -89,7 +86,7 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit() -> None:
         assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
 
 
-def test_an_update_with_the_true_variances_is_the_kalman_filter() -> None:
+def test_an_update_with_the_true_variances_is_the_kalman_filter():
     process = field_units.Process()
     history = field_units.live('carried', 3, 6, process)
     unit = field_units.calibration()
@@ -126,7 +123,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter() -> None:
         assert abs(found.shift[scale] - expected) < 0.2 * np.sqrt(found.posterior[scale, scale])
 
 
-def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave() -> None:
+def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave():
     # Walks, turn-on and one shock over 30 days, level and carried.
     squares, ratios = [], []
     for kind, seed in (('level', 1), ('level', 2), ('level', 4), ('carried', 1)):
@@ -160,7 +157,7 @@ def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave() -
     assert np.sqrt(np.mean(np.square(ratios))) < 1.4
 
 
-def test_axes_that_no_rest_shows_keep_their_bits() -> None:
+def test_axes_that_no_rest_shows_keep_their_bits():
     unit = known()
     found = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     new = found.calibration
@@ -177,7 +174,7 @@ def test_axes_that_no_rest_shows_keep_their_bits() -> None:
     assert new_sd > old_sd
 
 
-def test_a_jump_is_told_from_ageing(rng: np.random.Generator) -> None:
+def test_a_jump_is_told_from_ageing(rng):
     unit = known()
     jumped = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     (change,) = jumped.changes
@@ -192,7 +189,7 @@ def test_a_jump_is_told_from_ageing(rng: np.random.Generator) -> None:
     assert along == pytest.approx(60.0 * MICRO_G, rel=0.4)
 
 
-def test_a_curve_that_has_changed_is_found_and_mended() -> None:
+def test_a_curve_that_has_changed_is_found_and_mended():
     # 5 ug/K of the z bias, and temperatures of 15 to 25 degC in the log.
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
@@ -210,7 +207,7 @@ def test_a_curve_that_has_changed_is_found_and_mended() -> None:
     assert curves[1] - curves[0] == pytest.approx(5.0 * MICRO_G, abs=1.5 * MICRO_G)
 
 
-def test_a_start_that_contradicts_all_others_is_left_out() -> None:
+def test_a_start_that_contradicts_all_others_is_left_out():
     unit = known()
     found = rests(unit, upright, jump_of(100.0, 8.0), days=15)
     wrong = found[80][0]
@@ -223,14 +220,14 @@ def test_a_start_that_contradicts_all_others_is_left_out() -> None:
     assert result.moved[2].reading == pytest.approx(100.0 * MICRO_G, abs=20.0 * MICRO_G)
 
 
-def test_too_few_starts_are_refused() -> None:
+def test_too_few_starts_are_refused():
     unit = known()
     found = rests(unit, upright, no_error, days=1)[:8]
     with pytest.raises(FitError, match='rests of 2 starts, need 3 at least'):
         update(series_of(found, unit), unit)
 
 
-def test_the_first_passage_is_that_of_the_reflection_principle() -> None:
+def test_the_first_passage_is_that_of_the_reflection_principle():
     # Inside (-c, c): sum (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)] with s^2 = rate t.
     rate, bound = 4.0, 50.0
     for probability, days in zip((0.1, 0.5, 0.9), passage(0.0, 0.0, rate, bound), strict=True):
@@ -242,7 +239,7 @@ def test_the_first_passage_is_that_of_the_reflection_principle() -> None:
     assert passage(0.0, 0.0, 1e-12, bound) == (np.inf,) * 3
 
 
-def test_the_watch_names_the_day_and_the_class_of_temperature() -> None:
+def test_the_watch_names_the_day_and_the_class_of_temperature():
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )
@@ -263,7 +260,7 @@ def test_the_watch_names_the_day_and_the_class_of_temperature() -> None:
 
 
 @pytest.fixture
-def unit_file(tmp_path: Path) -> Path:
+def unit_file(tmp_path):
     path = tmp_path / 'unit.yaml'
     created = Provenance(created='2029-12-31T00:00:00Z')
     save_calibration(known(provenance=created), path)
@@ -271,7 +268,7 @@ def unit_file(tmp_path: Path) -> Path:
 
 
 @pytest.mark.usefixtures('no_figures')
-def test_update_by_the_command_line(tmp_path: Path, unit_file: Path, cli: Cli) -> None:
+def test_update_by_the_command_line(tmp_path, unit_file, cli):
     unit = load_calibration(unit_file)
     found = rests(unit, upright, jump_of(300.0, 10.0))
     log, new = write_log(tmp_path / 'rests', found), tmp_path / 'new.yaml'
@@ -291,7 +288,7 @@ def test_update_by_the_command_line(tmp_path: Path, unit_file: Path, cli: Cli) -
     assert 'has been updated with all of these rests' in again.stderr
 
 
-def test_nothing_gained_writes_nothing(tmp_path: Path, unit_file: Path, cli: Cli) -> None:
+def test_nothing_gained_writes_nothing(tmp_path, unit_file, cli):
     unit = load_calibration(unit_file)
     log = write_log(tmp_path / 'rests', rests(unit, upright, no_error))
     said = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', '--json', code=3)
@@ -303,7 +300,7 @@ def test_nothing_gained_writes_nothing(tmp_path: Path, unit_file: Path, cli: Cli
     assert 'recalibration interval' in text
 
 
-def test_mistakes_end_in_one_sentence(tmp_path: Path, unit_file: Path, cli: Cli) -> None:
+def test_mistakes_end_in_one_sentence(tmp_path, unit_file, cli):
     unit = load_calibration(unit_file)
     other = replace(unit, unit=replace(unit.unit, serial='T-2'))
     log = write_log(tmp_path / 'rests', rests(other, upright, no_error, days=2))
@@ -324,7 +321,7 @@ def test_mistakes_end_in_one_sentence(tmp_path: Path, unit_file: Path, cli: Cli)
     assert 'logged with a calibration that has other columns' in said
 
 
-def test_the_newest_of_many_starts_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_newest_of_many_starts_are_used(monkeypatch):
     unit = known()
     series = series_of(rests(unit, upright, no_error), unit)
     everything = rows_of(series, MICRO_G)

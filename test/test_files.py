@@ -7,18 +7,14 @@ WHY: `--force` destroyed the recordings that a command read; of two writers one 
 silently; an output was readable by everyone whatever the umask, and replaced a link.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from builders import calibration
-from conftest import Cli
 from test_cli_errors import bag
 
 from thermo_comp.errors import OutputError
@@ -32,7 +28,6 @@ from thermo_comp.files import (
     PARQUET,
     PICTURE,
     Draft,
-    Kind,
     check_output,
     write_atomically,
 )
@@ -42,7 +37,7 @@ FILES = (CALIBRATION, PAGE, PARAMETERS, PARQUET, MCAP, PICTURE, CSV)
 
 
 @contextmanager
-def umask(mask: int) -> Iterator[None]:
+def umask(mask):
     before = os.umask(mask)
     try:
         yield
@@ -51,7 +46,7 @@ def umask(mask: int) -> Iterator[None]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """Return a folder with bags of each kind, a calibration, and other names of them."""
     save_calibration(calibration(), tmp_path / 'unit.yaml')
     bag(tmp_path / 'raw.mcap')
@@ -101,9 +96,7 @@ FIT = ('fit', '--gravity', '9.80665')
     ],
     ids=lambda value: ' '.join(value) if isinstance(value, tuple) else value,
 )
-def test_an_output_is_never_an_input(
-    folder: Path, cli: Cli, command: tuple[str, ...], source: str, output: str
-) -> None:
+def test_an_output_is_never_an_input(folder, cli, command, source, output):
     before = {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()}
     finished = cli(*command, source, '-o', output, '--force', code=None, cwd=folder)
     assert finished.returncode in (1, 2), finished.stderr
@@ -114,7 +107,7 @@ def test_an_output_is_never_an_input(
 
 @pytest.mark.parametrize('kind', FILES, ids=lambda kind: kind.name)
 @pytest.mark.parametrize('there', ['work', 'empty', 'folder', 'fifo', 'device'])
-def test_only_the_same_kind_is_replaced(tmp_path: Path, kind: Kind, there: str) -> None:
+def test_only_the_same_kind_is_replaced(tmp_path, kind, there):
     path = tmp_path / 'output'
     if there == 'fifo':
         os.mkfifo(path)
@@ -134,7 +127,7 @@ def test_only_the_same_kind_is_replaced(tmp_path: Path, kind: Kind, there: str) 
         write_atomically(path, b'new', kind, overwrite=False)
 
 
-def test_what_a_command_wrote_is_of_its_kind(folder: Path, cli: Cli) -> None:
+def test_what_a_command_wrote_is_of_its_kind(folder, cli):
     for command in (
         ('export', 'unit.yaml', '--to', 'px4', '-o', 'a.params'),
         ('export', 'unit.yaml', '--to', 'ardupilot', '-o', 'a.parm'),
@@ -148,12 +141,12 @@ def test_what_a_command_wrote_is_of_its_kind(folder: Path, cli: Cli) -> None:
 
 
 @pytest.mark.parametrize('kind', [MCAP, BAG], ids=lambda kind: kind.name)
-def test_of_two_writers_one_wins(tmp_path: Path, kind: Kind) -> None:
+def test_of_two_writers_one_wins(tmp_path, kind):
     start = threading.Barrier(8)
-    won: list[str] = []
-    lost: list[str] = []
+    won = []
+    lost = []
 
-    def write(name: str) -> None:
+    def write(name):
         draft = Draft(tmp_path / 'out', kind)
         where = draft.partial / 'metadata.yaml' if kind.is_folder else draft.partial
         where.write_text(name)
@@ -178,10 +171,8 @@ def test_of_two_writers_one_wins(tmp_path: Path, kind: Kind) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ['out']
 
 
-def test_of_two_writers_one_wins_without_hard_links(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> None:
+def test_of_two_writers_one_wins_without_hard_links(tmp_path, monkeypatch):
+    def refuse(*_):
         raise PermissionError
 
     monkeypatch.setattr(os, 'link', refuse)
@@ -197,7 +188,7 @@ def test_of_two_writers_one_wins_without_hard_links(
 
 
 @pytest.mark.parametrize('mask', [0o022, 0o077])
-def test_the_umask_decides_who_may_read(folder: Path, cli: Cli, mask: int) -> None:
+def test_the_umask_decides_who_may_read(folder, cli, mask):
     with umask(mask):
         save_calibration(calibration(), folder / 'private.yaml')
         cli(*REPLAY, 'raw.mcap', '-o', 'private', code=None, cwd=folder)
@@ -207,7 +198,7 @@ def test_the_umask_decides_who_may_read(folder: Path, cli: Cli, mask: int) -> No
     assert stat.S_IMODE((folder / 'private').stat().st_mode) == 0o777 & ~mask
 
 
-def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path: Path) -> None:
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path):
     path = tmp_path / 'unit.yaml'
     save_calibration(calibration(), path)
     path.chmod(0o640)
@@ -215,7 +206,7 @@ def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path: Path) -> None:
     assert stat.S_IMODE(path.stat().st_mode) == 0o640
 
 
-def test_a_link_is_written_through(tmp_path: Path) -> None:
+def test_a_link_is_written_through(tmp_path):
     (tmp_path / 'store').mkdir()
     link = tmp_path / 'current.yaml'
     link.symlink_to('store/unit.yaml')
@@ -228,7 +219,7 @@ def test_a_link_is_written_through(tmp_path: Path) -> None:
         save_calibration(calibration(), tmp_path / 'round')
 
 
-def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
+def test_a_writer_that_fails_leaves_nothing(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(OutputError, match=r'unit\.yaml: cannot be written: .*is no directory'):
         write_atomically(tmp_path / 'file' / 'unit.yaml', b'', CALIBRATION)
@@ -238,7 +229,7 @@ def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('suffix', ['.db3', '.bag', '.csv', '.MCAP'])
-def test_a_bag_has_no_other_suffix(folder: Path, cli: Cli, suffix: str) -> None:
+def test_a_bag_has_no_other_suffix(folder, cli, suffix):
     output = f'out{suffix}'
     finished = cli('convert', 'raw.mcap', '-o', output, code=1, cwd=folder)
     assert f'{output}: cannot be written: {suffix} is none of' in finished.stderr
@@ -246,9 +237,7 @@ def test_a_bag_has_no_other_suffix(folder: Path, cli: Cli, suffix: str) -> None:
 
 
 @pytest.mark.parametrize(('kind', 'name'), [(CSV, 'w.parquet'), (PAGE, 'unit.pdf')])
-def test_a_table_and_a_page_are_what_their_suffix_says(
-    kind: Kind, name: str, tmp_path: Path
-) -> None:
+def test_a_table_and_a_page_are_what_their_suffix_says(kind, name, tmp_path):
     with pytest.raises(OutputError, match=rf'{name}: cannot be written: \.\w+ is not \*'):
         check_output(tmp_path / name, kind)
     for good in (Path(name).with_suffix(one).name for one in ('', *kind.suffixes)):

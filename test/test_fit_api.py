@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fits through the public API: a knee in the curve, a thermometer on two topics."""
 
-from __future__ import annotations
-
 import numpy as np
-import pytest
 
 import thermo_comp as tc
 
@@ -21,9 +18,7 @@ UPS = np.array(
 ) / 1.0  # fmt: skip
 
 
-def recording(
-    up: np.ndarray, rng: np.random.Generator, slope: float | None = None
-) -> tuple[np.ndarray, ...]:
+def recording(up, rng, slope=None):
     """Simulate times, m/s^2 and board temperatures of two hours, 10 to 32 degC and back."""
     time_s = np.arange(0.0, 7200.0)
     board = np.interp(time_s, (0.0, 600.0, 3600.0, 7200.0), (10.0, 10.0, 32.0, 12.0))
@@ -32,7 +27,7 @@ def recording(
     return time_s, force + NOISE * rng.standard_normal((len(time_s), 3)), board
 
 
-def left_by(groups: tuple[str, ...]) -> tuple[tc.Calibration, float]:
+def left_by(groups):
     """Fit some groups, and correct another recording: RMS error of minutes [ug]."""
     rng = np.random.default_rng(8)
     bags = [
@@ -48,7 +43,7 @@ def left_by(groups: tuple[str, ...]) -> tuple[tc.Calibration, float]:
     return unit, float(np.sqrt(np.mean(minutes**2)) / MICRO_G)
 
 
-def test_a_knee_of_the_bias_is_found() -> None:
+def test_a_knee_of_the_bias_is_found():
     unit, left = left_by(('curve', 'bend'))
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
     # Knees stand a kelvin apart: those on both sides of the true one are used.
@@ -58,27 +53,22 @@ def test_a_knee_of_the_bias_is_found() -> None:
     assert left < 1.5
 
 
-def test_a_curve_without_a_knee_has_no_bend(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_curve_without_a_knee_has_no_bend(monkeypatch):
     monkeypatch.setitem(globals(), 'SLOPE', 0.0)
     unit, _ = left_by(('curve', 'bend'))
     assert not [term for term in unit.response if term.group == 'bend']
 
 
-def test_a_thermometer_on_two_topics_is_one() -> None:
+def test_a_thermometer_on_two_topics_is_one():
     bags = []
     for copies in (('board',), ('board', 'case')):
         rng = np.random.default_rng(9)
-        bags.append(
-            [
-                tc.Columns(
-                    time_s,
-                    force,
-                    dict.fromkeys(copies, (time_s[::5], board[::5])),
-                    name=f'rest{k}',
-                )
-                for k, (time_s, force, board) in enumerate(recording(up, rng) for up in UPS[:3])
-            ]
-        )
+        own = []
+        for k, up in enumerate(UPS[:3]):
+            time_s, force, board = recording(up, rng)
+            readings = dict.fromkeys(copies, (time_s[::5], board[::5]))
+            own.append(tc.Columns(time_s, force, readings, name=f'rest{k}'))
+        bags.append(own)
     one, two = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
     assert one.static == two.static
     assert one.axes == two.axes
@@ -86,7 +76,7 @@ def test_a_thermometer_on_two_topics_is_one() -> None:
     assert not any('repeats' in note for note in one.provenance.notes)
 
 
-def columns_of(slopes: list[float]) -> list[tc.Columns]:
+def columns_of(slopes):
     """Record a position each, with the slopes given."""
     rng = np.random.default_rng(10)
     found = []
@@ -96,14 +86,14 @@ def columns_of(slopes: list[float]) -> list[tc.Columns]:
     return found
 
 
-def sd_of_a_correction(unit: tc.Calibration) -> np.ndarray:
+def sd_of_a_correction(unit):
     """Claimed sd of the axes at the end of a recording [ug]."""
     time_s, force, board = recording(UPS[0], np.random.default_rng(11))
-    found = unit.correct(time_s, force, board=(time_s[::5], board[::5])).covariance[-1]
+    found = unit.correct(time_s[3::4], force[3::4], board=(time_s[::5], board[::5])).covariance[-1]
     return np.sqrt(np.diag(found)) / MICRO_G
 
 
-def test_a_bag_of_another_environment_takes_no_part_and_is_claimed() -> None:
+def test_a_bag_of_another_environment_takes_no_part_and_is_claimed():
     options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',), 'mounting_sd': 1e-7}
     alone = tc.fit(columns_of([SLOPE] * 4), **options)
     with_another = columns_of([SLOPE] * 4 + [6.0 * SLOPE])

@@ -4,15 +4,13 @@
 A board warmer than its case by self-heating: effects of temperature changes are even about that.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
-from builders import ArrayBlock
+from builders import source_of
 from scipy.signal import lfilter
 
-from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.sensors import gradients_at_rest
 from thermo_comp.simulation.campaign import positions
@@ -23,13 +21,13 @@ STEP_S, OWN_HEAT_K = 2.0, 0.6
 NOISE = 4.0 * MICRO
 
 
-def lagged(values, tau: float):
+def lagged(values, tau):
     """First-order lag that starts in equilibrium."""
     share = 1.0 - np.exp(-STEP_S / tau)
     return lfilter([share], [1.0, share - 1.0], values - values[0]) + values[0]
 
 
-def recorded(rng, up, name: str, targets: tuple[float, ...]) -> FitSource:
+def recorded(rng, up, name, targets):
     """Record a unit of two thermal nodes whose bias is even in the heating of its board."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):
@@ -46,16 +44,16 @@ def recorded(rng, up, name: str, targets: tuple[float, ...]) -> FitSource:
     bias += np.outer(change, (9.0, -12.0, 6.0)) * (1.0 + 0.01 * t[:, None])
     force = GRAVITY * up * (1.0 + 6e-5 * t[:, None])
     stamps = 10**18 + np.rint(time * 1e9).astype(np.int64)
-    thermometers = [np.round(one + 0.003 * rng.standard_normal(len(time)), 4)
-                    for one in (board, case)]  # fmt: skip
+    board, case = (
+        np.round(one + 0.003 * rng.standard_normal(len(time)), 4) for one in (board, case)
+    )
     accel = force + bias * MICRO + NOISE * rng.standard_normal((len(time), 3))
-    block = ArrayBlock(stamps, accel, stamps, thermometers[0], stamps + 1, thermometers[1])
-    return FitSource(name, lambda: [block])
+    return source_of(stamps, accel, stamps, board, stamps + 1, case, name=name)
 
 
 def test_what_a_change_does_is_found_about_rest(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
-    bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(6, 3))]
+    bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
     # Two readings of 3 mK a minute for about twenty hours: 0.1 mK, and rates of minutes.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
@@ -75,6 +73,6 @@ def test_what_a_change_does_is_found_about_rest(rng):
 
 
 def test_what_is_forced_takes_part_beside_the_groups_that_may(rng):
-    bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(6, 3))]
+    bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(3, 3))]
     options = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), forced=('gradient',))
     assert {column.group for column in fit(bags, options).calibration.response} == {'gradient'}

@@ -1,11 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The end of the dynamic regime is chosen by evidence: by the unit, not by the chamber."""
-
-from __future__ import annotations
+"""Noise of series, and the end of the dynamic regime: both estimated, not assumed."""
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -13,12 +11,13 @@ from test_fitting import FACES, sources_of
 from triads import triad
 
 from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.noise import Whitener
+from thermo_comp.fitting.unknowns import WHITE, Noise
 from thermo_comp.simulation.campaign import Position, parse_cyclogram
-from thermo_comp.simulation.run import SimulatedRun, arrays
+from thermo_comp.simulation.run import arrays
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.thermal.state import WEIGHT
 from thermo_comp.thermal.tracker import ThermalTracker
-from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 Closes = Literal['board', 'case']
@@ -28,7 +27,7 @@ PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min')
 STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
 
 
-def weight(record: SimulatedRun, closes: Closes) -> Floats:
+def weight(record, closes):
     """Weight of the dynamic set at each sample, by a detector with the true sensor settings."""
     tracker = ThermalTracker(replace(DetectorSettings(), closes=closes))
     readings = sorted(
@@ -50,13 +49,9 @@ def weight(record: SimulatedRun, closes: Closes) -> Floats:
 
 @pytest.mark.parametrize(
     ('closes', 'options'),
-    [
-        ('board', {'model': 'golovach'}),
-        ('case', {'model': 'golovach'}),
-        ('case', {'groups': ('curve', 'set', 'board')}),
-    ],
+    [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],
 )
-def test_evidence_says_when_the_regime_closes(closes: Closes, options: dict[str, Any]) -> None:
+def test_evidence_says_when_the_regime_closes(closes, options):
     # A reading every four seconds: the case changes by 0.1 K between them.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
@@ -70,3 +65,80 @@ def test_evidence_says_when_the_regime_closes(closes: Closes, options: dict[str,
     # settings.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
+
+
+def uneven(rng):
+    """Make positions of several lengths (one of a single window) with gaps and weights."""
+    lengths = (7, 1, 12, 4)
+    position = np.repeat(np.arange(len(lengths)), lengths)
+    steps = rng.uniform(1.0, 9.0, len(position))
+    # A gap that is longer than the short correlation time.
+    steps[12] = 4000.0
+    time = np.concatenate(
+        [100.0 * k + np.cumsum(steps[position == k]) for k in range(len(lengths))]
+    )
+    return position, time, rng.uniform(0.1, 3.0, len(position))
+
+
+def dense(position, time, weight, noise):
+    """Build the covariance: exponentially correlated noise in each position, and white noise."""
+    same = position[:, None] == position
+    distance = np.abs(time[:, None] - time)
+    slow = np.where(same, noise.ratio * np.exp(-distance / noise.time_s), 0.0)
+    return slow + np.diag(1.0 / weight)
+
+
+@pytest.mark.parametrize(
+    'noise', [WHITE, Noise(1e-6, 30.0), Noise(1e-2, 1e4), Noise(10.0, 3.0), Noise(1e3, 1e4)]
+)
+def test_products_and_determinant_are_those_of_the_dense_matrix(rng, noise):
+    position, time, weight = uneven(rng)
+    series = rng.standard_normal((len(time), 5))
+    whitener = Whitener(position, time)
+    gains = whitener.gains(weight, noise)
+    white = whitener.filter(series, gains)
+    covariance = dense(position, time, weight, noise)
+    expected = series.T @ np.linalg.solve(covariance, series)
+    # Rounding only, of a matrix with a condition below 1e6.
+    np.testing.assert_allclose(white.T @ white, expected, rtol=1e-9, atol=1e-10)
+    determinant = np.linalg.slogdet(covariance)[1]
+    assert whitener.log_determinant(gains) == pytest.approx(determinant, abs=1e-9)
+
+
+def drawn(rng, n, steps, noise):
+    """Draw three axes of n positions: white noise of uneven windows, and Gauss-Markov noise."""
+    time = np.cumsum(rng.uniform(20.0, 100.0, steps))
+    weight = rng.uniform(0.3, 1.0, steps)
+    slow = np.sqrt(noise.ratio) * rng.standard_normal((n, steps, 3))
+    for k, decay in enumerate(np.exp(-np.diff(time) / noise.time_s), start=1):
+        slow[:, k] = decay * slow[:, k - 1] + np.sqrt(1.0 - decay**2) * slow[:, k]
+    series = slow + rng.standard_normal((n, steps, 3)) / np.sqrt(weight)[:, None]
+    whitener = Whitener(np.repeat(np.arange(n), steps), np.tile(time, n))
+    return whitener, np.tile(weight, n), series.reshape(-1, 3)
+
+
+@pytest.mark.parametrize('noise', [Noise(1.0, 600.0), Noise(0.3, 2000.0), Noise(30.0, 300.0)])
+def test_ratio_and_time_are_found(rng, noise):
+    # 3 axes x 9 positions x 300 windows of a minute: 240 or more correlation times determine the
+    # variance of the process to sqrt(2 / 240) = 9 %, its time to about 15 %.
+    whitener, weight, series = drawn(rng, 9, 300, noise)
+    found = whitener.estimate(5.0 * series, weight)
+    assert 0.5 < found.ratio / noise.ratio < 2.0
+    assert 0.5 < found.time_s / noise.time_s < 2.0
+
+
+def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
+    # The threshold has a false alarm rate of 1 % per series; none of these exceeds it.
+    assert [
+        whitener.estimate(series, weight)
+        for whitener, weight, series in (drawn(rng, 5, 100, WHITE) for _ in range(10))
+    ] == 10 * [WHITE]
+
+
+def test_a_time_that_no_position_holds_is_not_claimed(rng):
+    # Positions of twenty minutes do not show a correlation time of hours: the longest time tried
+    # is a fifth of them.
+    whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
+    assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
+    alone = Whitener(np.arange(3), np.zeros(3))
+    assert alone.estimate(rng.standard_normal((3, 3)), np.ones(3)) == WHITE

@@ -2,17 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Claimed sd of real units against their scatter from position to position."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from builders import ArrayBlock
+from builders import source_of
 from fitting_truth import rows_of
 
-from thermo_comp.fitting import FitOptions, FitSource, fit_bags
+from thermo_comp.fitting import FitOptions, fit_bags
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.regression import Regression
 from thermo_comp.fitting.windows import FEWEST_WINDOWS
@@ -20,20 +17,16 @@ from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
-def ratio(path: Path) -> float:
+def ratio(path):
     """Fit one log; return the jackknife over its positions, in units of the claimed sd."""
     accel = np.loadtxt(path, usecols=(0, 1, 2))
     stamps = np.arange(len(accel), dtype=np.int64) * 10_000_000
-    nothing_ns, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
-    block = ArrayBlock(stamps, accel, nothing_ns, nothing, nothing_ns, nothing)
     options = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
-    source = FitSource(path.stem, lambda: [block])
     short = {'window_s': 1.0, 'cell_s': 0.2, 'min_rest_s': 1.0, 'fewest_windows': FEWEST_WINDOWS}
-    bags = [reduce_source(source, full_scale=None, **short)]
+    bags = [reduce_source(source_of(stamps, accel, name=path.stem), full_scale=None, **short)]
     result = fit_bags(bags, options)
     posterior, prior = result.selected.posterior, result.selected.prior
     calibration, data = result.calibration, result.windows.data
-    assert calibration.posterior is not None
     K = np.array([axis.scale_factor for axis in calibration.axes])
     found = []
     for p in range(data.n_positions):
@@ -52,7 +45,7 @@ def ratio(path: Path) -> float:
     return float(np.sqrt(np.mean(scatter / np.concatenate((*claimed, variance[-3:])))))
 
 
-def test_claimed_sd_is_the_jackknife_s(real_data: Path) -> None:
+def test_claimed_sd_is_the_jackknife_s(real_data):
     logs = [real_data / f'mikoff-mpu9150/mk_imu{k}.log' for k in range(3)]
     if not all(path.is_file() for path in logs):
         pytest.skip('the logs of the MPU-9150 units are not there')

@@ -4,19 +4,17 @@
 Fits beyond 1 g: derivatives, terms that stay or leave, radius, statements of |f|, whole runs.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from builders import arrays_of, source_of
 from fitting_truth import GRAVITY, MICRO, NOMINAL, Truth, begin, prior_of, table_of
 from triads import triad
 
 from thermo_comp.errors import FitError, ThermoCompError
-from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.claim import claim_of
 from thermo_comp.fitting.equations import moved_by
 from thermo_comp.fitting.forces import Forces
@@ -42,7 +40,7 @@ from thermo_comp.report.certificate import results
 from thermo_comp.report.evidence import evidence_of_fit
 from thermo_comp.report.statements import CertificateInfo
 from thermo_comp.simulation.campaign import Cyclogram, Position, positions
-from thermo_comp.simulation.run import SimulatedRun, arrays
+from thermo_comp.simulation.run import arrays
 from thermo_comp.simulation.spin import Bend, Spin, steps
 from thermo_comp.unit.gravity import STANDARD_GRAVITY as G
 from thermo_comp.unit.nonlinearity import POWERS
@@ -168,7 +166,7 @@ def test_a_table_of_sections_states_the_force_of_each_rest():
             parse_sections(wrong)
 
 
-def test_a_bag_states_its_force_and_the_user_has_the_last_word(tmp_path: Path):
+def test_a_bag_states_its_force_and_the_user_has_the_last_word(tmp_path):
     stamps = 10**18 + np.arange(0, 20 * 10**9, 10**8)
     rate = np.zeros((200, 3))
     rate[:, 2] = np.where(np.arange(200) < 100, 0.0, 5.0)
@@ -179,7 +177,7 @@ def test_a_bag_states_its_force_and_the_user_has_the_last_word(tmp_path: Path):
             writer.write_counts('table/rate', stamps, rate)
     (tmp_path / 'table.txt').write_text('a.mcap 0 5 20\nb* 0 5 25\n')
 
-    def read(name: str, asked: AskedForce = AskedForce()) -> KnownForce | None:  # noqa: B008
+    def read(name, asked=AskedForce()):  # noqa: B008
         path = tmp_path / f'{name}.mcap'
         return known_force(path, inspect_recording(path), asked)
 
@@ -234,15 +232,10 @@ def test_simulated_forces_are_those_of_a_rotation():
     np.testing.assert_allclose(read / (1.01 * MICRO * G / GRAVITY), [[40.0, 8.0, 0.0]])
 
 
-def source(run: SimulatedRun, spin: Spin | None, name: str) -> FitSource:
-    from builders import ArrayBlock
-
+def source(run, spin, name):
     sections = tuple(Section(*one, 0.0) for one in spin.sections(G)) if spin else ()
-    block = ArrayBlock(
-        *(run.accel_stamp_ns, run.counts.astype(float)),
-        *(run.board_stamp_ns, run.board, run.case_stamp_ns, run.case),
-    )
-    return FitSource(name, lambda: [block], force=KnownForce(name, sections) if spin else None)
+    force = KnownForce(name, sections) if spin else None
+    return source_of(*arrays_of(run), name=name, force=force)
 
 
 def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():

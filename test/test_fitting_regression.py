@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The regression: mode, covariance and evidence against dense linear algebra, and its bounds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -28,10 +26,9 @@ from scipy.optimize import least_squares
 from thermo_comp.errors import FitError
 from thermo_comp.fitting.elimination import factored
 from thermo_comp.fitting.left_out import score_of
-from thermo_comp.fitting.regression import Posterior, Regression
+from thermo_comp.fitting.regression import Regression
 from thermo_comp.fitting.start import constant_calibration
-from thermo_comp.fitting.unknowns import Noise, Prior, State, inverse_misalignment, tangent_basis
-from thermo_comp.typing import Bools, Floats
+from thermo_comp.fitting.unknowns import Noise, State, inverse_misalignment, tangent_basis
 
 
 class Dense:
@@ -40,7 +37,7 @@ class Dense:
     derivatives.
     """
 
-    def __init__(self, regression: Regression, prior: Prior, at: Posterior) -> None:
+    def __init__(self, regression, prior, at):
         self.windows, self.prior, self.at = regression.windows, prior, at
         self.start_root = regression.start_root
         self.n = at.layout.n
@@ -52,23 +49,19 @@ class Dense:
         self.roots = [np.linalg.inv(sigma * noise) for sigma in prior.sigma]
         self.determinant = -2.0 * sum(np.log(np.diag(root)).sum() for root in self.roots)
 
-    def state(self, x: Floats) -> State:
+    def state(self, x):
         """Move the mode of the fast route by x."""
         layout, at = self.at.layout, self.at.state
         padded = np.append(x, 0.0)
         up = at.up + np.einsum('pij,pj->pi', tangent_basis(at.up), x[layout.up])
         return State(
-            at.kappa + x[layout.kappa],
-            at.bias + x[layout.bias],
-            at.weights + padded[layout.weights],
-            at.misalignment + x[layout.misalignment],
-            up / np.linalg.norm(up, axis=1, keepdims=True),
-            at.offset + x[layout.offset],
-            at.tilt + x[layout.tilt],
-            at.start + x[layout.start],
-        )
+            at.kappa + x[layout.kappa], at.bias + x[layout.bias],
+            at.weights + padded[layout.weights], at.misalignment + x[layout.misalignment],
+            up / np.linalg.norm(up, axis=1, keepdims=True), at.offset + x[layout.offset],
+            at.tilt + x[layout.tilt], at.start + x[layout.start],
+        )  # fmt: skip
 
-    def residual(self, x: Floats) -> Floats:
+    def residual(self, x):
         """All residuals in sd: those of the windows, then those of the prior."""
         w, prior, state = self.windows, self.prior, self.state(x)
         rms = np.sqrt(np.mean(w.columns**2, axis=0))
@@ -99,7 +92,7 @@ class Dense:
             parts.append((weights[:, sd > 0.0] / sd[sd > 0.0]).ravel())
         return np.concatenate(parts)
 
-    def jacobian(self, x: Floats) -> Floats:
+    def jacobian(self, x):
         """Return central differences with steps of a tenth of each sd: linear to some 1e-9."""
         sd = np.sqrt(self.at.variance)
         columns = []
@@ -111,7 +104,7 @@ class Dense:
 
 
 @pytest.fixture(scope='module', params=[1, 4], ids=['a position per bag', 'up to 4'])
-def solved(request: pytest.FixtureRequest) -> tuple[Regression, Prior, Posterior]:
+def solved(request):
     rng = np.random.default_rng(5)
     # The table draws a start for each position, but those of one bag have a common start: 0.
     truth = Truth(
@@ -126,9 +119,7 @@ def solved(request: pytest.FixtureRequest) -> tuple[Regression, Prior, Posterior
     return regression, prior, mode_of(regression, state, prior)
 
 
-def test_the_mode_is_that_of_the_dense_problem(
-    solved: tuple[Regression, Prior, Posterior],
-) -> None:
+def test_the_mode_is_that_of_the_dense_problem(solved):
     regression, prior, found = solved
     dense = Dense(regression, prior, found)
     at = dense.residual(np.zeros(dense.n))
@@ -141,9 +132,7 @@ def test_the_mode_is_that_of_the_dense_problem(
     assert np.abs(other / np.sqrt(found.variance)).max() < 1e-3
 
 
-def test_covariance_and_evidence_are_those_of_the_dense_problem(
-    solved: tuple[Regression, Prior, Posterior],
-) -> None:
+def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
     regression, prior, found = solved
     np.testing.assert_allclose(regression.start_root @ regression.start_root.T, START, atol=1e-12)
     beside = []
@@ -170,7 +159,7 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
-def test_truth_comes_out_without_noise(rng: np.random.Generator) -> None:
+def test_truth_comes_out_without_noise(rng):
     truth = Truth(sigma=np.full(3, 1e-9 * MICRO))
     windows, up = table_of(truth, 12, rng)
     regression, state = begin(windows, up)
@@ -190,7 +179,7 @@ def test_truth_comes_out_without_noise(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
 
 
-def test_claimed_sd_is_the_scatter() -> None:
+def test_claimed_sd_is_the_scatter():
     # Under the true priors the inverse Hessian is the Cramer-Rao bound: errors over claimed sd
     # have an RMS of 1. 36 units of 3 x 2 + 3 + 24 numbers, some of them correlated: the RMS of
     # each kind is determined to 13 % or better.
@@ -207,7 +196,7 @@ def test_claimed_sd_is_the_scatter() -> None:
     assert np.sqrt(np.mean(np.concatenate([*every.values()]) ** 2)) == pytest.approx(1.0, abs=0.1)
 
 
-def refit_of(whole: Posterior, regression: Regression, prior: Prior, kept: Bools) -> State:
+def refit_of(whole, regression, prior, kept):
     """Fit some rows alone; weights are in units of the whole table's RMS."""
     windows = regression.windows
     rest = Regression(rows_of(windows, np.flatnonzero(kept)), GRAVITY, NOMINAL)
@@ -228,9 +217,7 @@ LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.2)])
-def test_leaving_a_position_out_is_a_fit_without_it(
-    rng: np.random.Generator, groups: tuple[str, ...], tolerance: float
-) -> None:
+def test_leaving_a_position_out_is_a_fit_without_it(rng, groups, tolerance):
     used = np.isin(GROUPS, groups)
     truth = Truth(
         on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used,
@@ -256,9 +243,7 @@ def test_leaving_a_position_out_is_a_fit_without_it(
 
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.05)])
-def test_leaving_a_section_out_is_a_fit_without_it(
-    rng: np.random.Generator, groups: tuple[str, ...], tolerance: float
-) -> None:
+def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
     used = np.isin(GROUPS, groups)
     truth = Truth(on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used, start_sd=0.3)
     windows, up = table_of(truth, 12, rng, n_windows=24, step_s=200.0)
@@ -284,9 +269,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(
     assert alone_score.rms == alone_score.sections.rms
 
 
-def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(
-    rng: np.random.Generator,
-) -> None:
+def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
     # Six faces: without one of them the bias of its axis is not separated from the scale.
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
@@ -304,7 +287,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(
 
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
-def test_no_step_goes_uphill(seed: int) -> None:
+def test_no_step_goes_uphill(seed):
     # Bags that started far from rest, with little data to separate a start from a weight: a
     # product.
     rng = np.random.default_rng(seed)
@@ -320,7 +303,7 @@ def test_no_step_goes_uphill(seed: int) -> None:
     assert np.diff(sizes).max() < 1e-9 * sizes[0]
 
 
-def test_what_takes_no_part_any_more_is_gone(solved: tuple[Regression, Prior, Posterior]) -> None:
+def test_what_takes_no_part_any_more_is_gone(solved):
     regression, prior, found = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
     # The result also holds for a state to which no step has been applied.
@@ -329,7 +312,7 @@ def test_what_takes_no_part_any_more_is_gone(solved: tuple[Regression, Prior, Po
     np.testing.assert_array_equal(state.weights[1], found.state.weights[1])
 
 
-def test_published_huygens_coefficients_come_back(rng: np.random.Generator) -> None:
+def test_published_huygens_coefficients_come_back(rng):
     # Huygens HASI accelerometer: sf = 1.30675e-3 - 1.35046e-7 T + 4.02821e-10 T^2 [A/g] and
     # offset = -8.9642327e-4 + 3.83652e-6 T - 7.61e-9 T^2 [g], T in kelvin. Sampled on a chamber's
     # program, fitted in our variables (t from 20 degC, counts of 1 pA), converted back.
@@ -374,7 +357,7 @@ def test_published_huygens_coefficients_come_back(rng: np.random.Generator) -> N
 
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
-def test_inactive_columns_are_known_as_if_they_took_part(noise: Noise) -> None:
+def test_inactive_columns_are_known_as_if_they_took_part(noise):
     # In a linear problem S is the inverse covariance of the columns under a flat prior, S^-1 Q
     # their estimated weight, and the gain that of the log evidence.
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
@@ -407,9 +390,7 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise: Noise) -> None:
     assert not inactive.chosen(wide, asked, 1e9, 9).any()
 
 
-def test_only_the_matrix_that_rounding_made_indefinite_gets_more_jitter(
-    rng: np.random.Generator,
-) -> None:
+def test_only_the_matrix_that_rounding_made_indefinite_gets_more_jitter(rng):
     root = rng.standard_normal((3, 3))
     good, bad = root @ root.T, np.ones((3, 3)) - 1e-10 * np.eye(3)
     found = factored(np.stack((good, bad)))
@@ -420,7 +401,7 @@ def test_only_the_matrix_that_rounding_made_indefinite_gets_more_jitter(
         factored(np.stack((good, bad - 0.5 * np.eye(3))))
 
 
-def test_tangent_basis_is_orthonormal(rng: np.random.Generator) -> None:
+def test_tangent_basis_is_orthonormal(rng):
     up = rng.standard_normal((20, 3))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     up[0] = (1.0, 0.0, 0.0)
@@ -429,12 +410,12 @@ def test_tangent_basis_is_orthonormal(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-14)
 
 
-def test_a_dead_axis_is_refused() -> None:
+def test_a_dead_axis_is_refused():
     means = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     with pytest.raises(FitError, match='reads the same in all positions'):
         constant_calibration(means, GRAVITY, with_misalignment=False)
 
 
-def test_positions_in_motion_are_refused(rng: np.random.Generator) -> None:
+def test_positions_in_motion_are_refused(rng):
     with pytest.raises(FitError, match='no ellipsoid'):
         constant_calibration(rng.standard_normal((30, 3)), GRAVITY, with_misalignment=False)

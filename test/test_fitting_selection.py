@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The selected model, its prior sd, noises and claimed sd, for tables with known truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -30,15 +28,14 @@ from thermo_comp.fitting.claim import claim_of
 from thermo_comp.fitting.hyperparameters import downweigh, settle
 from thermo_comp.fitting.regression import Regression
 from thermo_comp.fitting.selection import Selected, fit_all, is_better, select
-from thermo_comp.fitting.unknowns import InformativePrior, Noise, Prior, Windows
-from thermo_comp.typing import Floats
+from thermo_comp.fitting.unknowns import InformativePrior, Noise
 
 Case = tuple[Regression, Selected, Truth]
 ALL = ('curve', 'board', 'idle')
 IDLE = np.array(GROUPS) == 'idle'
 
 
-def constants(truth: Truth) -> Prior:
+def constants(truth):
     """No columns yet, and wrong noise parameters."""
     return prior_of(
         truth, (), offset_sd=MICRO, offset_scale=30.0 * MICRO, sigma=np.full(3, 5.0 * MICRO),
@@ -46,21 +43,24 @@ def constants(truth: Truth) -> Prior:
     )  # fmt: skip
 
 
-def selected_of(
-    truth: Truth, windows: Windows, up: Floats, forced: tuple[str, ...] = ()
-) -> tuple[Regression, Selected]:
+def selected_of(truth, windows, up, forced=()):
     regression, state = begin(windows, up)
     candidates = candidates_of(windows, forced)
-    return regression, select(regression, state, constants(truth), candidates)
+    parts = []
+    found = select(regression, state, constants(truth), candidates, parts.append)
+    # Progress rises.
+    assert parts == sorted(parts)
+    assert 0.0 < parts[0] <= parts[-1] <= 1.0
+    return regression, found
 
 
-def chosen_groups(found: Selected) -> set[str]:
+def chosen_groups(found):
     (groups,) = (trial.groups for trial in found.trials if trial.is_chosen)
     return set(groups)
 
 
 @pytest.fixture(scope='module')
-def noisy() -> Case:
+def noisy():
     truth = Truth(
         sigma=np.array([1.0, 2.0, 3.0]) * MICRO,
         noise=Noise(2.0, 1200.0),
@@ -72,13 +72,13 @@ def noisy() -> Case:
 
 
 @pytest.fixture(scope='module')
-def calm() -> Case:
+def calm():
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=60)
     return *selected_of(truth, windows, up), truth
 
 
-def test_what_explains_nothing_is_not_chosen(calm: Case) -> None:
+def test_what_explains_nothing_is_not_chosen(calm):
     regression, found, _ = calm
     np.testing.assert_array_equal(found.prior.column_sd > 0.0, [~IDLE, ~IDLE])
     assert chosen_groups(found) == {'curve', 'board'}
@@ -90,7 +90,7 @@ def test_what_explains_nothing_is_not_chosen(calm: Case) -> None:
     assert not found.posterior.state.weights[..., IDLE].any()
 
 
-def test_models_that_were_looked_at_show_their_left_out_errors(calm: Case) -> None:
+def test_models_that_were_looked_at_show_their_left_out_errors(calm):
     _, found, truth = calm
     rms = {trial.groups: trial.score.rms for trial in found.trials}
     # The trials contain the constants, then the curve; the error is the size of the missing
@@ -104,7 +104,7 @@ def test_models_that_were_looked_at_show_their_left_out_errors(calm: Case) -> No
     assert all(is_better(trial.score, found.score) for trial in found.trials[:2])
 
 
-def test_what_is_forced_stays(calm: Case) -> None:
+def test_what_is_forced_stays(calm):
     regression, _, truth = calm
     _, found = selected_of(truth, regression.windows, calm[1].posterior.state.up, ('idle',))
     assert chosen_groups(found) == set(ALL)
@@ -114,7 +114,7 @@ def test_what_is_forced_stays(calm: Case) -> None:
 @pytest.mark.parametrize(
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
-def test_a_group_must_explain_more_than_an_accident(where: str, is_chosen: bool) -> None:
+def test_a_group_must_explain_more_than_an_accident(where, is_chosen):
     # WHY: a column may fit one recording, or one part of the program that all bags share. WHAT:
     # the evidence favours the group in each case; data left out of the fit decide.
     truth = Truth()
@@ -131,9 +131,7 @@ def test_a_group_must_explain_more_than_an_accident(where: str, is_chosen: bool)
 
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
-def test_a_part_that_lags_is_found_although_no_curve_helps_alone(
-    n_positions: int, step_s: float
-) -> None:
+def test_a_part_that_lags_is_found_although_no_curve_helps_alone(n_positions, step_s):
     # WHY: the selection stopped at constants, 440 ug instead of 0.6, as a curve alone did not
     # help. WHAT: a bias that follows only a lagged temperature is a curve and a lag that cancel.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
@@ -147,7 +145,7 @@ def test_a_part_that_lags_is_found_although_no_curve_helps_alone(
     assert found.score.rms < 1.2 * truth.sigma[0]
 
 
-def test_noises_come_out(noisy: Case) -> None:
+def test_noises_come_out(noisy):
     _, found, truth = noisy
     prior = found.prior
     assert {'curve', 'board'} <= chosen_groups(found)
@@ -161,13 +159,13 @@ def test_noises_come_out(noisy: Case) -> None:
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
 
 
-def test_white_noise_is_not_taken_for_slow_noise(calm: Case) -> None:
+def test_white_noise_is_not_taken_for_slow_noise(calm):
     _, found, truth = calm
     np.testing.assert_allclose(found.prior.sigma, truth.sigma, rtol=0.12)
     assert found.prior.noise == Noise()
 
 
-def test_prior_sds_are_those_of_the_weights(calm: Case) -> None:
+def test_prior_sds_are_those_of_the_weights(calm):
     # The fixed point: sd^2 = sum of squares / effective parameters, three if all are determined;
     # the hyperprior of a factor of ten shifts it by 1 / (2 x 3 x 5.3) of the distance.
     regression, found, truth = calm
@@ -178,7 +176,7 @@ def test_prior_sds_are_those_of_the_weights(calm: Case) -> None:
         assert len(one.prior_sd) == 2
 
 
-def test_no_weight_is_believed_steeper_than_a_data_sheet() -> None:
+def test_no_weight_is_believed_steeper_than_a_data_sheet():
     # A unit with ten times the steepest slope per kelvin: its prior stays at the limit.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
@@ -193,7 +191,7 @@ def test_no_weight_is_believed_steeper_than_a_data_sheet() -> None:
     assert per_kelvin == pytest.approx(STEEPEST[0])
 
 
-def test_truth_lies_within_the_claimed_sd(noisy: Case) -> None:
+def test_truth_lies_within_the_claimed_sd(noisy):
     regression, found, truth = noisy
     errors = truth.errors(regression, found.posterior)
     # Pruned weights have no sd; the true weights of the idle columns are 0.
@@ -204,7 +202,7 @@ def test_truth_lies_within_the_claimed_sd(noisy: Case) -> None:
     assert np.abs(every).max() < 4.0
 
 
-def test_bayes_factor_is_the_fall_of_the_evidence_without_it() -> None:
+def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
     # Savage-Dickey against brute force: solve without the group, with the same prior for the rest.
     # Exact in a linear problem; the directions are linear to noise / g.
     truth = Truth()
@@ -227,7 +225,7 @@ def test_bayes_factor_is_the_fall_of_the_evidence_without_it() -> None:
     assert falls['bias', 'idle'] < 0.5
 
 
-def test_what_a_group_explains_is_what_it_adds(calm: Case) -> None:
+def test_what_a_group_explains_is_what_it_adds(calm):
     regression, found, truth = calm
     columns = regression.windows.columns[:, 2:4]
     evidence = group_evidence(regression, found.posterior, found.prior)
@@ -237,7 +235,7 @@ def test_what_a_group_explains_is_what_it_adds(calm: Case) -> None:
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
-def test_outliers_do_not_pull(calm: Case) -> None:
+def test_outliers_do_not_pull(calm):
     regression, one, truth = calm
     rng = np.random.default_rng(6)
     clean = regression.windows
@@ -253,7 +251,7 @@ def test_outliers_do_not_pull(calm: Case) -> None:
     np.testing.assert_array_equal(other.prior.column_sd[0] > 0.0, one.prior.column_sd[0] > 0.0)
 
 
-def test_means_of_few_values_are_no_knocks() -> None:
+def test_means_of_few_values_are_no_knocks():
     # A converter that carries its remainder: most means are equal, others differ by a count.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
@@ -273,17 +271,7 @@ def test_means_of_few_values_are_no_knocks() -> None:
     np.testing.assert_array_equal(np.delete(changed, 100), 1.0)
 
 
-def test_progress_rises() -> None:
-    windows, up = table_of(Truth(), 9, np.random.default_rng(2), n_windows=20)
-    regression, state = begin(windows, up)
-    parts: list[float] = []
-    select(regression, state, constants(Truth()), candidates_of(windows), parts.append)
-    assert parts
-    assert parts == sorted(parts)
-    assert 0.0 < parts[0] <= parts[-1] <= 1.0
-
-
-def test_of_two_columns_that_are_almost_one_the_better_stays() -> None:
+def test_of_two_columns_that_are_almost_one_the_better_stays():
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(6), n_windows=50)
     columns = windows.columns.copy()
@@ -297,7 +285,7 @@ def test_of_two_columns_that_are_almost_one_the_better_stays() -> None:
 
 
 @pytest.mark.parametrize(('start_sd', 'lower', 'upper'), [(0.0, 0.0, 0.15), (1.0, 0.8, 1.0)])
-def test_how_bags_begin_is_learnt(start_sd: float, lower: float, upper: float) -> None:
+def test_how_bags_begin_is_learnt(start_sd, lower, upper):
     truth = Truth(start_sd=start_sd)
     windows, up = table_of(truth, 18, np.random.default_rng(9), n_windows=60)
     _, found = selected_of(truth, windows, up)
@@ -306,7 +294,7 @@ def test_how_bags_begin_is_learnt(start_sd: float, lower: float, upper: float) -
 
 
 @pytest.mark.parametrize('away', [0.0, 30.0])
-def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm: Case, away: float) -> None:
+def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
     # WHY: siblings, or the last calibration of a unit, may be nearer to this unit than they seem,
     # or farther. WHAT: of a narrow and a wide prior the evidence selects the true one.
     _, one, truth = calm
@@ -331,12 +319,12 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm: Case, away
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(found.posterior.variance[places]).max()
 
 
-def test_tilts_of_supports_come_out_and_leave_the_unit_alone() -> None:
+def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
     truth = Truth(tilt_sd=5e-6)
     windows, up = table_of(truth, 12, np.random.default_rng(0), n_windows=60)
     stiff = replace(windows, tilt=windows.tilt[:, :0])
 
-    def drift_left(table: Windows) -> tuple[Selected, float]:
+    def drift_left(table):
         regression, found = selected_of(truth, table, up)
         missed = found.posterior.state.weights[0] / regression.rms - truth.on_bias
         return found, float(np.sqrt(np.mean((table.columns @ missed.T) ** 2)))
@@ -350,7 +338,7 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone() -> None:
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
 
-def test_a_stiff_support_is_not_seen_tilting(calm: Case) -> None:
+def test_a_stiff_support_is_not_seen_tilting(calm):
     # Less than the noise of the windows of a tilt, 2 ug / sqrt(60).
     _, found, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)
@@ -359,7 +347,7 @@ def test_a_stiff_support_is_not_seen_tilting(calm: Case) -> None:
     assert np.sqrt(np.mean(tilt**2)) < 0.5 * hidden
 
 
-def claimed(n_positions: int, gravity_sd: float = 0.0) -> tuple[Floats, Floats]:
+def claimed(n_positions, gravity_sd=0.0):
     """Return claimed and fitted covariance of a unit whose mounting repeats to 20 ug."""
     truth = Truth(offset_sd=20.0 * MICRO)
     windows, up = table_of(truth, n_positions, np.random.default_rng(1), n_windows=20)
@@ -371,7 +359,7 @@ def claimed(n_positions: int, gravity_sd: float = 0.0) -> tuple[Floats, Floats]:
     return claim.covariance, found.posterior.covariance
 
 
-def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting() -> None:
+def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting():
     ratios = []
     for n in (9, 24):
         claim, fitted = claimed(n)
@@ -385,7 +373,7 @@ def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting() -> N
     assert 0.8 < ratios[1] < 1.5
 
 
-def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once() -> None:
+def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once():
     (without, _), (within, _) = claimed(12), claimed(12, 5e-4)
     added = within - without
     kappa = np.arange(3) * ((len(without) - 3) // 3)

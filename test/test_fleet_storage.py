@@ -2,14 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bags of a fleet are found and read in every kind of storage."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 from uuid import uuid4
 
 import pytest
@@ -27,14 +22,14 @@ fsspec = pytest.importorskip('fsspec', reason='fsspec is not installed: the extr
 
 
 @pytest.fixture(scope='module')
-def unit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def unit(tmp_path_factory):
     folder = tmp_path_factory.mktemp('fleet') / 'unit'
     write_unit(folder, 1, 2)
     return folder
 
 
 @pytest.fixture
-def memory() -> Iterator[tuple[Any, str]]:
+def memory():
     """Return an empty folder of fsspec's memory file system, and its URL."""
     fs = fsspec.filesystem('memory')
     name = f'/{uuid4().hex}'
@@ -43,7 +38,7 @@ def memory() -> Iterator[tuple[Any, str]]:
         fs.rm(name, recursive=True)
 
 
-def to_sqlite(path: Path, target: Path) -> None:
+def to_sqlite(path, target):
     """Write a bag again in the other storage of rosbag2."""
     with (
         Reader(path) as reader,
@@ -59,9 +54,7 @@ def to_sqlite(path: Path, target: Path) -> None:
 
 
 class TestElsewhere:
-    def test_a_fleet_in_memory_gives_the_bits_of_one_on_disk(
-        self, unit: Path, memory: tuple[Any, str]
-    ) -> None:
+    def test_a_fleet_in_memory_gives_the_bits_of_one_on_disk(self, unit, memory):
         fs, url = memory
         fs.put(f'{unit}/', f'{url}/unit/', recursive=True)
         (here,), (there,) = find_units(Storage(str(unit.parent))), find_units(Storage(url))
@@ -78,8 +71,8 @@ class TestElsewhere:
 
     @pytest.mark.parametrize('name', ['pos1', 'pos1.db3'])
     def test_any_storage_is_read_from_elsewhere_and_leaves_no_copy(
-        self, name: str, tmp_path: Path, memory: tuple[Any, str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+        self, name, tmp_path, memory, monkeypatch
+    ):
         fs, url = memory
         (path,) = write_unit(tmp_path / 'bags' / 'unit', 1, 1, names=['pos1'])
         if name == 'pos1.db3':
@@ -96,7 +89,7 @@ class TestElsewhere:
         assert outcome.hashes == {f'unit/{name}': digest(path.with_name(name))}
         assert list((tmp_path / 'scratch').iterdir()) == []
 
-    def test_a_file_that_vanishes_may_come_back(self, memory: tuple[Any, str]) -> None:
+    def test_a_file_that_vanishes_may_come_back(self, memory):
         _, url = memory
         gone = {'unit/a.mcap': [StoredFile('unit/a.mcap', 5, '')]}
         outcome = process_unit(FoundUnit('unit', '', gone), url, OPTIONS)
@@ -104,7 +97,7 @@ class TestElsewhere:
         assert outcome.row['verdict'] == 'failed'
         assert str(outcome.row['left_out']).startswith('unit/a.mcap: ')
 
-    def test_a_protocol_that_nobody_knows(self) -> None:
+    def test_a_protocol_that_nobody_knows(self):
         with pytest.raises(ThermoCompError, match='nowhere://x: Protocol not known'):
             Storage('nowhere://x')
 
@@ -121,11 +114,11 @@ class TestDiscovery:
             (['top.bag', 'u/x.db3'], ['top.bag', 'u/x.db3']),
         ],
     )
-    def test_files_to_bags(self, files: list[str], bags: list[str]) -> None:
+    def test_files_to_bags(self, files, bags):
         stored = [StoredFile(name, 1, '') for name in files]
         assert list(group_files(stored)) == bags
 
-    def test_a_folder_per_unit_and_lot(self, tmp_path: Path) -> None:
+    def test_a_folder_per_unit_and_lot(self, tmp_path):
         for name in ('lot-A/u1/1.mcap', 'lot-A/u1/2.mcap', 'lot-B/u2/1.mcap', 'u3/1.mcap'):
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).touch()
@@ -138,7 +131,7 @@ class TestDiscovery:
             ('u3', '', 1),
         ]
 
-    def test_bags_without_folders_are_sorted_by_serial(self, tmp_path: Path) -> None:
+    def test_bags_without_folders_are_sorted_by_serial(self, tmp_path):
         for seed, names in ((1, ['a.mcap', 'd.mcap']), (2, ['b.mcap', 'c.mcap'])):
             write_unit(tmp_path, seed, 2, names=names)
         write_unit(tmp_path, 3, 1, serial='', names=['e.mcap'])
@@ -152,7 +145,7 @@ class TestDiscovery:
             'f.mcap': ['f.mcap'],
         }
 
-    def test_names_that_somebody_chose_stand_on_one_line(self, tmp_path: Path) -> None:
+    def test_names_that_somebody_chose_stand_on_one_line(self, tmp_path):
         write_unit(tmp_path / 'lot\x1b[31m' / 'a\nb', 1, 1)
         write_unit(tmp_path, 1, 1, serial='S1\nCAL_ACC0_ID 7', names=['loose.mcap'])
         found = find_units(Storage(str(tmp_path)))
@@ -163,7 +156,7 @@ class TestDiscovery:
         for row in rows:
             assert all(cell.isprintable() for cell in row.values() if isinstance(cell, str))
 
-    def test_links_are_followed_but_not_in_circles(self, tmp_path: Path) -> None:
+    def test_links_are_followed_but_not_in_circles(self, tmp_path):
         (tmp_path / 'store' / 'u1').mkdir(parents=True)
         (tmp_path / 'store' / 'u1' / '1.mcap').touch()
         fleet = tmp_path / 'fleet'
@@ -174,14 +167,12 @@ class TestDiscovery:
         found = find_units(Storage(str(fleet)))
         assert [name for one in found for name in one.bags] == ['unit/1.mcap']
 
-    def test_a_relative_path_is_the_same_for_every_process(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_relative_path_is_the_same_for_every_process(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         assert Storage('bags').address == str(tmp_path / 'bags')
         assert Storage('memory://bags').address == 'memory://bags'
 
-    def test_nothing_there(self, tmp_path: Path) -> None:
+    def test_nothing_there(self, tmp_path):
         with pytest.raises(ThermoCompError, match='no bag in it; expected DIR/UNIT/BAG'):
             find_units(Storage(str(tmp_path)))
         with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):
@@ -190,7 +181,7 @@ class TestDiscovery:
             find_units(Storage('memory://never-made'))
 
 
-def test_damage_is_the_bag_s_not_the_file_system_s(tmp_path: Path) -> None:
+def test_damage_is_the_bag_s_not_the_file_system_s(tmp_path):
     (path,) = write_unit(tmp_path / 'u', 1, 1)
     damage(path)
     (found,) = find_units(Storage(str(tmp_path)))

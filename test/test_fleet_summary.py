@@ -2,12 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The statistics of a fleet table: real outliers and drifts are reported, chance is not."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Sequence
 from datetime import datetime, timedelta
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,21 +12,14 @@ from conftest import ROOT
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.fleet.run import Results, render_fleet
 from thermo_comp.fleet.summary import QUANTITIES, outlier_limit, summarise
-from thermo_comp.fleet.table import COLUMNS, Row, read_parquet, row_of, write_tables
+from thermo_comp.fleet.table import COLUMNS, read_parquet, row_of, write_tables
 
 pa = pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')
 
 MONDAY = datetime(2026, 1, 5)
 
 
-def fleet_of(
-    n: int,
-    rng: np.random.Generator,
-    *,
-    lots: Sequence[str] = ('',),
-    day: float = 0.0,
-    like: Sequence[Row] = (),
-) -> list[Row]:
+def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
     """Draw a fleet: every quantity normal (sizes log-normal), or near that of an earlier test."""
     rows = []
     for i in range(n):
@@ -52,29 +41,18 @@ def fleet_of(
         sds = {quantity.sd: 2.0 for quantity in QUANTITIES if quantity.sd}
         rows.append(
             row_of(
-                name=f'{lots[i % len(lots)]}/u{i:03d}@{day:g}',
-                serial=f'S{i:03d}',
-                lot=lots[i % len(lots)],
-                verdict='valid',
-                model='response',
-                start=f'{MONDAY + timedelta(days=day):%Y-%m-%dT%H:%M:%SZ}',
-                raw_ug=300.0,
-                peak_ug=9.0,
-                n_bags=12,
-                n_left_out=0,
-                n_positions=12,
-                lowest_c=5.0,
-                highest_c=35.0,
-                calibration_sha256=f'{day}-{i}',
-                **sds,
-                **cells,
-            )
-        )
+                name=f'{lots[i % len(lots)]}/u{i:03d}@{day:g}', serial=f'S{i:03d}',
+                lot=lots[i % len(lots)], verdict='valid', model='response',
+                start=f'{MONDAY + timedelta(days=day):%Y-%m-%dT%H:%M:%SZ}', raw_ug=300.0,
+                peak_ug=9.0, n_bags=12, n_left_out=0, n_positions=12, lowest_c=5.0, highest_c=35.0,
+                calibration_sha256=f'{day}-{i}', **sds, **cells,
+            ),
+        )  # fmt: skip
     return rows
 
 
 class TestOutliers:
-    def test_one_unit_stands_out_in_one_thing(self, rng: np.random.Generator) -> None:
+    def test_one_unit_stands_out_in_one_thing(self, rng):
         rows = fleet_of(100, rng)
         rows[17] = {**rows[17], 'bias_y_ug': 50.0 * 12.0}
         (found,) = summarise(rows).outliers
@@ -82,34 +60,32 @@ class TestOutliers:
         assert found.value == 600.0
         assert found.z == pytest.approx(12.0, rel=0.3)
 
-    def test_a_twelfth_of_bad_units_does_not_hide_them(self, rng: np.random.Generator) -> None:
+    def test_a_twelfth_of_bad_units_does_not_hide_them(self, rng):
         rows = fleet_of(60, rng)
         for i in range(5):
             rows[i] = {**rows[i], 'dynamic_ug': 40.0}
         assert {one.serial for one in summarise(rows).outliers} == {f'S{i:03d}' for i in range(5)}
 
     @pytest.mark.parametrize('n', [10, 40])
-    def test_a_fleet_without_oddities_alarms_once_in_twenty(
-        self, n: int, rng: np.random.Generator
-    ) -> None:
+    def test_a_fleet_without_oddities_alarms_once_in_twenty(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
         # 60 x 0.05 = 3 on average; twelve happens once in 30000.
         assert n_alarms < 12
 
-    def test_a_small_fleet_has_no_outliers(self, rng: np.random.Generator) -> None:
+    def test_a_small_fleet_has_no_outliers(self, rng):
         rows = fleet_of(6, rng)
         rows[0] = {**rows[0], 'bias_y_ug': 1e6}
         assert summarise(rows).outliers == ()
         assert outlier_limit(6, 20) == float('inf')
 
-    def test_alike_units_have_no_spread_to_stand_out_of(self, rng: np.random.Generator) -> None:
+    def test_alike_units_have_no_spread_to_stand_out_of(self, rng):
         rows = [{**row, 'm_10_urad': 0.0} for row in fleet_of(20, rng)]
         spread = next(one for one in summarise(rows).spreads if one.quantity.name == 'm_10_urad')
         assert (spread.sd, set(spread.z.tolist())) == (0.0, {0.0})
 
 
 class TestDrift:
-    def test_what_changed_between_two_tests(self, rng: np.random.Generator) -> None:
+    def test_what_changed_between_two_tests(self, rng):
         first = fleet_of(10, rng)
         second = fleet_of(10, rng, day=30.0, like=first)
         second[3] = {**second[3], 'bias_x_ug': float(first[3]['bias_x_ug']) + 40.0}
@@ -122,7 +98,7 @@ class TestDrift:
         assert found.worst.sd == pytest.approx(2.0 * np.sqrt(2.0))
         assert (found.earlier, found.later) == ('/u003@0', '/u003@30')
 
-    def test_a_scale_factor_drifts_in_ppm(self, rng: np.random.Generator) -> None:
+    def test_a_scale_factor_drifts_in_ppm(self, rng):
         first = fleet_of(2, rng)
         second = fleet_of(2, rng, day=7.0, like=first)
         second[0] = {**second[0], 'scale_z': float(first[0]['scale_z']) * (1.0 + 90e-6)}
@@ -130,7 +106,7 @@ class TestDrift:
         assert (drift.worst.constant, drift.worst.unit) == ('scale factor z', 'ppm')
         assert drift.worst.change == pytest.approx(90.0)
 
-    def test_an_earlier_table_counts(self, rng: np.random.Generator, tmp_path: Path) -> None:
+    def test_an_earlier_table_counts(self, rng, tmp_path):
         first = fleet_of(3, rng)
         table, _ = write_tables(first, tmp_path)
         before = read_parquet(table)
@@ -142,7 +118,7 @@ class TestDrift:
         assert summarise(first, before).drifts == ()
 
 
-def hostile(rng: np.random.Generator) -> list[Row]:
+def hostile(rng):
     """Draw a fleet whose texts contain mark-up and escape sequences."""
     evil = '<script>alert(1)</script>"&$x_1$'
     first = fleet_of(12, rng, lots=('A', evil))
@@ -156,9 +132,7 @@ def hostile(rng: np.random.Generator) -> list[Row]:
 
 
 class TestPage:
-    def test_nothing_of_the_bags_is_markup_and_nothing_needs_a_network(
-        self, rng: np.random.Generator
-    ) -> None:
+    def test_nothing_of_the_bags_is_markup_and_nothing_needs_a_network(self, rng):
         rows = hostile(rng)
         page = render_fleet(rows, summarise(rows), lambda row: f'units/{row["name"]}/c.html')
         assert '<script' not in page
@@ -173,7 +147,7 @@ class TestPage:
         # Residuals, and distances.
         assert page.count('<figure') == 2
 
-    def test_a_fleet_without_a_calibration(self) -> None:
+    def test_a_fleet_without_a_calibration(self):
         rows = [row_of(name='u', serial='u', verdict='failed', problem='x: damaged')]
         page = render_fleet(rows, summarise(rows), lambda _: '')
         assert '0 of 1 test gave a calibration.' in page
@@ -181,7 +155,7 @@ class TestPage:
 
 
 class TestTable:
-    def test_a_spreadsheet_runs_nothing(self, tmp_path: Path) -> None:
+    def test_a_spreadsheet_runs_nothing(self, tmp_path):
         row = row_of(name='=cmd()', serial='-1', n_bags=3, raw_ug=-1.5)
         _, path = write_tables([row], tmp_path)
         heading, line = path.read_text().splitlines()
@@ -190,7 +164,7 @@ class TestTable:
         assert (cells['name'], cells['serial']) == ("'=cmd()", "'-1")
         assert (cells['n_bags'], cells['raw_ug'], cells['board_lag_s']) == ('3', '-1.5', '')
 
-    def test_what_is_no_fleet_table(self, tmp_path: Path) -> None:
+    def test_what_is_no_fleet_table(self, tmp_path):
         (tmp_path / 'x.parquet').write_bytes(b'PAR1 not')
         with pytest.raises(ThermoCompError, match=r'x\.parquet: not a fleet table'):
             read_parquet(tmp_path / 'x.parquet')
@@ -200,14 +174,14 @@ class TestTable:
         with pytest.raises(ThermoCompError, match='lacks the columns serial and verdict'):
             read_parquet(tmp_path / 'y.parquet')
 
-    def test_the_page_of_the_docs_lists_every_column(self) -> None:
+    def test_the_page_of_the_docs_lists_every_column(self):
         text = (ROOT / 'docs' / 'fleet.md').read_text()
         listed = re.findall(r'^\| `(\w+)` \| (\w+) \| (.*) \|$', text, re.MULTILINE)
         assert [(name, kind, meaning.replace('\\|', '|')) for name, kind, meaning in listed] == [
             (column.name, column.kind, column.meaning) for column in COLUMNS
         ]
 
-    def test_a_strange_column_is_a_mistake(self) -> None:
+    def test_a_strange_column_is_a_mistake(self):
         with pytest.raises(ValueError, match="no column 'colour'"):
             row_of(colour='red')
 
@@ -215,7 +189,7 @@ class TestTable:
 @pytest.mark.parametrize(
     'name', ['../../etc', '.', '..', 'a/../b', '/abs', 'a\0b', 'x' * 300, 'ü/ß', 'a b', '']
 )
-def test_no_name_leads_out_of_the_results(name: str, tmp_path: Path) -> None:
+def test_no_name_leads_out_of_the_results(name, tmp_path):
     results = Results(tmp_path / 'out')
     folder = results.folder_of(name)
     folder.mkdir(parents=True)
@@ -223,7 +197,7 @@ def test_no_name_leads_out_of_the_results(name: str, tmp_path: Path) -> None:
     assert inside in folder.resolve().parents
 
 
-def test_results_need_a_folder(tmp_path: Path) -> None:
+def test_results_need_a_folder(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(ThermoCompError, match='file: cannot be created'):
         Results(tmp_path / 'file')

@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fuzz targets without a fuzzer: their seeds, whole, cut and changed."""
 
-from __future__ import annotations
-
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
@@ -19,7 +16,7 @@ TARGETS = targets.targets()
 
 
 @pytest.mark.parametrize('name', TARGETS)
-def test_seeds_and_what_is_near_them(name: str, rng: np.random.Generator) -> None:
+def test_seeds_and_what_is_near_them(name, rng):
     target = TARGETS[name]
     for seed in target.seeds:
         assert len(seed) <= target.max_length
@@ -32,13 +29,13 @@ def test_seeds_and_what_is_near_them(name: str, rng: np.random.Generator) -> Non
             target.check(bytes(changed))
 
 
-def test_the_runner_lists_every_target() -> None:
+def test_the_runner_lists_every_target():
     import run
 
     assert set(run.NAMES) == set(TARGETS)
 
 
-def test_seeds_are_behind_the_first_checks() -> None:
+def test_seeds_are_behind_the_first_checks():
     assert parse_calibration(TARGETS['calibration'].seeds[0]).unit.serial == 'T'
     for seed in TARGETS['mcap'].seeds:
         targets.BAG.write_bytes(seed)

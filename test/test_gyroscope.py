@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The gyroscope: its fit against simulated truth and closed forms, its file, its triad."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The judge: residuals known by hand, windows of the stated length, each verdict."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +12,7 @@ from builders import GRAVITY, axis_set, calibration, regime_set
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.fitting.sources import digest
 from thermo_comp.judging.evaluation import evaluate
-from thermo_comp.judging.judgement import Judgement, judge
+from thermo_comp.judging.judgement import judge
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.judging.windows import Windows, columns_of
 from thermo_comp.online.batch import process_block
@@ -24,7 +21,6 @@ from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter, table_writer
 from thermo_comp.replay import replay
-from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, spoken
 from thermo_comp.unit.provenance import Provenance, ResidualSummary, Source
 
@@ -35,16 +31,16 @@ SLOPE = 2.0  # counts per K on the z axis
 
 
 def resting(
-    path: Path,
-    temperature: float | tuple[float, float],
+    path,
+    temperature,
     *,
-    minutes: float = 10.0,
-    rate_hz: float = 10.0,
-    noise: float = 0.0,
-    shaken_s: tuple[float, float] | None = None,
-    error: float = 0.0,
-    serial: str = '',
-) -> Path:
+    minutes=10.0,
+    rate_hz=10.0,
+    noise=0.0,
+    shaken_s=None,
+    error=0.0,
+    serial='',
+):
     """Write a unit at rest, z up, whose z axis drifts with its temperature."""
     rng = np.random.default_rng(3)
     begin, end = temperature if isinstance(temperature, tuple) else (temperature, temperature)
@@ -69,53 +65,38 @@ def resting(
     return path
 
 
-def corrected_by(slope: float, claim: float = 0.0, **changes: object) -> Calibration:
+def corrected_by(slope, claim=0.0, **changes):
     """Make a calibration of the z axis' drift per K, with a claimed sd [m/s^2]."""
     parts = {name: axis_set(residual_sd_m_s2=claim) for name in 'xy'}
     part = regime_set(**parts, z=axis_set((0.0, slope), residual_sd_m_s2=claim))
     return dataclasses.replace(calibration(static=part, dynamic=part), **changes)
 
 
-def judged(bag: Path, one: Calibration, **keys: object) -> Judgement:
+def judged(bag, one, **keys):
     return evaluate([bag], [('it', one)], **keys).judgements['it']
 
 
-def made(
-    residual: float, raw: float, claimed: float, n: int = 40, dynamic: int = 10, outside: int = 0
-) -> Windows:
+def made(residual, raw, claimed, n=40, dynamic=10, outside=0):
     """Make windows of one position, z up, from figures in micro-g."""
     force, constant = np.zeros((n, 3)), np.zeros((n, 3))
     force[:, 2] = GRAVITY + residual * MICRO_G
     constant[:, 2] = GRAVITY + raw * MICRO_G
     rows = np.arange(n)
     return Windows(
-        window_s=60.0,
-        gravity=GRAVITY,
-        bag=np.zeros(n, np.int64),
-        position=np.zeros(n, np.int64),
-        start_ns=START_NS + rows * 60 * 10**9,
-        time=rows * 60.0 + 30.0,
-        count=np.full(n, 600),
-        mean=constant * K,
-        board=np.full(n, 20.0),
-        rate=np.zeros(n),
-        is_dynamic=rows < dynamic,
-        is_inside=rows >= outside,
-        is_swapped=np.zeros(n, bool),
-        raw=constant,
-        force=force,
-        size=np.full(n, GRAVITY),
-        claimed_sd=np.full(n, claimed * MICRO_G),
-        noise_sd=np.zeros(n),
+        window_s=60.0, gravity=GRAVITY, bag=np.zeros(n, np.int64), position=np.zeros(n, np.int64),
+        start_ns=START_NS + rows * 60 * 10**9, time=rows * 60.0 + 30.0, count=np.full(n, 600),
+        mean=constant * K, board=np.full(n, 20.0), rate=np.zeros(n), is_dynamic=rows < dynamic,
+        is_inside=rows >= outside, is_swapped=np.zeros(n, bool), raw=constant, force=force,
+        size=np.full(n, GRAVITY), claimed_sd=np.full(n, claimed * MICRO_G), noise_sd=np.zeros(n),
         gyro=np.zeros((n, 0)),
-    )
+    )  # fmt: skip
 
 
 CLAIMING = corrected_by(SLOPE, 1e-5)
 
 
 class TestWindows:
-    def test_residuals_are_those_of_the_hand(self, tmp_path: Path) -> None:
+    def test_residuals_are_those_of_the_hand(self, tmp_path):
         # 10 K above the reference the z axis reads 20 counts more: 20 / 300 m/s^2.
         bag = resting(tmp_path / 'bag', 30.0)
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
@@ -128,7 +109,7 @@ class TestWindows:
             np.testing.assert_allclose(windows.residual, expected, atol=1e-9)
             np.testing.assert_allclose(windows.board, 30.0, rtol=0.0, atol=1e-6)
 
-    def test_a_window_is_the_mean_of_what_the_node_publishes(self, tmp_path: Path) -> None:
+    def test_a_window_is_the_mean_of_what_the_node_publishes(self, tmp_path):
         # A ramp of 1 K/min, in which a wrong time or reading would show.
         bag = resting(tmp_path / 'bag', (15.0, 33.0), minutes=18.0, noise=0.2)
         one = corrected_by(SLOPE)
@@ -146,9 +127,7 @@ class TestWindows:
 
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
     @pytest.mark.parametrize('window_s', [60.0, 120.0])
-    def test_windows_are_as_long_as_stated(
-        self, tmp_path: Path, rate_hz: float, window_s: float
-    ) -> None:
+    def test_windows_are_as_long_as_stated(self, tmp_path, rate_hz, window_s):
         # WHY: 32 samples at 4 Hz are 8 s, and "ten seconds" were sixteen.
         bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
         windows = judged(bag, calibration(), window_s=window_s).windows
@@ -158,12 +137,12 @@ class TestWindows:
         # Every rest of this length is in a window, except for the time before the first reading.
         assert len(windows) >= int(20.5 * 60.0 / window_s) - 1
 
-    def test_samples_too_slow_for_a_window_are_refused(self, tmp_path: Path) -> None:
+    def test_samples_too_slow_for_a_window_are_refused(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0, rate_hz=1.0)
         with pytest.raises(RecordingError, match='too slow for windows of 10 s: 30 s or a mult'):
             judged(bag, calibration(), window_s=10.0)
 
-    def test_only_windows_at_rest_are_judged(self, tmp_path: Path) -> None:
+    def test_only_windows_at_rest_are_judged(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0, noise=0.3, shaken_s=(201.0, 222.0))
         windows = judged(bag, calibration(), window_s=10.0).windows
         inside = (windows.time > 196.0) & (windows.time < 227.0)
@@ -173,7 +152,7 @@ class TestWindows:
         # 0.3 counts of noise over 100 samples: 0.1 mm/s^2 per window.
         assert np.sqrt(np.mean(windows.residual**2)) < 3.0 * 0.3 / K / 10.0
 
-    def test_noise_is_claimed_as_it_is(self, tmp_path: Path) -> None:
+    def test_noise_is_claimed_as_it_is(self, tmp_path):
         # White noise of sd 0.3 counts at 10 Hz, which the calibration states.
         density = 0.3 / K * np.sqrt(0.1)
         unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
@@ -184,7 +163,7 @@ class TestWindows:
         # 240 windows: the RMS of a standard normal is 1 within 3 / sqrt(2 * 240).
         assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.14)
 
-    def test_a_noisy_unit_rests_as_its_calibration_says(self, tmp_path: Path) -> None:
+    def test_a_noisy_unit_rests_as_its_calibration_says(self, tmp_path):
         # WHY: the limit of 50 mg also applied to a unit whose known scatter is 100 mg.
         bag = resting(tmp_path / 'bag', 20.0, noise=0.1 * K * GRAVITY)
         density = 0.1 * GRAVITY * np.sqrt(0.1)
@@ -194,12 +173,12 @@ class TestWindows:
         with pytest.raises(RecordingError, match='no window of 60 s at rest'):
             judged(bag, calibration())
 
-    def test_gravity_is_that_of_the_place(self, tmp_path: Path) -> None:
+    def test_gravity_is_that_of_the_place(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0)
         found = judged(bag, calibration(), gravity=GRAVITY + 1e-3)
         np.testing.assert_allclose(found.windows.residual, -1e-3, atol=1e-9)
 
-    def test_several_recordings_are_judged_as_one(self, tmp_path: Path) -> None:
+    def test_several_recordings_are_judged_as_one(self, tmp_path):
         bags = [
             resting(tmp_path / name, at, error=error)
             for name, at, error in (('one', 19.0, 0.3), ('two', 30.0, -0.3))
@@ -212,13 +191,13 @@ class TestWindows:
         assert whole.rms == pytest.approx(0.3 / K, rel=1e-3)
         assert found.notes == ()
 
-    def test_a_bag_that_never_rests_is_named(self, tmp_path: Path) -> None:
+    def test_a_bag_that_never_rests_is_named(self, tmp_path):
         good = resting(tmp_path / 'good', 25.0)
         short = resting(tmp_path / 'short', 25.0, minutes=0.5)
         (note,) = evaluate([good, short], [('it', CLAIMING)]).notes
         assert note.startswith(f'{short}: no window of 60 s at rest')
 
-    def test_refusals(self, tmp_path: Path) -> None:
+    def test_refusals(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0, minutes=1.0, serial='T-9')
         with pytest.raises(CalibrationError, match='is of unit T-1'):
             judged(bag, calibration())
@@ -240,9 +219,7 @@ class TestVerdict:
             (1000.0, 1000.0, 1500.0, 'no better than raw'),
         ],
     )
-    def test_by_its_own_claim(
-        self, residual: float, raw: float, claimed: float, verdict: str
-    ) -> None:
+    def test_by_its_own_claim(self, residual, raw, claimed, verdict):
         found = judge(made(residual, raw, claimed), CLAIMING)
         assert found.verdict == verdict
         assert found.is_valid == verdict.startswith('valid')
@@ -261,14 +238,12 @@ class TestVerdict:
             (90.0, 80.0, 60.0, 'no better than raw'),
         ],
     )
-    def test_the_users_limit_decides(
-        self, residual: float, raw: float, claimed: float, verdict: str
-    ) -> None:
+    def test_the_users_limit_decides(self, residual, raw, claimed, verdict):
         found = judge(made(residual, raw, claimed), CLAIMING, 100.0 * MICRO_G)
         assert found.verdict == verdict
         assert '100 ug tolerated' in found.reason
 
-    def test_headline_of_seen_windows_is_what_was_left_out(self) -> None:
+    def test_headline_of_seen_windows_is_what_was_left_out(self):
         # WHY: in sample 59 ug, held out in the same positions 61 ug, in a new attitude 1091 ug.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         one = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
@@ -287,7 +262,7 @@ class TestVerdict:
         assert '300 ug on positions left out, 100 ug tolerated' in limited.reason
         assert judge(windows, one, 100.0 * MICRO_G).verdict == 'valid'
 
-    def test_a_bag_of_the_fit_is_known_by_its_hash(self, tmp_path: Path) -> None:
+    def test_a_bag_of_the_fit_is_known_by_its_hash(self, tmp_path):
         bag = resting(tmp_path / 'bag', 25.0)
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=3e-4)
         for sha256, expected in ((digest(bag), 3e-4), ('0' * 64, np.nan)):
@@ -296,7 +271,7 @@ class TestVerdict:
             found = judged(bag, dataclasses.replace(CLAIMING, provenance=provenance))
             assert found.left_out_rms == pytest.approx(expected, nan_ok=True)
 
-    def test_no_uncertainty_makes_no_claim(self) -> None:
+    def test_no_uncertainty_makes_no_claim(self):
         # WHY: an import without covariance was compared with the noise alone and called wrong.
         imported = corrected_by(SLOPE)
         windows = made(50.0, 1000.0, 2.0)
@@ -309,7 +284,7 @@ class TestVerdict:
         assert judge(windows, imported, 40.0 * MICRO_G).verdict == 'recalibrate'
         assert judge(made(50.0, 40.0, 2.0), imported).verdict == 'no better than raw'
 
-    def test_the_worse_regime_counts(self) -> None:
+    def test_the_worse_regime_counts(self):
         windows = made(50.0, 1000.0, 60.0)
         worse = windows.force.copy()
         worse[:10, 2] = GRAVITY + 150.0 * MICRO_G
@@ -320,7 +295,7 @@ class TestVerdict:
         assert found.verdict == 'recalibrate'
         assert judge(windows, CLAIMING, 100.0 * MICRO_G).verdict == 'recalibrate'
 
-    def test_what_is_outside_the_ranges_decides_nothing(self) -> None:
+    def test_what_is_outside_the_ranges_decides_nothing(self):
         windows = made(50.0, 1000.0, 60.0, outside=10)
         wild = windows.force.copy()
         wild[:10, 2] = GRAVITY + 5000.0 * MICRO_G
@@ -339,7 +314,7 @@ class TestVerdict:
             assert found.verdict == 'outside the calibrated range: not judged'
             assert not found.is_valid
 
-    def test_outside_is_told_from_a_bag(self, tmp_path: Path) -> None:
+    def test_outside_is_told_from_a_bag(self, tmp_path):
         _, upper = CLAIMING.static.temperature_range_c
         found = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
         assert found.kind is Verdict.OUTSIDE
@@ -349,9 +324,7 @@ class TestVerdict:
         assert edge.sections['outside'].n == 0
 
 
-def around(
-    n: int, bias: tuple[float, ...], scale: tuple[float, ...], noise: float = 0.0
-) -> Windows:
+def around(n, bias, scale, noise=0.0):
     """Make windows of a unit in n positions, with changes of the axes' bias [m/s^2] and scale."""
     rng = np.random.default_rng(5)
     faces = np.vstack((np.eye(3), -np.eye(3)))
@@ -366,7 +339,7 @@ def around(
 
 class TestShifts:
     @pytest.mark.parametrize('n', [6, 18])
-    def test_what_moved_is_named(self, n: int) -> None:
+    def test_what_moved_is_named(self, n):
         moved = around(n, (20.0 * MICRO_G, 0.0, 0.0), (0.0, 30e-6, 0.0), noise=0.5 * MICRO_G)
         # The noise of a window, half a micro-g, gives a claim of 2 ug with 12 windows per
         # position.
@@ -379,14 +352,14 @@ class TestShifts:
         assert found.verdict == 'recalibrate'
         assert '; moved: x bias +' in found.reason
 
-    def test_a_unit_as_it_was_has_not_moved(self) -> None:
+    def test_a_unit_as_it_was_has_not_moved(self):
         found = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)
         assert (len(found.shifts), found.moved, found.verdict) == (3, (), 'valid')
         # Five positions do not determine the shifts.
         found = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
         assert (found.shifts, found.n_positions) == ((), 5)
 
-    def test_rms_of_an_axis_is_about_the_mean_of_a_position(self) -> None:
+    def test_rms_of_an_axis_is_about_the_mean_of_a_position(self):
         windows = made(0.0, 1000.0, 60.0, n=40, dynamic=20)
         force = windows.force.copy()
         force[:20, 0] += 3e-5 * np.where(np.arange(20) % 2, 1.0, -1.0)
@@ -394,7 +367,7 @@ class TestShifts:
         np.testing.assert_allclose(found.axis_rms, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
 
 
-def test_thermometers_in_doubt_are_told_offline_too(root: Path, tmp_path: Path) -> None:
+def test_thermometers_in_doubt_are_told_offline_too(root, tmp_path):
     """
     WHY: replay did not report exchanged thermometers, and evaluate called them valid.
 
@@ -416,7 +389,7 @@ def test_thermometers_in_doubt_are_told_offline_too(root: Path, tmp_path: Path) 
     assert note == f'board temperature +2.00 K {CONTINUED}'
 
 
-def test_windows_as_a_table(tmp_path: Path) -> None:
+def test_windows_as_a_table(tmp_path):
     windows = made(50.0, 1000.0, 60.0, outside=3)
     with table_writer(tmp_path / 'rows', {}) as write:
         write(columns_of(windows, ['a,"b".mcap']))
@@ -439,13 +412,13 @@ def test_windows_as_a_table(tmp_path: Path) -> None:
     ('text', 'micro_g'),
     [('100ug', 100.0), ('100 µg', 100.0), ('0.5mg', 500.0), ('9.80665e-4m/s^2', 100.0)],
 )
-def test_accelerations_are_read_with_their_unit(text: str, micro_g: float) -> None:
+def test_accelerations_are_read_with_their_unit(text, micro_g):
     assert parse_acceleration(text) / MICRO_G == pytest.approx(micro_g)
 
 
 @pytest.mark.parametrize(
     'text', ['', '100', 'ug', '-1ug', '1 parsec', '1e999ug', '0mg', '1.2.3mg']
 )
-def test_accelerations_without_sense_are_refused(text: str) -> None:
+def test_accelerations_without_sense_are_refused(text):
     with pytest.raises(ValueError, match='expected a positive number with its unit, like 100ug'):
         parse_acceleration(text)

@@ -1,12 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The history of a unit: changes with covariances known by hand, in order of dates."""
-
-from __future__ import annotations
+"""The history of a unit, with covariances known by hand, and one verdict of all commands."""
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +11,9 @@ from builders import axis_set, calibration, regime_set
 from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.judging.evaluation import drifts_of, history_of
+from thermo_comp.report.html import number
 from thermo_comp.report.page import render_report
-from thermo_comp.unit.calibration import AxisReference, Calibration
+from thermo_comp.unit.calibration import AxisReference
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.provenance import Source
@@ -25,7 +23,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 K = 300.0
 
 
-def dated(created: str, bias_ug: float = 0.0, ppm: float = 0.0, sd_ug: float = 3.0) -> Calibration:
+def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
     """Change the z axis of a unit, with a claimed sd of its bias."""
     scale = K * (1.0 + 1e-6 * ppm)
     axes = dataclasses.replace(
@@ -39,7 +37,7 @@ def dated(created: str, bias_ug: float = 0.0, ppm: float = 0.0, sd_ug: float = 3
     return dataclasses.replace(one, provenance=provenance)
 
 
-def test_changes_and_their_sd_by_hand() -> None:
+def test_changes_and_their_sd_by_hand():
     # The later calibration is given first, but dates decide. Sd of 3 and 4 ug make 5.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
     assert [one.constant for one in drifts] == [
@@ -56,7 +54,7 @@ def test_changes_and_their_sd_by_hand() -> None:
         assert not one.is_sure
 
 
-def test_what_is_no_history() -> None:
+def test_what_is_no_history():
     one = dated('2026-01-01')
     # Another model of the same bags, another unit, and a single calibration.
     other = dataclasses.replace(one, unit=dataclasses.replace(one.unit, serial='other'))
@@ -69,7 +67,7 @@ def test_what_is_no_history() -> None:
     assert not any(drift.is_sure for drift in silent)
 
 
-def test_commands_tell_the_history(cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_tell_the_history(cli, tmp_path, monkeypatch):
     undrawn = 'thermo_comp.report.page.drawn_figures'
     monkeypatch.setattr(undrawn, lambda figures: [(one, '') for one in figures])
     now = fitted().calibration
@@ -92,3 +90,40 @@ def test_commands_tell_the_history(cli, tmp_path: Path, monkeypatch: pytest.Monk
     assert drawn['history'] == told['history']
     assert '2020-01-01' in page.read_text(encoding='utf-8')
     assert '<h2>History</h2>' not in render_report(evidence(), figures=[])
+
+
+FACTS = (
+    *('verdict', 'reason', 'is_valid', 'gravity_m_s2', 'window_s', 'tolerance_m_s2'),
+    *('sections_m_s2', 'n_positions', 'moved', 'shifts', 'axis_rms_m_s2'),
+)
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('judge')
+    save_calibration(fitted().calibration, folder / 'unit.yaml')
+    write_bag(folder / 'held_out.mcap')
+    return folder
+
+
+@pytest.mark.usefixtures('no_figures')
+@pytest.mark.parametrize('options', [(), ('--tolerance', '1ug', '--window', '120')])
+def test_evaluate_and_report_agree(cli, folder, options):
+    # WHY: for one bag and calibration one command said "re-calibrate", another "holds".
+    page = folder / f'page{len(options)}.html'
+    given = (folder / 'held_out.mcap', '-c', folder / 'unit.yaml', *options, '--json')
+    one = cli('evaluate', *given, code=None)
+    other = cli('report', *given, '-o', page, code=None)
+    ours, theirs = json.loads(one.stdout), json.loads(other.stdout)
+    for name in FACTS:
+        assert ours[name] == theirs[name], name
+    assert one.returncode == other.returncode == (0 if ours['is_valid'] else 1)
+    assert ours['window_s'] == float(options[3] if options else 60)
+    # The page shows the same figures, with the same length of windows.
+    text = page.read_text(encoding='utf-8')
+    assert f'means over {ours["window_s"]:g} s' in text
+    assert ours['verdict'].replace(' ug', ' µg') in text
+    for section in ours['sections_m_s2'].values():
+        if section['n']:
+            for name in ('raw_rms', 'rms', 'peak', 'claimed_rms'):
+                assert f'>{number(section[name] / 9.80665e-6)}<' in text

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Jumps at rest: time and size; turns, motions and knocks are not jumps."""
 
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -143,3 +143,18 @@ def test_a_shock_that_the_low_pass_lets_die_away_is_no_jump(rng, tau_s):
     since = rest.time - 301.0
     rest.accel[:, 2] += np.where(since >= 0.0, 40.0 * MG * np.exp(-since.clip(0.0) / tau_s), 0.0)
     assert find_jumps(reduce_source(rest.source(), full_scale=None)) == ()
+
+
+def test_bag_without_neighbours_is_not_read_again(rng):
+    n_passes = 0
+    source = Rest(rng).source()
+
+    def blocks():
+        nonlocal n_passes
+        n_passes += 1
+        return source.blocks()
+
+    bag = reduce_source(replace(source, blocks=blocks), full_scale=None)
+    assert len(bag.intervals) == 1
+    assert find_jumps(bag) == ()
+    assert n_passes == 1

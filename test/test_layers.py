@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 import ast
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
 
 import pytest
+from conftest import ran
 
 PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
 
@@ -46,24 +46,13 @@ LAYERS = {
 # Rooms that may import a library. A library that is missing here is free for all rooms.
 ROS = ['rclpy', 'rcl_interfaces', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs']
 HOMES = {
-    **{name: {'ros'} for name in ROS},
-    'rosgraph_msgs': {'ros'},
-    'builtin_interfaces': {'ros'},
-    'rosbags': {'recording'},
-    'mcap': {'recording'},
-    'zstandard': {'recording'},
-    'lz4': {'recording'},
-    'matplotlib': {'report'},
-    'jinja2': {'report'},
-    'pyulog': {'convert'},
-    'pymavlink': {'convert'},
-    'pyarrow': {'convert', 'fleet', 'recording'},
-    'dask': {'fleet'},
-    'distributed': {'fleet'},
-    'fsspec': {'fleet'},
-    'typer': {'cli', '__main__'},
+    **{name: {'ros'} for name in ROS}, 'rosgraph_msgs': {'ros'}, 'builtin_interfaces': {'ros'},
+    'rosbags': {'recording'}, 'mcap': {'recording'}, 'zstandard': {'recording'},
+    'lz4': {'recording'}, 'matplotlib': {'report'}, 'jinja2': {'report'}, 'pyulog': {'convert'},
+    'pymavlink': {'convert'}, 'pyarrow': {'convert', 'fleet', 'recording'}, 'dask': {'fleet'},
+    'distributed': {'fleet'}, 'fsspec': {'fleet'}, 'typer': {'cli', '__main__'},
     'rich': {'cli', '__main__'},
-}
+}  # fmt: skip
 
 # The mathematics reads no clock.
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
@@ -75,13 +64,13 @@ CLOCK_EXCEPTIONS = {
 SOURCES = sorted(PACKAGE.rglob('*.py'))
 
 
-def unit_of(path: Path) -> str:
+def unit_of(path):
     relative = path.relative_to(PACKAGE)
     return relative.parts[0].removesuffix('.py')
 
 
 @cache
-def imports_of(path: Path, with_types: bool = True) -> list[tuple[int, str]]:
+def imports_of(path, with_types=True):
     """Return (line, absolute dotted name) of every import, also of those inside functions."""
     here = ('thermo_comp', *path.relative_to(PACKAGE).with_suffix('').parts)
     tree = ast.parse(path.read_text(encoding='utf-8'), str(path))
@@ -91,7 +80,7 @@ def imports_of(path: Path, with_types: bool = True) -> list[tuple[int, str]]:
         if isinstance(node, ast.If) and ast.unparse(node.test) == 'TYPE_CHECKING'
         for inner in ast.walk(node)
     }
-    found: list[tuple[int, str]] = []
+    found = []
     for node in ast.walk(tree):
         if node in typing and not with_types:
             continue
@@ -105,7 +94,7 @@ def imports_of(path: Path, with_types: bool = True) -> list[tuple[int, str]]:
 
 
 @cache
-def own_unit(name: str) -> str | None:
+def own_unit(name):
     """Return the room of an absolute name of this package, None for other packages."""
     parts = name.split('.')
     if parts[0] != 'thermo_comp':
@@ -117,7 +106,7 @@ def own_unit(name: str) -> str | None:
 
 
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_go_down_only(path: Path) -> None:
+def test_imports_go_down_only(path):
     unit, own = unit_of(path), path.relative_to(PACKAGE).as_posix()
     assert unit in LAYERS, f'{unit} has no layer: give it one in {Path(__file__).name}'
     wrong = []
@@ -134,7 +123,7 @@ def test_imports_go_down_only(path: Path) -> None:
 
 
 @cache
-def own_file(name: str) -> str:
+def own_file(name):
     """Return the file of this package that an absolute name is imported from, as a dotted name."""
     parts = name.split('.')[1:]
     while parts:
@@ -147,7 +136,7 @@ def own_file(name: str) -> str:
     return '__init__'
 
 
-def circle(uses: dict[str, set[str]]) -> dict[str, set[str]]:
+def circle(uses):
     """
     Remove the leaves of a graph repeatedly; return the rest, which is empty without a circle.
     """
@@ -159,10 +148,10 @@ def circle(uses: dict[str, set[str]]) -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize('by', ['room', 'file'])
-def test_no_circle(by: str) -> None:
+def test_no_circle(by):
     # Within a layer a room may use another, but not mutually, and no two files may use each other.
     # Imports for type annotations do not count.
-    uses: dict[str, set[str]] = {}
+    uses = {}
     for path in SOURCES:
         own = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)
         here = unit_of(path) if by == 'room' else own
@@ -177,21 +166,13 @@ def test_no_circle(by: str) -> None:
     assert not left, f'these import each other: {left}'
 
 
-def loaded_after(statement: str, *watched: str) -> list[str]:
+def loaded_after(statement, *watched):
     """Return which of the watched modules a new interpreter has imported after one statement."""
     code = f'{statement}\nimport sys\nprint(*[m for m in {watched!r} if m in sys.modules])'
-    finished = subprocess.run(
-        [sys.executable, '-c', code],
-        cwd=PACKAGE.parent,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
-    return finished.stdout.split()
+    return ran(sys.executable, '-c', code, check=True, timeout=120).stdout.split()
 
 
-def test_node_starts_without_the_offline_libraries() -> None:
+def test_node_starts_without_the_offline_libraries():
     # The node runs on the robot's computer for weeks: libraries for fits or plots would cost
     # memory and start-up time.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
@@ -199,16 +180,16 @@ def test_node_starts_without_the_offline_libraries() -> None:
     assert loaded_after('import thermo_comp.ros.node', *offline) == []
 
 
-def test_help_starts_without_the_heavy_libraries() -> None:
+def test_help_starts_without_the_heavy_libraries():
     heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'rclpy', 'dask')
     assert loaded_after('import thermo_comp.cli.app', *heavy) == []
 
 
-def test_a_look_at_a_bag_starts_without_the_fit() -> None:
+def test_a_look_at_a_bag_starts_without_the_fit():
     heavy = ('scipy', 'matplotlib', 'pydantic', 'rosbags', 'rclpy', 'thermo_comp.fitting')
     assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
 
 
-def test_core_imports_no_files_and_no_ros() -> None:
+def test_core_imports_no_files_and_no_ros():
     statement = 'import thermo_comp.online.compensator'
     assert loaded_after(statement, 'rclpy', 'rosbags', 'mcap', 'matplotlib', 'scipy') == []

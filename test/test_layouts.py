@@ -2,14 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every path in the viewers' layouts leads to a number in a replayed bag."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +26,7 @@ TYPES = get_typestore(Stores.ROS2_JAZZY)
 LIVE_ONLY = {'/diagnostics'}
 
 
-def replayed(folder: Path, kind: str) -> dict[str, str]:
+def replayed(folder, kind):
     """Replay a minute of a bag with its inputs kept; return the type of each topic."""
     stamps = 10**18 + np.arange(600) * (SECOND_NS // 10)
     slow = 10**18 + np.arange(-1, 60) * SECOND_NS
@@ -51,12 +48,12 @@ def replayed(folder: Path, kind: str) -> dict[str, str]:
 
 
 @pytest.fixture(scope='module')
-def topics(tmp_path_factory) -> dict[str, str]:
+def topics(tmp_path_factory):
     folder = tmp_path_factory.mktemp('layouts')
     return {**replayed(folder, 'counts'), **replayed(folder, 'imu')}
 
 
-def field_kind(message: str, fields: list[str]) -> str:
+def field_kind(message, fields):
     """Follow field names through message definitions; return the type of the last one."""
     name = message
     for part in fields:
@@ -72,15 +69,15 @@ def field_kind(message: str, fields: list[str]) -> str:
     return name
 
 
-def panels() -> dict[str, dict]:
+def panels():
     return json.loads(FOXGLOVE.read_text())['configById']
 
 
-def foxglove_paths() -> list[str]:
+def foxglove_paths():
     return [path['value'] for panel in panels().values() for path in panel.get('paths', [])]
 
 
-def script() -> str:
+def script():
     (only,) = json.loads(FOXGLOVE.read_text())['userNodes'].values()
     return only['sourceCode']
 
@@ -117,11 +114,11 @@ def test_foxglove_shows_every_panel_once():
     assert {'Plot', 'StateTransitions', 'DiagnosticSummary'} <= kinds
 
 
-def plotjuggler() -> ET.Element:
+def plotjuggler():
     return ET.fromstring(PLOTJUGGLER.read_text())  # noqa: S314 - our own file
 
 
-def source_kind(topics: dict[str, str], series: str) -> str:
+def source_kind(topics, series):
     topic = max((t for t in topics if series.startswith(f'{t}/')), key=len)
     fields = series[len(topic) + 1 :].split('/')
     # PlotJuggler writes an element of a covariance as a field [row;column].

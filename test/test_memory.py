@@ -4,8 +4,6 @@
 The thermal memory against closed forms: lags of ramps and steps, loops of plays, unknown starts.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -96,15 +94,6 @@ def test_the_loop_of_a_play():
     assert again == pytest.approx([max(1.0, v - 1.0) for v in way[102:]])
     assert memory.at(200, 9.0, [0.0]) == [-1.0]
     assert memory.at(200, -9.0, [0.0]) == [1.0]
-
-
-def test_a_play_does_not_depend_on_how_fast_it_goes():
-    slow, fast = plays(0.4, 1.6), plays(0.4, 1.6)
-    for k, v in enumerate(np.linspace(0.0, 3.0, 1000)):
-        slow.board_step(k, float(v))
-    for k, v in enumerate((0.0, 3.0)):
-        fast.board_step(k, v)
-    assert slow.at(1000, 3.0, [0.0]) == pytest.approx(fast.at(1000, 3.0, [0.0]))
 
 
 def test_a_play_on_a_lag_follows_the_lag():

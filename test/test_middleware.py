@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Fast DDS profile has its effect, and a profile of the user replaces it."""
 
-from __future__ import annotations
-
 import json
 import os
 import select
@@ -20,7 +18,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import calibration
 from node_process import NodeProcess
-from ros_helpers import Driver, Peer, stamp_of, standing
+from ros_helpers import Driver, stamp_of, standing
 from sensor_msgs.msg import Imu
 
 from thermo_comp.ros.player import lossless
@@ -74,7 +72,7 @@ print(json.dumps(list(heard.values())), flush=True)
 """
 
 
-def event_wakes(pid: int) -> int:
+def event_wakes(pid):
     """Count how often the thread of the middleware's timed events has been woken so far."""
     (thread,) = (
         task
@@ -85,7 +83,7 @@ def event_wakes(pid: int) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith('voluntary'))
 
 
-def send(driver: Driver, first: int, last: int, pause_s: float) -> None:
+def send(driver, first, last, pause_s):
     """Send samples one by one, with the temperatures at every hundredth."""
     pause = threading.Event()
     for k in range(first, last):
@@ -96,13 +94,13 @@ def send(driver: Driver, first: int, last: int, pause_s: float) -> None:
 
 
 @pytest.fixture
-def node_arguments(tmp_path: Path) -> list[str]:
+def node_arguments(tmp_path):
     unit = tmp_path / 'unit.yaml'
     save_calibration(calibration(), unit)
     return [*lossless(), '-p', f'calibration_file:={unit}']
 
 
-def wakes_per_sample(peer: Peer, drivers: list[Driver], node_arguments: list[str]) -> float:
+def wakes_per_sample(peer, drivers, node_arguments):
     """Run the node with a reliable subscriber; count the wake-ups of its event thread."""
     with NodeProcess(*node_arguments) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -121,24 +119,20 @@ def wakes_per_sample(peer: Peer, drivers: list[Driver], node_arguments: list[str
         return (event_wakes(node.process.pid) - before) / N_SAMPLES
 
 
-def test_samples_do_not_wake_the_event_thread(
-    peer: Peer, node_arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, monkeypatch):
     # The user's profile leaves Fast DDS at its default: an event is due with each sample, or with
     # the first of several that a busy machine handles together.
     other = tmp_path / 'other.xml'
     other.write_text(OTHER)
     monkeypatch.setenv(VARIABLE, str(other))
-    drivers: list[Driver] = []
+    drivers = []
     by_default = wakes_per_sample(peer, drivers, node_arguments)
     # With the node's profile an event is due 50 times a second, not with each of 700 samples.
     monkeypatch.delenv(VARIABLE)
     assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
 
 
-def test_what_is_lost_on_the_way_is_repeated(
-    peer: Peer, node_arguments: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_lost_on_the_way_is_repeated(peer, node_arguments, monkeypatch):
     # The receiver is stopped while twice as many samples are sent as its shared memory queue holds
     # (512).
     monkeypatch.delenv(VARIABLE, raising=False)
@@ -167,7 +161,7 @@ def test_what_is_lost_on_the_way_is_repeated(
     assert len(set(best_effort) & set(reliable[-1000:])) < 1000
 
 
-def test_where_the_profile_comes_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_profile_comes_from(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # The previous setting is restored at the end.
     monkeypatch.setenv(VARIABLE, 'mine.xml')

@@ -2,13 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node on real DDS: its input, its output and its diagnostics."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -20,19 +15,27 @@ from builders import calibration, rich_calibration, thermal_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_helpers import DEEP, SECOND_NS, Peer, drive, node_in_thread, stamp_of, stamped, standing
+from ros_helpers import (
+    CYCLE_NS,
+    DEEP,
+    SECOND_NS,
+    START_NS,
+    drive,
+    node_arguments,
+    node_in_thread,
+    stamp_of,
+    stamped,
+    standing,
+)
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
-from thermo_comp.online.compensator import Compensator
 from thermo_comp.ros.player import lossless
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
-from thermo_comp.unit.calibration import Calibration, Unit
+from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.nonlinearity import Nonlinearity
 
-START_NS = 1_767_225_600 * SECOND_NS
-CYCLE_NS = 10_000_000
 BEST_EFFORT = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -41,26 +44,24 @@ IMU_UNIT = Unit('T-1', 'm/s^2', 160.0, 0.01)
 
 
 @pytest.fixture
-def saved(tmp_path: Path) -> Callable[..., list[str]]:
+def saved(tmp_path):
     """Write a calibration and return the ROS arguments of a node with it."""
 
-    def save(of: Calibration, *overrides: str) -> list[str]:
-        path = tmp_path / 'unit.yaml'
-        save_calibration(of, path)
-        words = [f'calibration_file:={path}', 'diagnostics_period:=0.05', *overrides]
-        return [word for override in words for word in ('-p', override)]
+    def save(of, *overrides):
+        save_calibration(of, tmp_path / 'unit.yaml')
+        return node_arguments(tmp_path / 'unit.yaml', *overrides)
 
     return save
 
 
-def diagnosis(peer: Peer) -> Callable[[Callable[[DiagnosticStatus, dict[str, str]], Any]], Any]:
+def diagnosis(peer):
     """Wait for diagnostics that fulfil a condition; return the status and its values."""
     heard = peer.listen(DiagnosticArray, '/diagnostics')
 
-    def wait(condition: Callable[[DiagnosticStatus, dict[str, str]], Any]) -> Any:
+    def wait(condition):
         found = []
 
-        def look() -> bool:
+        def look():
             for array in heard:
                 values = {one.key: one.value for one in array.status[0].values}
                 if condition(array.status[0], values):
@@ -75,65 +76,7 @@ def diagnosis(peer: Peer) -> Callable[[Callable[[DiagnosticStatus, dict[str, str
     return wait
 
 
-def test_publishes_the_compensators_values_under_the_inputs_stamps(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
-    unit = rich_calibration()
-    with node_in_thread(*saved(unit)) as node:
-        heard = peer.listen(Imu, 'imu/data_raw')
-        driver = drive(peer, node)
-        compensator = Compensator(unit)
-        expected = []
-        for k in range(300):
-            stamp_ns = START_NS + k * CYCLE_NS + 123
-            if k % 10 == 0:
-                driver.temperatures(stamp_ns - 50, 20.0 + 0.001 * k, 21.0 + 0.002 * k)
-                compensator.push('board', stamp_ns - 50, 20.0 + 0.001 * k)
-                compensator.push('case', stamp_ns - 50, 21.0 + 0.002 * k)
-            driver.counts(stamp_ns, 100.0 + k, -5.0 * k, 2900.0, frame_id='accel_link')
-            expected.append((stamp_ns, compensator.process(stamp_ns, 100.0 + k, -5.0 * k, 2900.0)))
-        peer.wait_for(lambda: len(heard) == 300, '300 samples')
-    for imu, (stamp_ns, values) in zip(heard, expected, strict=True):
-        assert stamp_of(imu) == stamp_ns
-        assert imu.header.frame_id == 'accel_link'
-        force = imu.linear_acceleration
-        assert (force.x, force.y, force.z) == values[:3]
-        c00, c01, c02, c11, c12, c22 = values[3:]
-        full = [c00, c01, c02, c01, c11, c12, c02, c12, c22]
-        assert imu.linear_acceleration_covariance.tolist() == full
-        assert imu.orientation_covariance[0] == imu.angular_velocity_covariance[0] == -1.0
-
-
-def test_a_reading_that_comes_late_counts_from_the_next_sample(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
-    # WHY: the node takes all waiting samples before the readings between them. WHAT: order of
-    # arrival decides, as in a bag; a reading never applies to earlier samples.
-    unit = rich_calibration()
-    with node_in_thread(*saved(unit), *lossless()) as node:
-        heard = peer.listen(Imu, 'imu/data_raw')
-        driver = drive(peer, node)
-        compensator = Compensator(unit)
-        expected = []
-        for k in range(2000):
-            stamp_ns = START_NS + k * CYCLE_NS
-            driver.counts(stamp_ns, *standing(k))
-            expected.append(compensator.process(stamp_ns, *standing(k)))
-            if k % 7 == 0:
-                # Its stamp is that of three samples before the one that it follows.
-                late = stamp_ns - 3 * CYCLE_NS
-                driver.temperatures(late, 20.0 + 0.01 * k, 22.0 + 0.01 * k)
-                compensator.push('board', late, 20.0 + 0.01 * k)
-                compensator.push('case', late, 22.0 + 0.01 * k)
-        expected = [values for values in expected if values is not None]
-        peer.wait_for(lambda: len(heard) == len(expected), f'{len(expected)} samples')
-    found = [(m.linear_acceleration.x, m.linear_acceleration.y) for m in heard]
-    assert found == [values[:2] for values in expected]
-
-
-def test_imu_input_with_frame_and_switch_of_the_input(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
+def test_imu_input_with_frame_and_switch_of_the_input(peer, saved):
     unit = replace(calibration(), unit=IMU_UNIT)
     with node_in_thread(*saved(unit, 'input:=imu', 'frame_id:=body')) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -167,9 +110,7 @@ def test_imu_input_with_frame_and_switch_of_the_input(
         assert heard[1].linear_acceleration.x == pytest.approx(0.5, rel=1e-12)
 
 
-def test_flag_is_latched_and_not_there_while_unknown(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
+def test_flag_is_latched_and_not_there_while_unknown(peer, saved):
     with node_in_thread(*saved(calibration()), *lossless()) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         flags = peer.listen(Bool, 'regime/dynamic')
@@ -214,7 +155,7 @@ def test_flag_is_latched_and_not_there_while_unknown(
         assert stamps[-1] <= START_NS + n * SECOND_NS
 
 
-def test_diagnostics_name_what_is_wrong(peer: Peer, saved: Callable[..., list[str]]) -> None:
+def test_diagnostics_name_what_is_wrong(peer, saved):
     wait = diagnosis(peer)
     with node_in_thread(*saved(thermal_calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -252,9 +193,7 @@ def test_diagnostics_name_what_is_wrong(peer: Peer, saved: Callable[..., list[st
         wait(lambda s, _: '1 jumps of time backwards' in s.message)
 
 
-def test_diagnostics_tell_noise_and_bias_apart(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
+def test_diagnostics_tell_noise_and_bias_apart(peer, saved):
     wait, unit = diagnosis(peer), rich_calibration()
     with node_in_thread(*saved(unit)) as node:
         driver = drive(peer, node)
@@ -283,9 +222,7 @@ def test_diagnostics_tell_noise_and_bias_apart(
 
 
 @pytest.mark.parametrize('was_fitted_with_case', [False, True])
-def test_a_case_is_missed_only_by_a_calibration_that_knew_one(
-    peer: Peer, saved: Callable[..., list[str]], was_fitted_with_case: bool
-) -> None:
+def test_a_case_is_missed_only_by_a_calibration_that_knew_one(peer, saved, was_fitted_with_case):
     seen = DetectorSettings(case=ThermometerSettings(noise_sd_c=0.05))
     unit = thermal_calibration()
     unit = replace(unit, detector=seen) if was_fitted_with_case else unit
@@ -299,7 +236,7 @@ def test_a_case_is_missed_only_by_a_calibration_that_knew_one(
         assert values['case age [s]'] == 'inf'
 
 
-def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]) -> None:
+def test_diagnostics_of_temperatures(peer, saved):
     wait = diagnosis(peer)
     # Of a fit that has seen less than 1 g.
     unit = replace(thermal_calibration(), nonlinearity=Nonlinearity((1.0, 5.0), 1e-4))
@@ -328,7 +265,7 @@ def test_diagnostics_of_temperatures(peer: Peer, saved: Callable[..., list[str]]
         assert values['stale'] == '1'
 
 
-def test_constants_need_no_thermometer(peer: Peer, saved: Callable[..., list[str]]) -> None:
+def test_constants_need_no_thermometer(peer, saved):
     wait = diagnosis(peer)
     with node_in_thread(*saved(calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -344,9 +281,7 @@ def test_constants_need_no_thermometer(peer: Peer, saved: Callable[..., list[str
     assert (values['board age [s]'], values['board temperature sd [K]']) == ('inf', '10.0000')
 
 
-def test_sample_rate_is_held_against_the_calibrated_one(
-    peer: Peer, saved: Callable[..., list[str]]
-) -> None:
+def test_sample_rate_is_held_against_the_calibrated_one(peer, saved):
     wait = diagnosis(peer)
     with node_in_thread(*saved(calibration())) as node:
         driver = drive(peer, node)
@@ -362,9 +297,7 @@ def test_sample_rate_is_held_against_the_calibrated_one(
 
 
 @pytest.mark.parametrize('qos', [DEEP, BEST_EFFORT], ids=['reliable', 'best effort'])
-def test_any_reader_and_any_driver_match(
-    peer: Peer, saved: Callable[..., list[str]], qos: QoSProfile
-) -> None:
+def test_any_reader_and_any_driver_match(peer, saved, qos):
     with node_in_thread(*saved(calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw', qos)
         driver = drive(peer, node, qos=qos)
@@ -373,7 +306,7 @@ def test_any_reader_and_any_driver_match(
         peer.wait_for(lambda: heard, 'the sample')
 
 
-def test_namespace_and_remapping(peer: Peer, saved: Callable[..., list[str]]) -> None:
+def test_namespace_and_remapping(peer, saved):
     args = ['-r', '__ns:=/imu0', '-r', 'accel/counts:=/adc/raw', '-r', 'imu/data_raw:=imu/clean']
     with node_in_thread(*saved(calibration()), *args) as node:
         topics = dict(node.node.get_topic_names_and_types())

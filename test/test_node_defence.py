@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests and messages of strangers on the network: the node answers, and samples go on."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -12,7 +10,6 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -36,7 +33,6 @@ from ros_helpers import (
     CYCLE_NS,
     START_NS,
     TIMEOUT,
-    Peer,
     Samples,
     node_arguments,
     node_in_thread,
@@ -45,46 +41,37 @@ from ros_helpers import (
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
-from thermo_comp.ros.parameters import PARAMETERS_LIMIT, NodeConfig
+from thermo_comp.ros.parameters import PARAMETERS_LIMIT
 from thermo_comp.ros.reader import Reader, read_within
 from thermo_comp.text import one_line
 from thermo_comp.unit.calibration_file import save_calibration
 
 
-def odd(name: str, kind: int) -> ParameterMessage:
+def odd(name, kind):
     return ParameterMessage(name=name, value=ParameterValue(type=kind))
 
 
 #: Values that a request may contain; each request must be answered.
-STRANGE: list[ParameterMessage] = [
+STRANGE = [
     *[odd(name, kind) for name in ('frame_id', '', 'no such') for kind in (0, 77, 255)],
     *[
         Parameter(name, value=value).to_parameter_msg()
         for name, value in (
-            ('calibration_file', '~nosuchuser/u.yaml'),
-            ('calibration_file', '~' * 5000),
-            ('calibration_file', ''),
-            ('calibration_file', 'a\0b'),
-            ('calibration_file', [1.0, 2.0]),
-            ('calibration_directory', '/'),
-            ('frame_id', 'x' * 10_000_000),
-            ('frame_id', 'a\nb'),
-            ('nobody\x1b[2J' * 100_000, 1),
-            ('frame_id', 'a\x1b[2Jb'),
-            ('serial', 's' * 65),
-            ('transition_time', float('nan')),
-            ('transition_time', 1 << 62),
+            ('calibration_file', '~nosuchuser/u.yaml'), ('calibration_file', '~' * 5000),
+            ('calibration_file', ''), ('calibration_file', 'a\0b'), ('input', 'imu'),
+            ('calibration_file', [1.0, 2.0]), ('calibration_directory', '/'),
+            ('frame_id', 'x' * 10_000_000), ('frame_id', 'a\nb'), ('frame_id', 'a\x1b[2Jb'),
+            ('nobody\x1b[2J' * 100_000, 1), ('serial', 's' * 65), ('use_sim_time', 'perhaps'),
+            ('transition_time', float('nan')), ('transition_time', 1 << 62),
             ('diagnostics_period', -(1 << 62)),
-            ('input', 'imu'),
-            ('use_sim_time', 'perhaps'),
             ('qos_overrides./accel/counts.subscription.depth', 7),
         )
     ],
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize('together', [False, True], ids=['each', 'together'])
-def test_any_request_is_answered_and_samples_go_on(peer: Peer, unit: Path, together: bool) -> None:
+def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
         samples.go_on()
@@ -101,7 +88,7 @@ def test_any_request_is_answered_and_samples_go_on(peer: Peer, unit: Path, toget
         # A bad value among good ones: all good ones are set, or none.
         good = Parameter('frame_id', value='body').to_parameter_msg()
         answer = peer.call(kind, name, kind.Request(parameters=[STRANGE[1], good]))
-        config: NodeConfig = node._config
+        config = node._config
         assert config.frame_id == ('' if together else 'body')
         many = kind.Request(parameters=[good] * (PARAMETERS_LIMIT + 1))
         answer = peer.call(kind, name, many)
@@ -120,15 +107,13 @@ def test_any_request_is_answered_and_samples_go_on(peer: Peer, unit: Path, toget
         (ListParameters, 'prefixes'),
     ],
 )
-def test_questions_of_any_length_are_answered(
-    peer: Peer, unit: Path, kind: Any, field: str
-) -> None:
+def test_questions_of_any_length_are_answered(peer, unit, kind, field):
     # WHY: a request with 100 000 names delayed the samples by more than a second.
     name = 'thermo_comp/' + re.sub('(?<!^)(?=[A-Z])', '_', kind.__name__).lower()
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
 
-        def ask(*names: str) -> str:
+        def ask(*names):
             answer = str(peer.call(kind, name, kind.Request(**{field: list(names)})))
             samples.go_on()
             return answer
@@ -142,14 +127,14 @@ def test_questions_of_any_length_are_answered(
         assert node._loop.n_failures == 0
 
 
-def test_a_callback_that_fails_is_logged_counted_and_survived(peer: Peer, unit: Path) -> None:
+def test_a_callback_that_fails_is_logged_counted_and_survived(peer, unit):
     # WHY: the class of fault: unexpected failures in a service, a call or the relay itself.
     with node_in_thread(*node_arguments(unit)) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
         samples.go_on()
 
-        def fail(*_: Any) -> None:
+        def fail(*_):
             raise ZeroDivisionError('nobody foresaw this')
 
         node._loop.call_soon(fail)
@@ -181,9 +166,7 @@ NOT_CALIBRATIONS = {
 }
 
 
-def test_nothing_of_a_file_that_is_no_calibration_is_told(
-    peer: Peer, unit: Path, tmp_path: Path
-) -> None:
+def test_nothing_of_a_file_that_is_no_calibration_is_told(peer, unit, tmp_path):
     other = tmp_path / 'other'
     with node_in_thread(*node_arguments(unit)):
         for content, rule in NOT_CALIBRATIONS.items():
@@ -195,9 +178,7 @@ def test_nothing_of_a_file_that_is_no_calibration_is_told(
                 assert word not in result.reason.removeprefix(str(other))
 
 
-def test_calibrations_are_taken_from_one_folder_only(
-    peer: Peer, unit: Path, tmp_path: Path
-) -> None:
+def test_calibrations_are_taken_from_one_folder_only(peer, unit, tmp_path):
     folder, outside = tmp_path / 'units', tmp_path / 'outside.yaml'
     folder.mkdir()
     save_calibration(calibration(), outside)
@@ -220,12 +201,11 @@ def test_calibrations_are_taken_from_one_folder_only(
         assert peer.describe('calibration_directory')[0].read_only
 
 
-def test_a_reader_that_ends_is_begun_anew(unit: Path) -> None:
+def test_a_reader_that_ends_is_begun_anew(unit):
     # WHY: a file may crash or hang the process that reads it, but not the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
     process = reader._process
-    assert process is not None
     process.kill()
     process.wait()
     with pytest.raises(CalibrationError, match='the process that reads it ended'):
@@ -236,12 +216,11 @@ def test_a_reader_that_ends_is_begun_anew(unit: Path) -> None:
     reader.close()
 
 
-def test_a_reader_that_hangs_is_given_up(unit: Path) -> None:
+def test_a_reader_that_hangs_is_given_up(unit):
     # WHY: a lost network drive blocked every request, and also the end of the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
     process, reader._limit_s = reader._process, 0.3
-    assert process is not None
     process.send_signal(signal.SIGSTOP)
     with pytest.raises(CalibrationError, match=r'cannot be read: no answer within 0\.3 s'):
         reader.read(str(unit), '')
@@ -253,7 +232,7 @@ def test_a_reader_that_hangs_is_given_up(unit: Path) -> None:
         reader.read(str(unit), '')
 
 
-def test_at_the_start_a_file_that_hangs_is_given_up(monkeypatch: Any) -> None:
+def test_at_the_start_a_file_that_hangs_is_given_up(monkeypatch):
     forever = threading.Event()
     monkeypatch.setattr('thermo_comp.ros.reader.read', lambda *_: forever.wait())
     with pytest.raises(CalibrationError, match=r'^a\.yaml: cannot be read: no answer within 0\.2'):
@@ -261,7 +240,7 @@ def test_at_the_start_a_file_that_hangs_is_given_up(monkeypatch: Any) -> None:
     forever.set()
 
 
-def test_while_a_file_hangs_the_other_parameters_go_on(peer: Peer, unit: Path) -> None:
+def test_while_a_file_hangs_the_other_parameters_go_on(peer, unit):
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
@@ -284,9 +263,7 @@ def test_while_a_file_hangs_the_other_parameters_go_on(peer: Peer, unit: Path) -
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
-def test_while_a_file_hangs_the_node_ends_and_nothing_stays(
-    peer: Peer, unit: Path, number: int
-) -> None:
+def test_while_a_file_hangs_the_node_ends_and_nothing_stays(peer, unit, number):
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
         children = Path(f'/proc/{node.process.pid}/task').glob('*/children')
@@ -304,7 +281,7 @@ def test_while_a_file_hangs_the_node_ends_and_nothing_stays(
         assert 'Traceback' not in node.said
 
 
-def alive(pid: int) -> bool:
+def alive(pid):
     """Return whether a process runs, not counting a zombie."""
     try:
         return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
@@ -320,12 +297,11 @@ raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.
 """
 
 
-def test_a_start_that_hangs_ends_with_one_signal() -> None:
+def test_a_start_that_hangs_ends_with_one_signal():
     # WHY: SIGTERM was stored but not handled; a second one was needed.
     with subprocess.Popen(
         [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == 'reads\n'
         began = time.monotonic()
         process.send_signal(signal.SIGTERM)
@@ -333,7 +309,7 @@ def test_a_start_that_hangs_ends_with_one_signal() -> None:
         assert time.monotonic() - began < 2.0
 
 
-def test_what_param_dump_writes_param_load_sets(peer: Peer, unit: Path) -> None:
+def test_what_param_dump_writes_param_load_sets(peer, unit):
     with node_in_thread(*node_arguments(unit)) as node:
         names = [one for one in node.node._parameters]  # noqa: C416
         request = GetParameters.Request(names=names)

@@ -2,15 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Other publishers: two sources are never mixed, and a new driver is accepted soon."""
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -25,7 +20,6 @@ from ros_helpers import (
     DEEP,
     SECOND_NS,
     START_NS,
-    Peer,
     Samples,
     drive,
     node_arguments,
@@ -41,14 +35,12 @@ from thermo_comp.ros.waitloop import Sources
 from thermo_comp.unit.calibration_file import save_calibration
 
 
-def contested(
-    peer: Peer, heard: list[DiagnosticArray], topic: str, send: Callable[[], None]
-) -> DiagnosticStatus:
+def contested(peer, heard, topic, send):
     """Let both publishers send until the node reports two, however slowly."""
     text = f'2 publishers on {topic}, the topic is not used until only one of them sends'
-    found: list[DiagnosticStatus] = []
+    found = []
 
-    def look() -> bool:
+    def look():
         send()
         found.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
         return bool(found)
@@ -58,7 +50,7 @@ def contested(
     return found[0]
 
 
-def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> None:
+def test_samples_of_a_second_publisher_never_go_out(peer, unit):
     # WHY: samples of a second driver in another attitude were published as the unit's.
     with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
@@ -67,7 +59,7 @@ def test_samples_of_a_second_publisher_never_go_out(peer: Peer, unit: Path) -> N
         other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', DEEP)
         peer.poll(other.get_subscription_count, 'the second publisher')
 
-        def both() -> None:
+        def both():
             samples.send(1)
             strange = stamped(Vector3Stamped(), START_NS + samples.n_sent * CYCLE_NS - 5)
             strange.vector.x, strange.vector.y = 2000.0 + samples.n_sent % 3, -2000.0
@@ -119,11 +111,10 @@ rclpy.spin(node)
 
 
 @contextlib.contextmanager
-def driver_process(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+def driver_process(name):
     """Run a driver; return the time of its first sample [ns]. It is killed at the end."""
     command = [sys.executable, '-c', DRIVER, name]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
     try:
         yield process, int(process.stdout.readline())
     finally:
@@ -132,13 +123,13 @@ def driver_process(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
         process.stdout.close()
 
 
-def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer: Peer, unit: Path) -> None:
+def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer, unit):
     # WHY: nothing was published for the 20 s of the dead driver's lease.
     with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         heard = peer.listen(Imu, 'imu/data_raw')
 
-        def of(name: str) -> list[Imu]:
+        def of(name):
             return [imu for imu in list(heard) if imu.header.frame_id == name]
 
         with driver_process('first'):
@@ -163,7 +154,7 @@ def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer: Peer, u
         assert names == sorted(names)
 
 
-def numbered(begin: int, period_s: float, until_s: float, start_s: float = 0.0) -> Any:
+def numbered(begin, period_s, until_s, start_s=0.0):
     """List the messages of a publisher: time and number."""
     n = int((until_s - start_s) / period_s)
     return [(start_s + k * period_s, begin + k) for k in range(n)]
@@ -171,7 +162,7 @@ def numbered(begin: int, period_s: float, until_s: float, start_s: float = 0.0) 
 
 @pytest.mark.parametrize('offset', [-7, -1, 0, 1, 2, 1000])
 @pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
-def test_two_that_send_are_never_mixed(offset: int, period_s: float) -> None:
+def test_two_that_send_are_never_mixed(offset, period_s):
     own = [(*one, 'own') for one in numbered(500, 0.01, 12.0)]
     begins = 500 + 200 + offset  # about as many as the other driver has sent by then
     other = [(*one, 'other') for one in numbered(begins, period_s, 8.0, start_s=2.003)]
@@ -186,7 +177,7 @@ def test_two_that_send_are_never_mixed(offset: int, period_s: float) -> None:
     assert sum(at_s > 10.0 for at_s, _ in used) >= 199
 
 
-def test_without_numbers_two_publishers_are_two() -> None:
+def test_without_numbers_two_publishers_are_two():
     sources = Sources()
     assert sources.of_one(1, [None] * 3, [0, 1, 2]) == 0
     for k in range(5):
@@ -195,7 +186,7 @@ def test_without_numbers_two_publishers_are_two() -> None:
     assert sources.of_one(1, [None] * 3, [9 * SECOND_NS] * 3) == 0
 
 
-def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> None:
+def test_readings_of_a_second_publisher_are_not_used(peer, unit):
     with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
@@ -203,7 +194,7 @@ def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> 
         other = peer.node.create_publisher(Temperature, 'temperature/board', DEEP)
         peer.poll(other.get_subscription_count, 'the second publisher')
 
-        def both() -> None:
+        def both():
             reading = Temperature(temperature=20.5)
             other.publish(stamped(reading, START_NS + samples.n_sent * CYCLE_NS))
             samples.send(10)
@@ -214,7 +205,7 @@ def test_readings_of_a_second_publisher_are_not_used(peer: Peer, unit: Path) -> 
         assert board.stamp_ns < START_NS + 20 * CYCLE_NS
 
 
-def test_a_driver_that_cannot_be_heard_is_named(peer: Peer, unit: Path) -> None:
+def test_a_driver_that_cannot_be_heard_is_named(peer, unit):
     reliable = 'qos_overrides./accel/counts.subscription.reliability:=reliable'
     with node_in_thread(*node_arguments(unit, reliable)):
         heard = peer.listen(DiagnosticArray, '/diagnostics')
@@ -228,7 +219,7 @@ def test_a_driver_that_cannot_be_heard_is_named(peer: Peer, unit: Path) -> None:
         status_with(peer, heard, text)
 
 
-def test_reports_more_often_than_samples_are_no_silence(peer: Peer, tmp_path: Path) -> None:
+def test_reports_more_often_than_samples_are_no_silence(peer, tmp_path):
     # WHY: with diagnostics_period below the sample interval each empty report was an ERROR.
     from thermo_comp.unit.calibration import Unit
 
@@ -253,7 +244,7 @@ def test_reports_more_often_than_samples_are_no_silence(peer: Peer, tmp_path: Pa
         status_with(peer, heard, 'no samples are coming in')
 
 
-def test_a_reading_far_ahead_is_forgotten(peer: Peer, unit: Path) -> None:
+def test_a_reading_far_ahead_is_forgotten(peer, unit):
     # WHY: a reading one day ahead kept WARN until a sample of that day came.
     with node_in_thread(*node_arguments(unit)) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')

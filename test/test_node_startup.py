@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node as a process: bad starts end at once with one clear line, good ones end cleanly."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -11,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from conftest import ran
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
@@ -24,7 +23,7 @@ from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 
 
-def arguments(*overrides: str) -> list[str]:
+def arguments(*overrides):
     words = [word for override in overrides for word in ('-p', override)]
     return ['thermo_comp_node', '--ros-args', *words]
 
@@ -33,35 +32,27 @@ def arguments(*overrides: str) -> list[str]:
     ('overrides', 'text'),
     [
         ([], 'parameter `calibration_file` is not set; start with --ros-args -p calibration_f'),
-        (['calibration_file:={tmp}/none.yaml'], '/none.yaml: cannot be read: No such file or dir'),
+        (['calibration_file:={tmp}/none.yaml'],
+         '/none.yaml: cannot be read: No such file or dir'),
         (['calibration_file:={tmp}'], 'cannot be read: '),
         (['calibration_file:={tmp}/nan.yaml'], '/nan.yaml: axes.x.bias: '),
         (['calibration_file:={tmp}/text.yaml'], '/text.yaml: expected a mapping'),
         (['calibration_file:={unit}', 'serial:=T-2'], "unit.serial: must be 'T-2' (parameter"),
         (['calibration_file:={unit}', 'input:=imu'], "unit.input: must be 'm/s^2'"),
-        (
-            ['calibration_file:={tmp}/imu.yaml'],
-            "/imu.yaml: unit.input: must be 'counts' (parameter `input` is counts), got 'm/s^2'",
-        ),
+        (['calibration_file:={tmp}/imu.yaml'],
+         "/imu.yaml: unit.input: must be 'counts' (parameter `input` is counts), got 'm/s^2'"),
         (['calibration_file:={unit}', 'input:=gyro'], '`input` must be one of counts, imu'),
-        (['calibration_file:={unit}', 'transition_time:=-1'], '`transition_time` must be between'),
-        (
-            [
-                'calibration_file:={unit}',
-                'qos_overrides./accel/counts.subscription.reliability:=good',
-            ],
-            'a topic cannot be opened: ',
-        ),
-        (
-            ['calibration_file:={unit}', 'qos_overrides./accel/counts.subscription.depth:=deep'],
-            "a topic cannot be opened: Trying to set parameter 'qos_overrides./accel/counts",
-        ),
+        (['calibration_file:={unit}', 'transition_time:=-1'],
+         '`transition_time` must be between'),
+        (['calibration_file:={unit}',
+         'qos_overrides./accel/counts.subscription.reliability:=good'],
+         'a topic cannot be opened: '),
+        (['calibration_file:={unit}', 'qos_overrides./accel/counts.subscription.depth:=deep'],
+         "a topic cannot be opened: Trying to set parameter 'qos_overrides./accel/counts"),
         (['calibration_file:={unit}', 'use_sim_time:=7'], "set parameter 'use_sim_time' to '7'"),
     ],
-)
-def test_bad_start(
-    overrides: list[str], text: str, unit: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+)  # fmt: skip
+def test_bad_start(overrides, text, unit, tmp_path, capfd):
     (tmp_path / 'text.yaml').write_text('just words')
     nan = dump_calibration(calibration()).replace('bias: 0.0', 'bias: .nan', 1)
     (tmp_path / 'nan.yaml').write_text(nan)
@@ -75,28 +66,13 @@ def test_bad_start(
     assert text in line
 
 
-def test_one_topic_for_two_thermometers(unit: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_one_topic_for_two_thermometers(unit, capfd):
     remaps = [f'temperature/{name}:=/imu/temperature' for name in ('board', 'case')]
     words = [word for one in remaps for word in ('-r', one)]
     assert main([*arguments(f'calibration_file:={unit}'), *words]) == 1
     assert capfd.readouterr().err == (
         'thermo_comp_node: /imu/temperature: one topic for both board and case: a single '
         'thermometer is the board, leave the other out\n'
-    )
-
-
-def test_bad_start_as_a_process_is_one_line_too(tmp_path: Path) -> None:
-    finished = subprocess.run(
-        [sys.executable, '-m', 'thermo_comp.ros.node', *arguments('calibration_file:=none')[1:]],
-        cwd=Path(__file__).parents[1],
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT,
-        check=False,
-    )
-    assert finished.returncode == 1
-    assert finished.stderr == (
-        'thermo_comp_node: none: cannot be read: No such file or directory\n'
     )
 
 
@@ -107,14 +83,7 @@ def test_bad_start_as_a_process_is_one_line_too(tmp_path: Path) -> None:
         ('ROS_LOG_DIR', '/proc/none', "Failed to create log directory '/proc/none'"),
     ],
 )
-def test_an_environment_that_ros_cannot_use(
-    name: str,
-    value: str,
-    text: str,
-    unit: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_an_environment_that_ros_cannot_use(name, value, text, unit, monkeypatch, capfd):
     monkeypatch.setenv(name, value)
     assert main(arguments(f'calibration_file:={unit}')) == 1
     said = capfd.readouterr().err.splitlines()[-1]
@@ -122,7 +91,7 @@ def test_an_environment_that_ros_cannot_use(
     assert text in said
 
 
-def test_closed_streams_are_no_signal(unit: Path) -> None:
+def test_closed_streams_are_no_signal(unit):
     # WHY: the signals' pipe got the descriptor of stderr, and the first letter of the log was
     # taken for a signal.
     peer = Peer()
@@ -136,12 +105,9 @@ def test_closed_streams_are_no_signal(unit: Path) -> None:
 
 
 @pytest.mark.parametrize(('sink', 'code'), [('> /dev/full', 1), ('| true', 0)])
-def test_help_that_cannot_be_written(sink: str, code: int) -> None:
+def test_help_that_cannot_be_written(sink, code):
     words = f'set -o pipefail; "{sys.executable}" -m thermo_comp.ros.node --help {sink}'
-    root = Path(__file__).parents[1]
-    finished = subprocess.run(
-        ['bash', '-c', words], cwd=root, capture_output=True, text=True, check=False
-    )
+    finished = ran('bash', '-c', words)
     assert finished.returncode == code
     assert 'Traceback' not in finished.stderr
 
@@ -150,9 +116,7 @@ def test_help_that_cannot_be_written(sink: str, code: int) -> None:
 ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
 
 
-def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
-    unit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path, monkeypatch):
     # The interpreters of the node and of its child processes import this first.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
@@ -165,9 +129,7 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
     check = f'from importlib.util import find_spec\nfor name in {ABSENT!r}:\n'
     check += '    try: find_spec(name)\n    except ModuleNotFoundError: print(name)'
-    finished = subprocess.run(
-        [sys.executable, '-c', check], capture_output=True, text=True, check=False
-    )
+    finished = ran(sys.executable, '-c', check)
     assert tuple(finished.stdout.split()) == ABSENT
     peer = Peer()
     heard = peer.listen(Imu, 'imu/data_raw')
@@ -175,7 +137,7 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
         driver = Driver(peer)
         peer.poll(lambda: peer.node.count_publishers('imu/data_raw'), 'the output')
 
-        def is_heard() -> bool:
+        def is_heard():
             stamp_ns = time.monotonic_ns()
             driver.temperatures(stamp_ns, 20.0, 20.0)
             driver.counts(stamp_ns, *standing(stamp_ns))
@@ -190,33 +152,27 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(
         assert node.stop() == 0
         assert 'rror' not in node.said.replace('[ERROR]', '')
     peer.close()
-    finished = subprocess.run(
-        [sys.executable, '-m', 'thermo_comp', 'info', unit],
-        cwd=Path(__file__).parents[1],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    finished = ran(sys.executable, '-m', 'thermo_comp', 'info', unit)
     assert finished.returncode == 1
     said = 'thermo_comp: error: the commands need typer: pip install thermo_comp\n'
     assert (finished.stdout, finished.stderr) == ('', said)
 
 
-def test_usage(capfd: pytest.CaptureFixture[str]) -> None:
+def test_usage(capfd):
     assert main(['thermo_comp_node', '--help']) == 0
     assert 'example: thermo_comp_node --ros-args -p calibration_file' in capfd.readouterr().out
     assert main(['thermo_comp_node', 'unit.yaml']) == 2
     assert "unknown argument 'unit.yaml'" in capfd.readouterr().err
 
 
-def test_unreadable_ros_arguments(capfd: pytest.CaptureFixture[str]) -> None:
+def test_unreadable_ros_arguments(capfd):
     assert main(['thermo_comp_node', '--ros-args', '--params-file', '/none.yaml']) == 2
     said = capfd.readouterr().err
     assert 'thermo_comp_node: ' in said
     assert 'Traceback' not in said
 
 
-def test_misspelt_parameters_are_said(unit: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_misspelt_parameters_are_said(unit, capfd):
     overrides = ['-p', f'calibration_file:={unit}', '-p', 'transition_tme:=3.0']
     overrides += ['-p', 'qos_overrides./imu/uncompensated.subscription.depth:=3']
     with node_in_thread(*overrides):
@@ -226,7 +182,7 @@ def test_misspelt_parameters_are_said(unit: Path, capfd: pytest.CaptureFixture[s
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_during_start_up_ends_it_cleanly(unit: Path, number: int) -> None:
+def test_a_signal_during_start_up_ends_it_cleanly(unit, number):
     # A signal during the construction of the node, once the middleware has a thread.
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         tasks = Path(f'/proc/{node.process.pid}/task')
@@ -237,7 +193,7 @@ def test_a_signal_during_start_up_ends_it_cleanly(unit: Path, number: int) -> No
         assert 'Traceback' not in node.said
 
 
-def name(task: Path) -> str:
+def name(task):
     try:
         return (task / 'comm').read_text()
     except OSError:

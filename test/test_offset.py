@@ -2,16 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Raw words with an offset: the same calibration, with the offset in its bias."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import ArrayBlock
+from builders import source_of
 from position_helpers import START_NS
 
-from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.coverage import rough_centre
 from thermo_comp.fitting.fit import about
 from thermo_comp.simulation.campaign import positions
@@ -23,11 +21,9 @@ BIAS = np.array((120.0, -340.0, 55.0))
 M = np.array(((1.0, 0.0, 0.0), (0.004, 1.0, 0.0), (-0.006, 0.003, 1.0)))
 
 
-def source(words, name='words') -> FitSource:
+def source(words, name='words'):
     stamps = START_NS + np.arange(len(words)) * 10_000_000
-    none_ns, none = np.zeros(0, dtype=np.int64), np.zeros(0)
-    block = ArrayBlock(stamps, words, none_ns, none, none_ns, none)
-    return FitSource(name, lambda: [block])
+    return source_of(stamps, words, name=name)
 
 
 def words_of(ups, rng, seconds=20.0):
@@ -42,8 +38,7 @@ def words_of(ups, rng, seconds=20.0):
 
 
 def constants(result):
-    axes = result.calibration.axes
-    triad = (axes.x, axes.y, axes.z)
+    triad = result.calibration.axes
     return np.array([one.bias for one in triad]), np.array([one.scale_factor for one in triad])
 
 

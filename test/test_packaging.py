@@ -2,19 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Version, licence, commands and keys of the package agree wherever they are stated."""
 
-from __future__ import annotations
-
 import ast
-import configparser
 import os
 import re
-import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
 import yaml
+from conftest import ran
 
 import thermo_comp
 
@@ -23,30 +20,16 @@ MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314 - our own file
 
 # Keys that rosdep/python.yaml of rosdistro resolves on Ubuntu 24.04, and ROS 2 Jazzy packages.
 KNOWN_KEYS = {
-    'rclpy',
-    'builtin_interfaces',
-    'diagnostic_msgs',
-    'geometry_msgs',
-    'rcl_interfaces',
-    'rosgraph_msgs',
-    'sensor_msgs',
-    'std_msgs',
-    'launch_xml',
-    'launch_ros',
-    'ament_flake8',
-    'ament_pep257',
-    'ament_xmllint',
-    'python3-numpy',
-    'python3-yaml',
-    'python3-hypothesis',
-    'python3-pytest',
-    'python3-pytest-xdist',
+    *('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'rcl_interfaces'),
+    *('rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'launch_xml', 'launch_ros', 'ament_flake8'),
+    *('ament_pep257', 'ament_xmllint', 'python3-numpy', 'python3-yaml', 'python3-hypothesis'),
+    *('python3-pytest', 'python3-pytest-xdist'),
 }
 
 
-def setup_literals() -> dict[str, object]:
+def setup_literals():
     """Return the module-level literals of setup.py without running it."""
-    literals: dict[str, object] = {}
+    literals = {}
     for node in ast.parse((ROOT / 'setup.py').read_text()).body:
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
             try:
@@ -56,20 +39,14 @@ def setup_literals() -> dict[str, object]:
     return literals
 
 
-def test_one_version() -> None:
+def test_one_version():
     assert MANIFEST.findtext('version') == thermo_comp.__version__
     assert re.fullmatch(r'\d+\.\d+\.\d+', thermo_comp.__version__)
-    finished = subprocess.run(
-        [sys.executable, 'setup.py', '--version'],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    finished = ran(sys.executable, 'setup.py', '--version', check=True)
     assert finished.stdout.split()[-1] == thermo_comp.__version__
 
 
-def test_manifest_is_format_3_with_keys_that_exist() -> None:
+def test_manifest_is_format_3_with_keys_that_exist():
     assert MANIFEST.get('format') == '3'
     assert MANIFEST.findtext('name') == 'thermo_comp'
     assert MANIFEST.findtext('export/build_type') == 'ament_python'
@@ -81,26 +58,23 @@ def test_manifest_is_format_3_with_keys_that_exist() -> None:
     assert keys == KNOWN_KEYS
 
 
-def test_licence_is_the_whole_apache_text() -> None:
+def test_licence_is_the_whole_apache_text():
     licence = (ROOT / 'LICENSE').read_text()
     assert 'Version 2.0, January 2004' in licence
     assert 'END OF TERMS AND CONDITIONS' in licence
     node = MANIFEST.find('license')
-    assert node is not None
     assert (node.text, node.get('file')) == ('Apache-2.0', 'LICENSE')
 
 
-def tracked(*patterns: str) -> list[Path]:
-    listing = subprocess.run(
-        ['git', 'ls-files', '-z', '--', *patterns], cwd=ROOT, capture_output=True, check=False
-    )
-    names = [name for name in listing.stdout.decode().split('\0') if name]
+def tracked(*patterns):
+    listing = ran('git', 'ls-files', '-z', '--', *patterns)
+    names = [name for name in listing.stdout.split('\0') if name]
     if listing.returncode or not names:
         pytest.skip('not a git working tree: an installed or unpacked copy')
     return [ROOT / name for name in names if (ROOT / name).exists()]
 
 
-def test_every_source_carries_its_licence() -> None:
+def test_every_source_carries_its_licence():
     first = 'SPDX-FileCopyrightText: 2026 thermo_comp contributors'
     second = 'SPDX-License-Identifier: Apache-2.0'
     for path in tracked('*.py', 'Makefile', '.ci/run'):
@@ -109,12 +83,12 @@ def test_every_source_carries_its_licence() -> None:
         assert lines[:2] == [f'# {first}', f'# {second}'], path
 
 
-def test_no_source_is_too_long_to_read() -> None:
+def test_no_source_is_too_long_to_read():
     lengths = {path: len(path.read_text().splitlines()) for path in tracked('*.py')}
     assert {path.name: n for path, n in lengths.items() if n > 500} == {}
 
 
-def test_the_manifest_asks_for_the_node_alone() -> None:
+def test_the_manifest_asks_for_the_node_alone():
     # Other dependencies of the commands come from PyPI: test_node_startup.py runs the node without
     # them.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
@@ -127,10 +101,9 @@ def test_the_manifest_asks_for_the_node_alone() -> None:
     assert all('>=' in requirement for requirement in install), 'no floor'
 
 
-def test_hosted_ci_does_what_the_readme_says() -> None:
+def test_hosted_ci_does_what_the_readme_says():
     jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yaml').read_text())['jobs']
     lowest = re.search(r"python_requires='>=([\d.]+)'", (ROOT / 'setup.py').read_text())
-    assert lowest is not None
     assert jobs['wheels']['strategy']['matrix']['python'][0] == lowest[1]
     run = '\n'.join(step.get('run', '') for step in jobs['ros']['steps'])
     readme = (ROOT / 'README.md').read_text()
@@ -139,26 +112,13 @@ def test_hosted_ci_does_what_the_readme_says() -> None:
     assert jobs['ros']['container'] == 'ros:jazzy'
 
 
-def test_scripts_land_where_ros2_run_looks() -> None:
-    config = configparser.ConfigParser()
-    config.read(ROOT / 'setup.cfg')
-    assert config['develop']['script_dir'] == '$base/lib/thermo_comp'
-    assert config['install']['install_scripts'] == '$base/lib/thermo_comp'
-
-
-def test_share_holds_what_ros_looks_for(tmp_path: Path) -> None:
+def test_share_holds_what_ros_looks_for(tmp_path):
     # colcon installs a package in this way: setup.py's install command into a prefix. Only the
     # data files are tested here, not scripts and code.
-    subprocess.run(
-        [
-            *(sys.executable, 'setup.py', '-q', 'build', '--build-base', tmp_path / 'build'),
-            *('install_data', '--install-dir', tmp_path / 'prefix'),
-        ],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        env={**os.environ, 'PYTHONWARNINGS': 'ignore'},
-    )
+    words = (*('build', '--build-base', tmp_path / 'build'), 'install_data', '--install-dir')
+    environment = {**os.environ, 'PYTHONWARNINGS': 'ignore'}
+    command = (sys.executable, 'setup.py', '-q', *words, tmp_path / 'prefix')
+    ran(*command, check=True, env=environment)
     share = tmp_path / 'prefix' / 'share'
     assert (share / 'ament_index/resource_index/packages/thermo_comp').is_file()
     assert (share / 'thermo_comp/package.xml').is_file()

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A part of a bag gives the same as a bag of that part, in every test."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -21,7 +19,7 @@ from thermo_comp.recording.writer import BagWriter
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 
 
-def bag_of(path, rest: Rest):
+def bag_of(path, rest):
     """Write a rest at 25 Hz with a board thermometer at 2 Hz that begins 3 s earlier."""
     stamp_ns = START_NS + np.rint(rest.time * 1e9).astype(np.int64)
     board_ns = START_NS + np.rint((rest.board_time - 3.0) * 1e9).astype(np.int64)

@@ -6,20 +6,15 @@ Properties: for any input the output is finite, valid, in order and within physi
 The suite tries each property a few times; `make nightly` ten thousand times.
 """
 
-from __future__ import annotations
-
 import base64
-import contextlib
 import json
 import math
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from builders import calibration, rich_calibration
+from builders import rich_calibration
 from fault_rig import unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -29,16 +24,14 @@ from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.online.trial import is_sound_sample, tried
 from thermo_comp.quantities import QUANTITIES
-from thermo_comp.unit.calibration import Calibration, RegimeSet
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
-from thermo_comp.unit.functions import Polynomial
 
 START_NS = 1_767_225_600_000_000_000
 UNITS = (rich_calibration(), unit())
 TREE = yaml.safe_load(dump_calibration(rich_calibration()))
 
 
-def leaves(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+def leaves(tree, path=()):
     """List every place of a calibration file, including nested ones."""
     items = tree.items() if isinstance(tree, dict) else enumerate(tree)
     for key, value in items:
@@ -56,16 +49,8 @@ anything = st.recursive(
 
 
 @settings(deadline=None)
-@given(st.binary(max_size=2000) | st.text(max_size=500).map(str.encode))
-def test_any_bytes_are_a_calibration_or_one_clear_line(content: bytes) -> None:
-    with contextlib.suppress(CalibrationError):
-        value = parse_calibration(content, 'unit.yaml')
-        assert parse_calibration(dump_calibration(value).encode()) == value
-
-
-@settings(deadline=None)
 @given(st.sampled_from(PLACES), anything)
-def test_any_value_at_any_key_is_good_or_its_key_is_named(place: Any, value: Any) -> None:
+def test_any_value_at_any_key_is_good_or_its_key_is_named(place, value):
     tree = json.loads(json.dumps(TREE))
     *way, last = place
     branch = tree
@@ -73,7 +58,7 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place: Any, value: Any
         branch = branch[key]
     branch[last] = value
     content = yaml.dump(tree, Dumper=yaml.CSafeDumper, allow_unicode=True).encode()
-    refusal: CalibrationError | None = None
+    refusal = None
     try:
         found = parse_calibration(content, 'unit.yaml')
     except CalibrationError as error:
@@ -117,12 +102,12 @@ class Edited(dict[str, Any]):
 
     edits: tuple[Any, ...] = ()
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         return f'{self.get("unit")!r:.40} with {self.edits}'
 
 
 @st.composite
-def edited(draw: st.DrawFn) -> Edited:
+def edited(draw):
     """Change one to three values of a calibration file by any magnitude."""
     which = draw(st.sampled_from(range(len(TREES))))
     tree = Edited(json.loads(json.dumps(TREES[which])))
@@ -156,14 +141,14 @@ def edited(draw: st.DrawFn) -> Edited:
     return tree
 
 
-def whole_range(of: Calibration) -> list[tuple[str, int, Any]]:
+def whole_range(of):
     """List messages that pass through and beyond all temperatures of a calibration."""
     edges_c = [edge for one in of.regime_sets() for edge in one.temperature_range_c]
     middle = of.reference_temperature_c
     temperatures = [middle, middle + 0.5, *edges_c, middle, -273.0, 999.0, middle, middle]
     steps_s = [1.0, 5.0, 20.0, 60.0, 1.0, 400.0, 60.0, 5.0, 90_000.0, 2.0, 0.5]
     largest = of.unit.full_scale * (1.0 - 1e-9)
-    sent: list[tuple[str, int, Any]] = []
+    sent = []
     now_ns = START_NS
     for k, (celsius, step_s) in enumerate(zip(temperatures, steps_s, strict=True)):
         for m in range(6):
@@ -181,7 +166,7 @@ def whole_range(of: Calibration) -> list[tuple[str, int, Any]]:
 
 @settings(deadline=None, max_examples=max(120, settings.default.max_examples))
 @given(edited())
-def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree: Edited) -> None:
+def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree):
     # WHY: a delta of 1e300, a lag of 1e-300 s and a weight of 1e160 were accepted; the output was
     # not finite, or its covariance invalid.
     content = yaml.dump(dict(tree), Dumper=yaml.CSafeDumper, allow_unicode=True).encode()
@@ -239,7 +224,7 @@ configs = st.builds(
 )
 
 
-def largest(axis: int, regime: RegimeSet, of: Calibration) -> tuple[float, float]:
+def largest(axis, regime, of):
     """
     Bound an axis' |bias| without that of the reference, and the distance of its scale from 1.
     """
@@ -249,7 +234,7 @@ def largest(axis: int, regime: RegimeSet, of: Calibration) -> tuple[float, float
     t += 0.25 * (max(edges) - min(edges))
     curves = regime.axes()[axis]
 
-    def terms(name: str) -> float:
+    def terms(name):
         function = getattr(curves, f'{name}_function').coefficients[1:]
         response = (
             abs(getattr(term, name)[axis]) * max(map(abs, term.range)) * t**term.power
@@ -260,7 +245,7 @@ def largest(axis: int, regime: RegimeSet, of: Calibration) -> tuple[float, float
     return abs(curves.delta) + terms('bias'), terms('scale')
 
 
-def bound(of: Calibration) -> float:
+def bound(of):
     """Bound the specific force that a unit can output, from its calibration [m/s^2]."""
     worst = 0.0
     for regime in (of.static, of.dynamic):
@@ -274,9 +259,7 @@ def bound(of: Calibration) -> float:
 
 @settings(deadline=None)
 @given(st.sampled_from(UNITS), configs, messages)
-def test_any_messages_give_sound_numbers(
-    of: Calibration, config: CompensatorConfig, sent: list[tuple[str, int, Any]]
-) -> None:
+def test_any_messages_give_sound_numbers(of, config, sent):
     compensator = Compensator(of, config)
     limit = bound(of) * (1.0 + 1e-9)
     now_ns, last_ns, n_jumps, n_counts = START_NS, -math.inf, 0, 0
@@ -303,32 +286,3 @@ def test_any_messages_give_sound_numbers(
 
 
 finite = st.floats(-1e3, 1e3)
-
-
-@settings(deadline=None)
-@given(
-    st.lists(st.floats(-1e-3, 1e-3), min_size=6, max_size=6),
-    st.lists(finite, min_size=6, max_size=6),
-    st.text(st.characters(codec='utf-8', exclude_categories=['Cc', 'Cs']), min_size=1, max_size=9),
-)
-def test_any_calibration_survives_its_file(
-    small: list[float], numbers: list[float], serial: str
-) -> None:
-    plain = calibration()
-    axis = replace(
-        plain.static.x,
-        delta=numbers[0],
-        bias_function=Polynomial((0.0, *numbers[1:4])),
-        scale_function=Polynomial((1.0, small[0], small[4] * 1e-3)),
-    )
-    try:
-        value = replace(
-            plain,
-            static=replace(plain.static, x=axis),
-            misalignment=((1.0, 0.0, 0.0), (small[1], 1.0, 0.0), (small[2], small[3], 1.0)),
-            unit=replace(plain.unit, serial=serial),
-        )
-        text = dump_calibration(value)
-    except (ValueError, CalibrationError):
-        return  # a file that the reader would refuse is not written
-    assert parse_calibration(text.encode()) == value

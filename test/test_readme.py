@@ -2,14 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The README and the session on the page of the command line: outputs and links are right."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import pytest
 import yaml
-from conftest import Cli, Once
 from desk_helpers import write_fit_of_the_readme
 from readme_helpers import FENCE, README, ROOT, SESSION, is_alike, shown
 
@@ -18,7 +14,7 @@ from thermo_comp.cli.app import app
 pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 
-def test_the_shown_commands_give_the_shown_output(tmp_path: Path, cli: Cli, once: Once) -> None:
+def test_the_shown_commands_give_the_shown_output(tmp_path, cli, once):
     # The demo is tested in test_cli_demo.
     commands = shown()
     assert list(commands) == ['demo', 'fit', 'evaluate', 'replay', 'info']
@@ -32,7 +28,7 @@ def test_the_shown_commands_give_the_shown_output(tmp_path: Path, cli: Cli, once
         assert is_alike(got, expected), f'{" ".join(words)}\n{got}'
 
 
-def test_commands_that_are_not_run_here_exist() -> None:
+def test_commands_that_are_not_run_here_exist():
     known = {c.name or c.callback.__name__ for c in app.registered_commands if c.callback}
     known |= {group.typer_instance.info.name for group in app.registered_groups}
     named = set(re.findall(r'(?:^|^\$ |`)thermo_comp (\w+)', README, re.MULTILINE))
@@ -46,17 +42,17 @@ def test_commands_that_are_not_run_here_exist() -> None:
         assert (ROOT / script).is_file(), script
 
 
-def test_links_lead_somewhere() -> None:
+def test_links_lead_somewhere():
     for target in re.findall(r'\]\(([^)#]+)\)', README):
         assert (ROOT / target).exists(), target
 
 
-def test_the_calibration_s_keys_are_those_of_the_example() -> None:
+def test_the_calibration_s_keys_are_those_of_the_example():
     page = (ROOT / 'docs' / 'calibration_file.md').read_text(encoding='utf-8')
     (excerpt,) = (yaml.safe_load(text) for kind, text in FENCE.findall(page) if kind == 'yaml')
     example = yaml.safe_load((ROOT / 'config' / 'calibration.example.yaml').read_text())
 
-    def holds(part: object, whole: object) -> bool:
+    def holds(part, whole):
         if isinstance(part, dict):
             return isinstance(whole, dict) and all(
                 key in whole and holds(value, whole[key]) for key, value in part.items()
@@ -66,7 +62,7 @@ def test_the_calibration_s_keys_are_those_of_the_example() -> None:
     assert holds(excerpt, example)
 
 
-def test_it_fits_the_page() -> None:
+def test_it_fits_the_page():
     lines = README.splitlines()
     assert len(lines) <= 150
     assert [line for line in lines if len(line) > 100 and '|' not in line] == []

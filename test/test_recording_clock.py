@@ -2,16 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A clock that jumps: the shortened jump, the unchanged rest, and a clock that is refused."""
 
-from __future__ import annotations
-
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording.blocks import LONGEST_PAUSE_NS, Block
+from thermo_comp.recording.blocks import LONGEST_PAUSE_NS
 from thermo_comp.recording.overview import survey_recording
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.writer import BagWriter
@@ -21,7 +18,7 @@ YEAR_NS = 365 * 86400 * 10**9
 STEP_NS = 10_000_000
 
 
-def blocks_of(path: Path, stamp_ns: np.ndarray, reading_ns: np.ndarray) -> list[Block]:
+def blocks_of(path, stamp_ns, reading_ns):
     """Write samples and readings in this order, and read them on one clock."""
     n = len(stamp_ns)
     log_ns = START_NS + STEP_NS * np.arange(n)
@@ -35,7 +32,7 @@ def blocks_of(path: Path, stamp_ns: np.ndarray, reading_ns: np.ndarray) -> list[
         return list(reader.blocks_on_one_clock())
 
 
-def joined(blocks: list[Block], name: str) -> np.ndarray:
+def joined(blocks, name):
     return np.concatenate(
         [
             block.accel_stamp_ns if name == 'accel' else block.temperatures[name].stamp_ns
@@ -45,7 +42,7 @@ def joined(blocks: list[Block], name: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize('jump_ns', [YEAR_NS, -YEAR_NS, -START_NS + 5, 2 * LONGEST_PAUSE_NS])
-def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path: Path, jump_ns: int) -> None:
+def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path, jump_ns):
     true_ns = START_NS + STEP_NS * np.arange(1000)
     after = np.arange(1000) >= 500
     blocks = blocks_of(
@@ -63,27 +60,27 @@ def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path: Path, jump_ns: int)
         assert np.abs(moved - hour[::100]).max() <= STEP_NS
 
 
-def test_without_a_jump_nothing_is_touched(tmp_path: Path) -> None:
+def test_without_a_jump_nothing_is_touched(tmp_path):
     stamp_ns = START_NS + np.cumsum(np.tile([STEP_NS, 10**9, LONGEST_PAUSE_NS, -(10**9)], 50))
     blocks = blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])
     assert joined(blocks, 'accel').tolist() == stamp_ns.tolist()
     assert joined(blocks, 'board').tolist() == stamp_ns[::10].tolist()
 
 
-def test_what_jumps_all_the_time_is_no_clock(tmp_path: Path) -> None:
+def test_what_jumps_all_the_time_is_no_clock(tmp_path):
     stamp_ns = START_NS + YEAR_NS * (np.arange(400) % 2)
     with pytest.raises(RecordingError, match=r'bag\.mcap: .* jumps by more than an hour'):
         blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])
 
 
-def test_a_message_an_hour_is_no_recording(tmp_path: Path) -> None:
+def test_a_message_an_hour_is_no_recording(tmp_path):
     stamp_ns = START_NS + LONGEST_PAUSE_NS * np.arange(400)
     with pytest.raises(RecordingError, match=r'messages stamped over \d+ days'):
         blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])
 
 
 @pytest.mark.parametrize(('zone_s', 'n'), [(3600, 40000), (-3600, 1000), (1800, 1000), (20, 1000)])
-def test_thermometers_of_another_time_zone_are_named(tmp_path: Path, zone_s: int, n: int) -> None:
+def test_thermometers_of_another_time_zone_are_named(tmp_path, zone_s, n):
     # WHY: the only message was the number of days, or none, and `replay` wrote samples corrected
     # with the temperatures of another hour.
     true_ns = START_NS + STEP_NS * np.arange(n)

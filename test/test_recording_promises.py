@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The stated and the actual content of a bag; the cost of opening one."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 from dataclasses import replace
@@ -12,7 +10,6 @@ from pathlib import Path
 import pytest
 import yaml
 import zstandard
-from conftest import Cli
 from recording_helpers import (
     ACCEL,
     BOARD,
@@ -29,12 +26,12 @@ from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import inspect_recording, open_recording, read_recording
 
 
-def whole(folder: Path, storage: str = 'mcap', compression: str = '') -> Path:
+def whole(folder, storage='mcap', compression=''):
     write_rosbag2(folder / 'bag', regular_messages(400), storage=storage, compression=compression)
     return folder / 'bag'
 
 
-def test_rows_deleted_from_a_database_are_missed(tmp_path: Path, cli: Cli) -> None:
+def test_rows_deleted_from_a_database_are_missed(tmp_path, cli):
     bag = whole(tmp_path, 'sqlite3')
     with sqlite3.connect(bag / 'bag.db3') as database:
         (topic,) = database.execute('select id from topics where name = ?', (ACCEL,)).fetchone()
@@ -49,7 +46,7 @@ def test_rows_deleted_from_a_database_are_missed(tmp_path: Path, cli: Cli) -> No
     assert (tmp_path / 'o.mcap').is_file()
 
 
-def test_a_conversion_tells_what_the_bag_lacks(tmp_path: Path, cli: Cli) -> None:
+def test_a_conversion_tells_what_the_bag_lacks(tmp_path, cli):
     messages = regular_messages(400, accel=IMU_IN)
     for one in messages:
         if one.topic == IMU_IN:  # as gravity, since another magnitude at rest is refused
@@ -63,7 +60,7 @@ def test_a_conversion_tells_what_the_bag_lacks(tmp_path: Path, cli: Cli) -> None
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_a_topic_that_metadata_promise_and_nobody_has(tmp_path: Path, storage: str) -> None:
+def test_a_topic_that_metadata_promise_and_nobody_has(tmp_path, storage):
     bag = whole(tmp_path, storage)
     path = bag / 'metadata.yaml'
     content = yaml.safe_load(path.read_text())
@@ -76,7 +73,7 @@ def test_a_topic_that_metadata_promise_and_nobody_has(tmp_path: Path, storage: s
     assert inspect_recording(bag).truncated == '/gone: 0 of the 7 messages listed are there'
 
 
-def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path: Path) -> None:
+def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path):
     write_mcap(tmp_path / 'bag.mcap', regular_messages(40))
     with open_recording(tmp_path / 'bag.mcap') as reader:
         kind = reader.info.topics[ACCEL][0]
@@ -86,7 +83,7 @@ def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path: Path) -> None
         assert reader.info.truncated == f'{ACCEL}: 40 of the 64 messages listed are there'
 
 
-def test_a_compressed_file_is_read_up_to_its_damage(tmp_path: Path) -> None:
+def test_a_compressed_file_is_read_up_to_its_damage(tmp_path):
     write_rosbag2(tmp_path / 'bag', regular_messages(8000), compression='FILE')
     bag = tmp_path / 'bag'
     (packed,) = bag.glob('*.zstd')
@@ -106,9 +103,7 @@ def test_a_compressed_file_is_read_up_to_its_damage(tmp_path: Path) -> None:
         read_recording(bag)
 
 
-def test_a_compressed_file_expands_within_limits_and_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_compressed_file_expands_within_limits_and_leaves_nothing(tmp_path, monkeypatch):
     bag = whole(tmp_path, 'mcap', 'FILE')
     temporary = tmp_path / 'temporary'
     temporary.mkdir()
@@ -124,7 +119,7 @@ def test_a_compressed_file_expands_within_limits_and_leaves_nothing(
     assert not list(temporary.iterdir())
 
 
-def test_a_compressed_message_expands_within_limits(tmp_path: Path) -> None:
+def test_a_compressed_message_expands_within_limits(tmp_path):
     bag = whole(tmp_path, 'sqlite3', 'MESSAGE')
     with sqlite3.connect(bag / 'bag.db3') as database:
         bomb = zstandard.compress(bytes(1 << 28))
@@ -136,9 +131,7 @@ def test_a_compressed_message_expands_within_limits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('packing', ['BZ2', 'LZ4'])
-def test_a_chunk_of_a_ros1_bag_expands_within_limits(
-    tmp_path: Path, packing: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chunk_of_a_ros1_bag_expands_within_limits(tmp_path, packing, monkeypatch):
     # WHY: a bag of 10 kB took a gigabyte of memory.
     store, kind = get_typestore(Stores.ROS1_NOETIC), 'sensor_msgs/msg/Temperature'
     header, stamp = (
@@ -167,7 +160,7 @@ def test_a_chunk_of_a_ros1_bag_expands_within_limits(
                 read_recording(path, require=('board',))
 
 
-def test_a_fifo_or_a_device_is_never_waited_for(tmp_path: Path) -> None:
+def test_a_fifo_or_a_device_is_never_waited_for(tmp_path):
     for name in ('bag.mcap', 'bag.db3', 'bag.bag'):
         os.mkfifo(tmp_path / name)
         with pytest.raises(RecordingError, match=r'neither a file nor a directory'):

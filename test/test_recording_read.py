@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any bag written by another tool gives the columns of its messages in a player's order."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from pathlib import Path
@@ -31,8 +29,7 @@ from recording_helpers import (
 )
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.recording.blocks import Recording
-from thermo_comp.recording.reader import inspect_recording, open_recording, read_recording
+from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 
@@ -41,13 +38,13 @@ WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}
 
 
 @st.composite
-def bags(draw: st.DrawFn, accel: str = ACCEL, lowest: int = -3) -> list[Message]:
+def bags(draw, accel=ACCEL, lowest=-3):
     """
     Messages in order of writing, with equal and decreasing log times, mixed frames and orders.
     """
     frames = draw(st.lists(st.text('abcxyz_/é', max_size=24), min_size=1, max_size=3))
     topics = (accel, BOARD, CASE, OTHER)
-    messages: list[Message] = []
+    messages = []
     log_ns = START_NS
     for topic in draw(st.lists(st.sampled_from(topics), min_size=1, max_size=60)):
         log_ns += draw(st.integers(lowest, 4)) * 1000
@@ -65,11 +62,11 @@ def bags(draw: st.DrawFn, accel: str = ACCEL, lowest: int = -3) -> list[Message]
     return messages
 
 
-def in_reading_order(messages: list[Message]) -> list[Message]:
+def in_reading_order(messages):
     return sorted(messages, key=lambda message: message.log_ns)
 
 
-def read(path: Path) -> Recording:
+def read(path):
     return read_recording(path, require=())
 
 
@@ -77,15 +74,14 @@ def read(path: Path) -> Recording:
 @given(
     messages=bags(),
     chunk_size=st.sampled_from([1, 150, 400, 1000, 5000, 1 << 20]),
+    use_chunking=st.sampled_from([True, True, True, False]),
     compression=st.sampled_from(['none', 'lz4', 'zstd']),
     index_types=st.sampled_from([IndexType.ALL, IndexType.CHUNK, IndexType.MESSAGE, IndexType(0)]),
     use_statistics=st.booleans(),
     repeat=st.booleans(),
     enable_crcs=st.booleans(),
 )
-def test_any_chunked_file_gives_its_messages_in_order_of_log_time(
-    messages: list[Message], **options: object
-) -> None:
+def test_any_file_gives_its_messages_in_order_of_log_time(messages, **options):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         write_mcap(path, messages, **options)
@@ -95,7 +91,11 @@ def test_any_chunked_file_gives_its_messages_in_order_of_log_time(
         assert recording.info.n_messages == len(messages)
         assert recording.info.start_ns == min(message.log_ns for message in messages)
         assert recording.info.end_ns == max(message.log_ns for message in messages)
-        if options['index_types'] == IndexType.ALL and options['repeat']:
+        if (
+            options['use_chunking']
+            and options['index_types'] == IndexType.ALL
+            and options['repeat']
+        ):
             # Second route to the order: that of rosbags for the same file. Its versions differ for
             # equal log times in different chunks, so that these may be in either order.
             order = [(log_ns, topic) for topic, log_ns, _ in read_with_rosbags(path)]
@@ -105,21 +105,8 @@ def test_any_chunked_file_gives_its_messages_in_order_of_log_time(
 
 
 @settings(max_examples=25, deadline=None)
-@given(messages=bags(), index_types=st.sampled_from([IndexType.ALL, IndexType(0)]))
-def test_a_file_without_chunks_is_read_in_order_of_log_time_too(
-    messages: list[Message], index_types: IndexType
-) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, 'bag.mcap')
-        write_mcap(path, messages, use_chunking=False, index_types=index_types)
-        recording = read(path)
-        assert_columns(recording.columns, in_reading_order(messages))
-        assert recording.info.n_messages == len(messages)
-
-
-@settings(max_examples=25, deadline=None)
 @given(messages=bags(accel=IMU_IN), chunk_size=st.sampled_from([500, 3000, 1 << 20]))
-def test_every_number_of_an_imu_message_arrives(messages: list[Message], chunk_size: int) -> None:
+def test_every_number_of_an_imu_message_arrives(messages, chunk_size):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         write_mcap(path, messages, chunk_size=chunk_size, compression='lz4')
@@ -130,17 +117,13 @@ def test_every_number_of_an_imu_message_arrives(messages: list[Message], chunk_s
         if not numbers:
             assert columns.imu is None or len(columns.imu.orientation) == 0
             return
-        assert columns.imu is not None
         together = np.hstack(
             [
-                columns.imu.orientation,
-                columns.imu.orientation_covariance,
-                columns.imu.angular_velocity,
-                columns.imu.angular_velocity_covariance,
-                columns.accel,
-                columns.imu.linear_acceleration_covariance,
-            ]
-        )
+                columns.imu.orientation, columns.imu.orientation_covariance,
+                columns.imu.angular_velocity, columns.imu.angular_velocity_covariance,
+                columns.accel, columns.imu.linear_acceleration_covariance,
+            ],
+        )  # fmt: skip
         assert together.tobytes() == np.array(numbers).tobytes()
 
 
@@ -150,9 +133,7 @@ def test_every_number_of_an_imu_message_arrives(messages: list[Message], chunk_s
     storage=st.sampled_from(['mcap', 'sqlite3']),
     compression=st.sampled_from(['', 'FILE', 'MESSAGE', 'STORAGE']),
 )
-def test_directories_written_by_rosbags(
-    messages: list[Message], storage: str, compression: str
-) -> None:
+def test_directories_written_by_rosbags(messages, storage, compression):
     compression = '' if storage == 'sqlite3' and compression == 'STORAGE' else compression
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag')
@@ -165,7 +146,7 @@ def test_directories_written_by_rosbags(
 
 @settings(max_examples=10, deadline=None)
 @given(messages=bags(lowest=1))
-def test_ros_1_bags(messages: list[Message]) -> None:
+def test_ros_1_bags(messages):
     # No equal log times: a ROS 1 bag has an index per topic, and no order between topics for equal
     # times.
     with tempfile.TemporaryDirectory() as folder:
@@ -177,7 +158,7 @@ def test_ros_1_bags(messages: list[Message]) -> None:
 
 
 @pytest.mark.parametrize('accel', [ACCEL, IMU_IN])
-def test_raw_messages_are_the_very_bytes(tmp_path: Path, accel: str) -> None:
+def test_raw_messages_are_the_very_bytes(tmp_path, accel):
     messages = regular_messages(accel=accel)
     write_mcap(tmp_path / 'bag.mcap', messages, chunk_size=900)
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
@@ -194,7 +175,7 @@ def test_raw_messages_are_the_very_bytes(tmp_path: Path, accel: str) -> None:
             assert raw.log_ns.tolist() == [m.log_ns for m in wanted]
 
 
-def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path: Path) -> None:
+def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path):
     messages = regular_messages(60)
     for row, message in enumerate(messages):
         message.frame_id = 'front' if row % 30 < 11 else 'a_longer_name'
@@ -214,7 +195,7 @@ def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path: Path
     assert_columns(read(tmp_path / 'bag.mcap').columns, messages)
 
 
-def test_overlapping_chunks_of_single_topics_are_merged(tmp_path: Path) -> None:
+def test_overlapping_chunks_of_single_topics_are_merged(tmp_path):
     """
     WHY: a tool that writes a chunk per topic puts the temperatures after the samples that they
     belong to; in file order each would apply a chunk too late.
@@ -230,9 +211,7 @@ def test_overlapping_chunks_of_single_topics_are_merged(tmp_path: Path) -> None:
     assert_columns(read(tmp_path / 'bag.mcap').columns, in_reading_order(by_topic))
 
 
-def test_too_many_overlapping_chunks_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_many_overlapping_chunks_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.mcap_file._MAX_HELD_BYTES', 4000)
     messages = regular_messages(200)
     # Each chunk has every 40th message, so that all of them cover the whole time.
@@ -242,7 +221,7 @@ def test_too_many_overlapping_chunks_are_refused(
         read(tmp_path / 'bag.mcap')
 
 
-def test_raw_messages_of_overlapping_chunks_are_in_order_too(tmp_path: Path) -> None:
+def test_raw_messages_of_overlapping_chunks_are_in_order_too(tmp_path):
     messages = regular_messages(60)
     shuffled = [m for pair in zip(messages[1::2], messages[::2], strict=False) for m in pair]
     for row, message in enumerate(messages):
@@ -257,7 +236,7 @@ def test_raw_messages_of_overlapping_chunks_are_in_order_too(tmp_path: Path) -> 
     assert frames == [m.frame_id for m in wanted]
 
 
-def test_split_files_follow_each_other(tmp_path: Path) -> None:
+def test_split_files_follow_each_other(tmp_path):
     messages = regular_messages(90)
     write_rosbag2(tmp_path / 'bag', messages[:50])
     write_mcap(tmp_path / 'bag' / 'bag_1.mcap', messages[50:80])
@@ -289,7 +268,7 @@ def test_split_files_follow_each_other(tmp_path: Path) -> None:
         )
 
 
-def test_a_folder_of_bags_is_no_bag(tmp_path: Path) -> None:
+def test_a_folder_of_bags_is_no_bag(tmp_path):
     # WHY: bags of different positions were once read as the files of one truncated bag.
     for name in ('01.mcap', '02.mcap'):
         (tmp_path / name).write_bytes(b'')
@@ -297,7 +276,7 @@ def test_a_folder_of_bags_is_no_bag(tmp_path: Path) -> None:
         read(tmp_path)
 
 
-def test_a_bare_database_and_one_without_metadata(tmp_path: Path) -> None:
+def test_a_bare_database_and_one_without_metadata(tmp_path):
     messages = regular_messages()
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
@@ -308,40 +287,14 @@ def test_a_bare_database_and_one_without_metadata(tmp_path: Path) -> None:
     assert_columns(read(tmp_path / 'bare.db3').columns, messages)
 
 
-def test_info_is_known_before_the_messages_are_read(tmp_path: Path) -> None:
-    messages = regular_messages(40)
-    write_mcap(tmp_path / 'bag.mcap', [*messages, Message(OTHER, START_NS + 10**9)])
-    info = inspect_recording(tmp_path / 'bag.mcap')
-    assert info.topics == {
-        ACCEL: ('geometry_msgs/msg/Vector3Stamped', 40),
-        BOARD: ('sensor_msgs/msg/Temperature', 5),
-        CASE: ('sensor_msgs/msg/Temperature', 5),
-        OTHER: ('std_msgs/msg/String', 1),
-    }
-    assert (info.start_ns, info.end_ns) == (START_NS, START_NS + 10**9)
-    assert info.input == 'counts'
-    assert info.n_messages == 51
-
-
-def test_auto_prefers_counts_that_are_there(tmp_path: Path) -> None:
-    both = [*regular_messages(8), *regular_messages(8, IMU_IN)]
-    write_mcap(tmp_path / 'both.mcap', both)
-    write_mcap(tmp_path / 'imu.mcap', regular_messages(8, IMU_IN))
-    assert read(tmp_path / 'both.mcap').info.input == 'counts'
-    assert read(tmp_path / 'imu.mcap').info.input == 'imu'
-    chosen = read_recording(tmp_path / 'both.mcap', Topics(input='imu'))
-    assert chosen.info.input == 'imu'
-    assert chosen.columns.imu is not None
-
-
-def test_a_topic_is_found_under_its_namespace(tmp_path: Path) -> None:
+def test_a_topic_is_found_under_its_namespace(tmp_path):
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(8))
     with open_recording(path, Topics(counts='counts', board='/temperature/board/')) as reader:
         assert reader.topics == {'accel': ACCEL, 'board': BOARD, 'case': CASE}
 
 
-def written(path: Path, *topics: str, counts: str = 'accel/counts') -> Path:
+def written(path, *topics, counts='accel/counts'):
     """Write three samples, and a reading of 20, 21, ... degC on each topic."""
     with BagWriter(path) as bag:
         bag.write_counts(counts, START_NS + np.arange(3), np.zeros((3, 3)))
@@ -350,7 +303,7 @@ def written(path: Path, *topics: str, counts: str = 'accel/counts') -> Path:
     return path
 
 
-def test_further_thermometers_are_found_beside_the_board(tmp_path: Path) -> None:
+def test_further_thermometers_are_found_beside_the_board(tmp_path):
     names = ('board', 'case', 'lid', 'Tip', 'accel', 'a/b')
     topics = [f'imu0/temperature/{name}' for name in names]
     path = written(tmp_path / 'bag', *topics, 'temperature/lid', counts='imu0/accel/counts')
@@ -363,17 +316,14 @@ def test_further_thermometers_are_found_beside_the_board(tmp_path: Path) -> None
     assert found['lid'].after.tolist() == [2]
 
 
-def test_topics_by_the_names_of_their_inputs(tmp_path: Path) -> None:
+def test_topics_by_the_names_of_their_inputs(tmp_path):
     path = written(tmp_path / 'bag', 't1', 't2', 't3', 'temperature/lid', counts='raw')
     names = {'counts': '/raw', 'board': 't1', 'temperature/case': 't2', 'temperature/magnet': 't3'}
     found = read_recording(path, Topics.named(names))
     assert found.info.chosen is None
     assert {name: one.celsius.tolist() for name, one in found.columns.temperatures.items()} == {
-        'board': [20.0],
-        'case': [21.0],
-        'lid': [23.0],
-        'magnet': [22.0],
-    }
+        'board': [20.0], 'case': [21.0], 'lid': [23.0], 'magnet': [22.0],
+    }  # fmt: skip
     with pytest.raises(RecordingError, match=r'/t9: no such topic.*--topic temperature/magnet='):
         open_recording(path, Topics.named({**names, 'temperature/magnet': '/t9'}))
     with pytest.raises(RecordingError, match=r'/raw: the topic has type geometry_msgs/msg/Vector'):
@@ -387,7 +337,7 @@ def test_topics_by_the_names_of_their_inputs(tmp_path: Path) -> None:
         Topics.named({'case': '/'})
 
 
-def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path: Path) -> None:
+def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
     path = written(tmp_path / 'one', 'imu/die', counts='imu/ticks')
     with open_recording(path, require=('accel', 'board')) as reader:
         assert reader.topics == {'accel': '/imu/ticks', 'board': '/imu/die'}
@@ -404,7 +354,7 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path: Path) ->
             open_recording(several, require=('board',))
 
 
-def test_reading_twice_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_twice_gives_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 100)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
@@ -415,9 +365,7 @@ def test_reading_twice_gives_the_same(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize('n_messages', [100, 500])
-def test_blocks_have_about_one_size(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_messages: int
-) -> None:
+def test_blocks_have_about_one_size(tmp_path, monkeypatch, n_messages):
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', n_messages)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
@@ -429,7 +377,7 @@ def test_blocks_have_about_one_size(
     assert np.concatenate([block.accel for block in blocks]).tobytes() == whole.tobytes()
 
 
-def test_a_closed_recording_gives_nothing(tmp_path: Path) -> None:
+def test_a_closed_recording_gives_nothing(tmp_path):
     write_mcap(tmp_path / 'bag.mcap', regular_messages())
     write_rosbag1(tmp_path / 'bag.bag', regular_messages())
     for name in ('bag.mcap', 'bag.bag'):

@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refusals: other layouts, encodings and topics, and files that are not bags."""
 
-from __future__ import annotations
-
 import os
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +13,7 @@ from recording_helpers import (
     BOARD,
     CASE,
     OTHER,
+    START_NS,
     Message,
     regular_messages,
     serialize,
@@ -26,21 +24,22 @@ from recording_helpers import (
 from test_recording_damage import read, whole_file
 
 from thermo_comp.errors import RecordingError
+from thermo_comp.fitting.sources import recording_source
 from thermo_comp.recording.reader import inspect_recording, open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 
 
-def short_message(data: bytes) -> bytes:
+def short_message(data):
     record = struct.pack('<HIQQ', 1, 0, 1, 1) + data
     return struct.pack('<BQ', Opcode.MESSAGE, len(record)) + record
 
 
-def text(value: str) -> bytes:
+def text(value):
     return struct.pack('<I', len(value.encode())) + value.encode()
 
 
-def declared(encoding: str = 'cdr', kind: str = 'geometry_msgs/msg/Vector3Stamped') -> bytes:
+def declared(encoding='cdr', kind='geometry_msgs/msg/Vector3Stamped'):
     schema = struct.pack('<H', 1) + text(kind) + text('ros2msg') + text('')
     channel = struct.pack('<HH', 1, 1) + text(ACCEL) + text(encoding) + text('')
     return b''.join(
@@ -59,14 +58,14 @@ def declared(encoding: str = 'cdr', kind: str = 'geometry_msgs/msg/Vector3Stampe
         (b'\x00\x01\x00\x00' + bytes(80), 'does not fit'),
     ],
 )
-def test_messages_of_another_layout_are_named(tmp_path: Path, data: bytes, reason: str) -> None:
+def test_messages_of_another_layout_are_named(tmp_path, data, reason):
     path = tmp_path / 'bag.mcap'
     path.write_bytes(whole_file(declared(), short_message(data)))
     with pytest.raises(RecordingError, match=rf'bag\.mcap: {ACCEL}: .*{reason}'):
         read(path)
 
 
-def test_ros_1_messages_in_an_mcap_file(tmp_path: Path) -> None:
+def test_ros_1_messages_in_an_mcap_file(tmp_path):
     path = tmp_path / 'bag.mcap'
     numbers = struct.pack('<3d', 1.5, -2.5, 3.5)
     data = struct.pack('<IIII', 9, 12, 34, 4) + b'link' + numbers
@@ -83,7 +82,7 @@ def test_ros_1_messages_in_an_mcap_file(tmp_path: Path) -> None:
     assert block.raw['accel'].data.tobytes() == serialize(message)
 
 
-def test_messages_in_another_encoding_are_named(tmp_path: Path) -> None:
+def test_messages_in_another_encoding_are_named(tmp_path):
     path = tmp_path / 'bag.mcap'
     both = declared() + declared('ros1').replace(
         struct.pack('<HH', 1, 1), struct.pack('<HH', 2, 1)
@@ -97,8 +96,8 @@ def test_messages_in_another_encoding_are_named(tmp_path: Path) -> None:
         read(path)
 
 
-def test_what_is_no_bag(tmp_path: Path) -> None:
-    def refused(path: Path, reason: str) -> None:
+def test_what_is_no_bag(tmp_path):
+    def refused(path, reason):
         with pytest.raises(RecordingError, match=reason):
             open_recording(path)
 
@@ -137,7 +136,7 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
         refused(tmp_path / 'folder', reason)
 
 
-def test_topics_that_are_not_there_or_are_something_else(tmp_path: Path) -> None:
+def test_topics_that_are_not_there_or_are_something_else(tmp_path):
     path = tmp_path / 'bag.mcap'
     messages = regular_messages(8)
     write_mcap(path, messages)
@@ -164,7 +163,7 @@ def test_topics_that_are_not_there_or_are_something_else(tmp_path: Path) -> None
     assert len(read(path).columns) == 0
 
 
-def test_a_required_topic_without_messages(tmp_path: Path) -> None:
+def test_a_required_topic_without_messages(tmp_path):
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         bag.write_counts('accel/counts', [1, 2], np.zeros((2, 3)))
@@ -174,7 +173,7 @@ def test_a_required_topic_without_messages(tmp_path: Path) -> None:
         open_recording(path)
 
 
-def test_two_topics_that_fit_are_ambiguous(tmp_path: Path) -> None:
+def test_two_topics_that_fit_are_ambiguous(tmp_path):
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         for unit in ('a', 'b'):
@@ -187,7 +186,7 @@ def test_two_topics_that_fit_are_ambiguous(tmp_path: Path) -> None:
         assert reader.topics == {'accel': '/b/accel/counts'}
 
 
-def test_names_from_a_bag_cannot_forge_lines(tmp_path: Path) -> None:
+def test_names_from_a_bag_cannot_forge_lines(tmp_path):
     """WHY: a topic's name may contain anything; an error must be one line of a terminal."""
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
@@ -199,7 +198,7 @@ def test_names_from_a_bag_cannot_forge_lines(tmp_path: Path) -> None:
     assert len(str(caught.value)) < 3000
 
 
-def test_torn_bags_of_other_storages_are_one_line(tmp_path: Path) -> None:
+def test_torn_bags_of_other_storages_are_one_line(tmp_path):
     messages = [*regular_messages(400), Message(OTHER, 0)]
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     write_rosbag1(tmp_path / 'bag.bag', messages)
@@ -211,6 +210,83 @@ def test_torn_bags_of_other_storages_are_one_line(tmp_path: Path) -> None:
         assert '\n' not in str(caught.value)
 
 
-def test_wire_sizes_are_as_the_layout_says() -> None:
-    # 4 encapsulation + align8(12 + 6) = 24 + 3 * 8: the sizes used by the tests above.
-    assert len(serialize(Message(ACCEL, 0, 0, 'accel', (1.0, 2.0, 3.0)))) == 52
+def driver_bag(path, *topics, metadata=None):
+    """Write five messages on each topic: an Imu, or if stated a Vector3Stamped or a flag."""
+    stamp_ns = START_NS + np.arange(5) * 10**7
+    with BagWriter(path, metadata=metadata or {}) as bag:
+        for topic, kind in topics:
+            if kind == 'imu':
+                bag.write_imu(topic, stamp_ns, np.ones((5, 3)), np.zeros(9))
+            elif kind == 'celsius':
+                bag.write_temperature(topic, stamp_ns, np.full(5, 20.0))
+            elif kind == 'flag':
+                bag.write_bool(topic, stamp_ns, np.ones(5, bool))
+            else:
+                bag.write_counts(topic, stamp_ns, np.ones((5, 3)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ('topics', 'taken'),
+    [
+        # REP 145: the driver's topic; the magnetometer's vector is not a force.
+        ([('imu/data_raw', 'imu'), ('imu/mag', 'vector')], '/imu/data_raw'),
+        # Xsens: free acceleration and rate are vectors.
+        ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
+        ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
+        # With a filter, its input is chosen.
+        ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
+        ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
+        ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),
+        # Two equivalent topics, and vectors that are not forces.
+        ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
+        ([('imu/mag', 'vector')], None),
+        # The node's output, recognised by the regime topics beside it.
+        ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], None),
+        ([('a/imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], '/a/imu/data_raw'),
+        ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag'), ('d/imu', 'imu')], '/d/imu'),
+    ],
+)
+def test_an_imu_topic_beats_a_guess_by_type(tmp_path, topics, taken):
+    path = driver_bag(tmp_path / 'bag', *topics)
+    with open_recording(path, require=()) as reader:
+        assert reader.topics.get('accel') == taken
+    if taken is None:
+        with pytest.raises(RecordingError, match='no such topic; the bag has /'):
+            open_recording(path, require=('accel',))
+
+
+def test_the_input_that_the_user_names_is_compensated(tmp_path):
+    path = driver_bag(tmp_path / 'bag', ('accel/counts', 'vector'), ('imu/data', 'imu'))
+    for names, taken in (({}, '/accel/counts'), ({'imu': '/imu/data'}, '/imu/data')):
+        with open_recording(path, Topics.named(names), require=('accel',)) as reader:
+            assert reader.topics['accel'] == taken
+
+
+def test_what_is_corrected_already_is_explained(tmp_path):
+    path = driver_bag(
+        tmp_path / 'bag', ('imu/data_raw', 'imu'), metadata={'corrected_by': 'thermo_comp 0.1'}
+    )
+    told = '/imu/data_raw is corrected already: thermo_comp wrote it'
+    with pytest.raises(RecordingError, match=told):
+        open_recording(path, require=('accel',))
+    assert told in str(inspect_recording(path).chosen)
+    # The user's choice.
+    with open_recording(path, Topics.named({'imu': 'imu/data_raw'}), require=('accel',)) as reader:
+        assert reader.topics['accel'] == '/imu/data_raw'
+
+
+def test_one_topic_for_two_inputs_is_refused_by_its_name(tmp_path):
+    path = driver_bag(tmp_path / 'bag', ('accel/counts', 'vector'), ('imu/temperature', 'celsius'))
+    for second in ('case', 'temperature/lid'):
+        names = {'board': '/imu/temperature', second: 'imu/temperature'}
+        told = f'/imu/temperature: one topic for both board and {second.rpartition("/")[2]}: '
+        with pytest.raises(RecordingError, match=told):
+            open_recording(path, Topics.named(names), require=('accel',))
+
+
+def test_a_fit_that_fails_names_the_topic_that_was_taken(tmp_path):
+    source, _ = recording_source(driver_bag(tmp_path / 'bag', ('imu/data', 'imu')))
+    assert source.name == 'bag (/imu/data)'
+    source, _ = recording_source(driver_bag(tmp_path / 'usual', ('accel/counts', 'vector')))
+    assert source.name == 'usual'

@@ -17,7 +17,7 @@ def test_generated_pages_are_up_to_date():
     assert not stale, 'run: python docs/make_reference.py'
 
 
-def test_json_schema_says_the_same() -> None:
+def test_json_schema_says_the_same():
     schema = make_reference.json_schema(Drawing)
     assert schema['required'] == ['name']
     assert schema['additionalProperties'] is False
@@ -29,12 +29,9 @@ def test_json_schema_says_the_same() -> None:
         'default': [],
     }
     assert schema['properties']['corner'] == {
-        'type': 'array',
-        'prefixItems': [{'type': 'number'}, {'type': 'number'}],
-        'minItems': 2,
-        'maxItems': 2,
-        'default': [0.0, 0.0],
-    }
+        'type': 'array', 'prefixItems': [{'type': 'number'}, {'type': 'number'}], 'minItems': 2,
+        'maxItems': 2, 'default': [0.0, 0.0],
+    }  # fmt: skip
     assert schema['properties']['colour'] == {
         'anyOf': [{'enum': ['red', 'green', 'blue'], 'type': 'string'}, {'type': 'null'}],
         'default': None,

@@ -25,9 +25,10 @@ from thermal_signals import (
     switches,
 )
 
+from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.change_detector import ChangeDetector
 from thermo_comp.thermal.regime import Regime, RegimeDetector
-from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
+from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig, ThermometerSettings
 from thermo_comp.thermal.thermometer import Thermometer
 
 UNKNOWN, STATIC, DYNAMIC = Regime.UNKNOWN, Regime.STATIC, Regime.DYNAMIC
@@ -55,14 +56,15 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
     for seed in range(n):
         rng = np.random.default_rng([seed, 2])
         t = np.arange(-soak_s, end_s, dt)
-        start = 20.0 + rng.uniform(-0.5, 0.5) * max(quantum, 0.1)
-        case, board = case_and_board(t, [(0.0, rng.choice([-1, 1]) * rate_k_min)], lag, start)
+        start, sign = 20.0 + rng.uniform(-0.5, 0.5) * max(quantum, 0.1), rng.choice([-1, 1])
+        case, board = case_and_board(t, [(0.0, sign * rate_k_min)], lag, start)
         changes = switches(
             settings, t, read(case, noise, quantum, rng), read(board, noise, quantum, rng)
         )
         before = [each for each in changes if each[0] < 0.0]
         n_static += bool(before) and before[-1][1] == STATIC
         found.append([each for each in changes if each[0] >= 0.0])
+        assert found[-1][-1][2] == sign
     return found, n_static
 
 
@@ -70,7 +72,7 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
 def headline():
     """Run the ramp of the requirement: 0.5 K/min behind 15 min, 1 Hz, after a soak."""
     return {
-        name: onsets(*sensor, 0.5, LAG_S, 12 if sensor[1] else 24, end_s=300.0, soak_s=2700.0)
+        name: onsets(*sensor, 0.5, LAG_S, 12 if sensor[1] else 24, end_s=300.0, soak_s=1800.0)
         for name, sensor in SENSORS.items()
     }
 
@@ -114,14 +116,6 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
     assert ours <= 2.0 * np.median(delays)
 
 
-@pytest.mark.parametrize('direction_of', SENSORS)
-def test_direction_is_that_of_the_ramp(headline, direction_of):
-    for seed, each in enumerate(headline[direction_of][0]):
-        rng = np.random.default_rng([seed, 2])
-        rng.uniform()
-        assert each[0][2] == rng.choice([-1, 1])
-
-
 @pytest.mark.parametrize(
     ('noise', 'quantum', 'rate_k_min', 'lag', 'dt', 'end_s'),
     [
@@ -138,7 +132,7 @@ def test_direction_is_that_of_the_ramp(headline, direction_of):
     ],
 )
 def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt, end_s):
-    found, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 4, dt=dt, end_s=end_s)
+    found, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in found:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
         # The slowest: steps of 1 K in a ramp of 0.2 K/min, two edges 5 min apart behind 15 min.
@@ -367,20 +361,6 @@ def test_a_start_in_a_ramp_is_dynamic():
     assert changes[0][2] == 1
 
 
-def test_a_lost_case_leaves_the_board():
-    # The board's additional lag delays the onset; the end depends on the board anyway.
-    whole, alone = run_once(RAMP), run_once(RAMP, case=gone)
-    assert [regime for _, regime, _ in alone] == [STATIC, DYNAMIC, STATIC]
-    assert whole[1][0] < alone[1][0] < 300.0
-    assert alone[2][0] == pytest.approx(whole[2][0], abs=60.0)
-
-
-def test_a_frozen_case_does_not_blind():
-    changes = run_once(RAMP, case=lambda t, x: np.where(t < 0.0, x, 20.0))
-    assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
-    assert changes[1][0] < 900.0
-
-
 def test_a_board_that_died_does_not_hold_the_dynamic_state():
     settings = detector_settings(0.001)
     case, board = Thermometer(settings.case), Thermometer(settings.board)
@@ -417,25 +397,32 @@ def test_switches_do_not_depend_on_the_origin_of_time():
 
 
 @pytest.mark.parametrize(
-    ('changes', 'text'),
+    ('settings', 'changes', 'text'),
     [
-        ({'smallest_ramp_k_min': -0.2}, '`smallest_ramp_k_min` must be positive and finite'),
-        ({'false_alarms_per_hour': 0.0}, '`false_alarms_per_hour` must be positive and finite'),
-        ({'relaxed_rate_k_min': math.nan}, '`relaxed_rate_k_min` must be positive and finite'),
-        ({'ripple_c': -0.1}, '`ripple_c` must be zero or positive and finite, got -0.1'),
-        ({'dwell_s': math.inf}, '`dwell_s` must be zero or positive and finite, got inf'),
-        ({'closes': 'chamber'}, "`closes` must be 'board' or 'case', got 'chamber'"),
+        (DetectorSettings, {'smallest_ramp_k_min': -0.2}, 'must be positive and finite'),
+        (DetectorSettings, {'false_alarms_per_hour': 0.0}, 'must be positive and finite'),
+        (DetectorSettings, {'relaxed_rate_k_min': math.nan}, 'must be positive and finite'),
+        (DetectorSettings, {'ripple_c': -0.1}, 'must be zero or positive and finite, got -0.1'),
+        (DetectorSettings, {'dwell_s': math.inf}, 'must be zero or positive and finite, got inf'),
+        (DetectorSettings, {'closes': 'chamber'}, "must be 'board' or 'case', got 'chamber'"),
         (
-            {'smallest_ramp_k_min': 0.06},
-            '`relaxed_rate_k_min` must be below `smallest_ramp_k_min` / 1.5, got 0.05 and 0.06',
+            DetectorSettings,
+            {'relaxed_rate_k_min': 0.15},
+            'must be below `smallest_ramp_k_min` / 1',
         ),
+        (ThermometerSettings, {'noise_sd_c': 0.0}, 'must be positive and finite, got 0.0'),
+        (ThermometerSettings, {'fastest_ramp_k_min': -1.0}, 'must be positive and finite, got -1'),
+        (ThermometerSettings, {'lag_s': math.inf}, 'must be positive and finite, got inf'),
+        (ThermometerSettings, {'quantum_c': -0.1}, 'must be zero or positive and finite'),
+        (ThermalConfig, {'transition_time_s': math.nan}, 'must be zero or positive and finite'),
+        (ThermalConfig, {'case_timeout_s': 0.0}, 'must be positive'),
+        (CompensatorConfig, {'temperature_timeout_s': 0.0}, 'must be positive'),
+        (CompensatorConfig, {'stuck_timeout_s': -1.0}, 'must be zero or positive'),
+        (CompensatorConfig, {'local_gravity_m_s2': math.nan}, 'must be zero or positive'),
+        (CompensatorConfig, {'gravity_tolerance_m_s2': -0.1}, 'must be zero or positive'),
     ],
 )
-def test_settings_refuse_contradictions(changes, text):
-    with pytest.raises(ValueError, match=text):
-        DetectorSettings(**changes)
-
-
-def test_sensor_settings_are_checked_with_them():
-    with pytest.raises(ValueError, match='`noise_sd_c` must be positive and finite, got 0'):
-        DetectorSettings(case=ThermometerSettings(noise_sd_c=0.0))
+def test_settings_refuse_contradictions(settings, changes, text):
+    (name,) = changes
+    with pytest.raises(ValueError, match=f'`{name}` {text}'):
+        settings(**changes)

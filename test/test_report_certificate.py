@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The certificate of a laboratory: its statements, uncertainties and rounding."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +13,8 @@ from hypothesis import strategies as st
 from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.errors import ThermoCompError
-from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.report.certificate import budget, combined, conformity, over_temperature, results
-from thermo_comp.report.evidence import evidence_of_bags
 from thermo_comp.report.html import rounded
 from thermo_comp.report.page import render_report
 from thermo_comp.report.statements import CertificateInfo, load_certificate_info
@@ -47,7 +42,7 @@ signatory: B. Person
 """
 
 
-def lab(folder: Path, text: str = LAB) -> Path:
+def lab(folder, text=LAB):
     path = folder / 'lab.yaml'
     path.write_text(text, encoding='utf-8')
     return path
@@ -97,14 +92,8 @@ def test_what_a_laboratory_states_is_printed_and_the_rest_is_blank(tmp_path):
     )
     assert margin in page
     order = [
-        *(
-            'Certificate number',
-            'Laboratory',
-            'Customer',
-            'Unit, maker',
-            'Date of test',
-            'Conditions',
-        ),
+        *('Certificate number', 'Laboratory', 'Customer', 'Unit, maker', 'Date of test'),
+        'Conditions',
         *('>Instruments', 'Local gravity', '>Method', '>Results', '>Results over temperature'),
         *('>Uncertainty budget', '>Statement of conformity', '>Range of validity'),
         *('reproduced in full only', 'Authorised by', '>End of the certificate'),
@@ -267,13 +256,6 @@ def test_conformity_is_stated_to_a_limit_alone():
         said, rule = conformity(replace(evidence(), judgement=judged))
         assert said == ''
         assert 'o statement of conformity is made' in rule
-
-
-def test_simulated_bags_mark_every_page(tmp_path):
-    calibration = fitted().calibration
-    simulated = evidence_of_bags(open_bags([write_bag(tmp_path / 'sim.mcap')]), calibration)
-    assert 'class="simulated"' in render_report(simulated, figures=[])
-    assert 'class="simulated"' not in render_report(evidence_of_bags([], calibration), figures=[])
 
 
 @pytest.mark.usefixtures('no_figures')

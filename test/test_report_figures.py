@@ -1,22 +1,23 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The figures: legible without colour, with units, and equal to the numbers behind them."""
+"""Figures: legible without colour, with units, as the numbers behind them; pages in a browser."""
 
-from __future__ import annotations
-
+import re
+import shutil
+import subprocess
+import zlib
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from builders import axis_set, calibration, regime_set, rich_calibration, term
-from matplotlib.artist import Artist
 from matplotlib.colors import to_rgb
-from report_helpers import evidence, fitted
+from report_helpers import certificate, evidence, fitted
 
 from thermo_comp.report import figures_bags as of_bags
 from thermo_comp.report import figures_unit as of_unit
-from thermo_comp.report.html import label_text, number
+from thermo_comp.report.html import number
 from thermo_comp.report.page import figures_of, position_error, schuler_peak
 from thermo_comp.report.states import curves
 from thermo_comp.report.style import drawing, svg
@@ -102,7 +103,7 @@ def test_trace_without_a_case_sensor_follows_the_board():
     assert any(stretch.regime == Regime.DYNAMIC for stretch in shown.stretches)
 
 
-def look(line: Artist) -> tuple[object, ...]:
+def look(line):
     """Return what distinguishes lines without colour: dashes, marker, darkness."""
     dashes, colour = line._unscaled_dash_pattern, line.get_color()
     marker = f'{line.get_marker()} {line.get_markerfacecolor()}'
@@ -147,17 +148,6 @@ def test_numbers_are_spelt_for_readers(value, text):
     assert number(value) == text
 
 
-def test_names_of_others_fit_a_figure():
-    assert label_text('a\nb\x00c ') == 'a b c'
-    assert label_text('x' * 60) == 'x' * 39 + '…'
-
-
-def test_every_figure_asks_a_question():
-    for one in figures_of(evidence()):
-        assert one.question.endswith('?')
-        assert one.reading.endswith('.')
-
-
 def test_label_of_a_drawing_is_escaped():
     with drawing():
         text = svg(of_bags.draw_temperatures(evidence()), 'x', '"><script>')
@@ -181,3 +171,62 @@ def test_rates_are_those_of_the_gyroscope():
     names = [one.name for one in figures_of(replace(evidence(), calibration=unit))]
     assert 'rates' in names
     assert 'rates' not in [one.name for one in figures_of(evidence())]
+
+
+TIMEOUT_S = 60.0
+HEADLESS = (
+    *('--headless', '--no-sandbox', '--disable-gpu', '--no-first-run', '--disable-sync'),
+    *('--disable-background-networking', '--disable-component-update'),
+)
+
+
+def browser():
+    found = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
+    if found is None:
+        pytest.skip('no Chromium here (Debian: apt install chromium)')
+    return found
+
+
+def test_browser_draws_the_page_for_a_phone_whole_and_without_a_complaint(tmp_path):
+    # A headless browser has no window as narrow as a phone, but a frame in it can be.
+    (tmp_path / 'page.html').write_text(certificate(), encoding='utf-8')
+    frame = tmp_path / 'frame.html'
+    frame.write_text("""<iframe src="page.html" style="width:390px;height:800px;border:0"></iframe>
+<script>onload = () => {
+  const page = frames[0].document;
+  const shown = [page.documentElement, ...page.querySelectorAll("div:not(.drawing)")];
+  console.log(shown.filter(one => one.scrollWidth > Math.max(one.clientWidth, 1)).length
+    + " of " + page.querySelectorAll("table").length + " tables are cut");
+}</script>""")
+    finished = subprocess.run(
+        [
+            browser(), *HEADLESS, '--enable-logging=stderr', '--allow-file-access-from-files',
+            f'--user-data-dir={tmp_path / "profile"}', f'--screenshot={tmp_path / "phone.png"}',
+            frame.as_uri(),
+        ],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=True,
+    )  # fmt: skip
+    (said,) = [line for line in finished.stderr.splitlines() if 'CONSOLE' in line]
+    cut, n_tables = re.search(r'(\d+) of (\d+) tables are cut', said).groups()
+    assert int(n_tables) >= 5
+    assert cut == '0'
+    assert (tmp_path / 'phone.png').stat().st_size > 10_000
+
+
+def test_no_printed_page_is_empty(tmp_path):
+    (tmp_path / 'page.html').write_text(certificate(), encoding='utf-8')
+    subprocess.run(
+        [
+            browser(), *HEADLESS, f'--user-data-dir={tmp_path / "profile"}',
+            '--no-pdf-header-footer', f'--print-to-pdf={tmp_path / "page.pdf"}',
+            (tmp_path / 'page.html').as_uri(),
+        ],
+        capture_output=True, timeout=TIMEOUT_S, check=True,
+    )  # fmt: skip
+    printed = (tmp_path / 'page.pdf').read_bytes()
+    pages = re.findall(rb'/Type /Page\n.*?/Contents (\d+) 0 R', printed, re.DOTALL)
+    assert 5 <= len(pages) <= 12
+    for one in pages:
+        drawn = re.search(rb'\n%s 0 obj.*?stream\r?\n' % one, printed, re.DOTALL)
+        # The margin takes some lines.
+        assert zlib.decompressobj().decompress(printed[drawn.end() :]).count(b'\n') > 200

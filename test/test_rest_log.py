@@ -2,15 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rest log: what the node gathers on real DDS, and its files when killed or on a full disk."""
 
-from __future__ import annotations
-
 import json
 import signal
 import threading
 import zlib
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +18,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray
 from node_process import NodeProcess
-from ros_helpers import SECOND_NS, START_NS, Driver, Peer, drive, node_arguments, node_in_thread
+from ros_helpers import SECOND_NS, START_NS, Driver, drive, node_arguments, node_in_thread
 
 from thermo_comp.errors import OutputError
 from thermo_comp.field.gather import RestFinder
@@ -37,49 +33,42 @@ NOISE = 0.01  # of a sample [m/s^2]: 3 counts of the unit of 300 per m/s^2
 START = Start(START_NS, 'T-1', 'counts', 9.80665, 'abc', MemorySpec(('case',), (('board', 60.0),)))
 
 
-def rest(number: int) -> Rest:
+def rest(number):
     stamp, state = START_NS + number * 10 * SECOND_NS, (20.0, 1e-6, 0.0, 0.0, 0.0, 0.5, 1e-6)
     return Rest(stamp, 1000, (1.0, -2.0, 2941.25), (3.0,) * 3, (*state, 0.25, 0.0), (0.5,))
 
 
 @pytest.fixture
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
-
-
-@pytest.fixture
-def unit(tmp_path: Path) -> Path:
+def unit(tmp_path):
     path = tmp_path / 'unit.yaml'
     density = float(NOISE / np.sqrt(RATE_HZ))
     save_calibration(calibration(noise_density_m_s2_sqrt_hz=(density,) * 3), path)
     return path
 
 
-def standing(n: int, seed: int = 1) -> np.ndarray:
+def standing(n, seed=1):
     """Make the counts of a unit that stands."""
     rng = np.random.default_rng(seed)
     return np.round((30.0, -20.0, 2941.0) + 300.0 * NOISE * rng.standard_normal((n, 3)))
 
 
-def send(driver: Driver, samples: np.ndarray, begin: int = 0) -> None:
+def send(driver, samples, begin=0):
     for k, sample in enumerate(samples.tolist(), begin):
         if k % RATE_HZ == 0:
             driver.temperatures(START_NS + k * CYCLE_NS, 21.0, 21.5)
         driver.counts(START_NS + k * CYCLE_NS, *sample)
 
 
-def logged(folder: Path) -> list[tuple[Start, Rest]]:
+def logged(folder):
     return [one for file in sorted(folder.glob('*.rests')) for one in decode(file.read_bytes())[0]]
 
 
-def finder() -> RestFinder:
+def finder():
     state = (20.0,) * 7
     return RestFinder(np.full(3, 300.0), np.full(3, NOISE**2), 32767.0, lambda: (state, ()))
 
 
-def test_windows_are_means_of_ten_seconds_at_rest() -> None:
+def test_windows_are_means_of_ten_seconds_at_rest():
     # 25 s at rest, 1 s of handling, 21 s at rest in another attitude: two windows, then two.
     first, second = standing(25 * RATE_HZ), standing(21 * RATE_HZ, 2)[:, [2, 1, 0]]
     handled = first[:RATE_HZ] + np.linspace(0.0, 900.0, RATE_HZ)[:, None]
@@ -100,7 +89,7 @@ def test_windows_are_means_of_ten_seconds_at_rest() -> None:
 
 
 @pytest.mark.parametrize('fault', ['moves', 'shakes', 'stuck', 'tilts', 'saturated', 'gap'])
-def test_what_is_no_rest_is_not_kept(fault: str) -> None:
+def test_what_is_no_rest_is_not_kept(fault):
     samples = standing(12 * RATE_HZ)
     stamps = START_NS + np.arange(len(samples)) * CYCLE_NS
     if fault == 'moves':
@@ -118,7 +107,7 @@ def test_what_is_no_rest_is_not_kept(fault: str) -> None:
     assert finder().add(stamps, samples) == []
 
 
-def test_a_rest_that_lasts_a_day_is_kept_ever_more_rarely() -> None:
+def test_a_rest_that_lasts_a_day_is_kept_ever_more_rarely():
     # Ten minutes all 60 windows, then one a minute to the hour, then one in five minutes.
     found, one = 0, finder()
     samples = standing(6 * 60)
@@ -129,7 +118,7 @@ def test_a_rest_that_lasts_a_day_is_kept_ever_more_rarely() -> None:
 
 
 @given(st.integers(0, 2000), st.integers(0, 255))
-def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place: int, value: int) -> None:
+def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
     content = encode(START) + b''.join(encode(rest(k)) for k in range(9))
     whole, n_damaged = decode(content)
     assert n_damaged == 0
@@ -153,7 +142,7 @@ def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place: int, value:
     ),
     st.integers(0, 6),
 )
-def test_a_line_with_a_checksum_may_hold_anything(value: object, place: int) -> None:
+def test_a_line_with_a_checksum_may_hold_anything(value, place):
     good = json.loads(encode(rest(0))[9:])
     for data in (value, [*good[:place], value, *good[place + 1 :]]):
         text = json.dumps(data).encode()
@@ -164,7 +153,7 @@ def test_a_line_with_a_checksum_may_hold_anything(value: object, place: int) -> 
             assert (len(one.mean), len(one.sd), len(one.state)) == (3, 3, 9)
 
 
-def test_thinning_halves_the_rests_and_keeps_each_start() -> None:
+def test_thinning_halves_the_rests_and_keeps_each_start():
     starts = [replace(START, start_ns=START_NS + k) for k in range(3)]
     lines = [encode(one) + b''.join(map(encode, map(rest, range(5)))) for one in starts]
     content = thinned(b''.join(lines))
@@ -175,9 +164,7 @@ def test_thinning_halves_the_rests_and_keeps_each_start() -> None:
     assert [start for start, _ in decode(content)[0]] == starts
 
 
-def test_a_log_is_bounded_by_day_and_in_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_is_bounded_by_day_and_in_all(tmp_path, monkeypatch):
     monkeypatch.setattr(rest_log, 'DAY_BYTES', 2000)
     monkeypatch.setattr(rest_log, 'FOLDER_BYTES', 5000)
     monkeypatch.setattr(rest_log, '_FLOOR', 500)
@@ -197,7 +184,7 @@ def test_a_log_is_bounded_by_day_and_in_all(
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')
 
 
-def test_a_full_disk_loses_nothing_silently(small_disk: Path) -> None:
+def test_a_full_disk_loses_nothing_silently(small_disk):
     log = RestLog(str(small_disk))
     for k in range(100):
         log.put(rest(k).stamp_ns, encode(START), encode(rest(k)))
@@ -208,15 +195,13 @@ def test_a_full_disk_loses_nothing_silently(small_disk: Path) -> None:
     assert log.reason == 'No space left on device'
 
 
-def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(
-    tmp_path: Path, unit: Path, peer: Peer
-) -> None:
+def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(tmp_path, unit, peer):
     folder = tmp_path / 'rests'
     samples = standing(200 * RATE_HZ)
     words = node_arguments(unit, f'rest_log:={folder}')
     sent = 0
 
-    def until(condition: Callable[[], bool], what: str) -> None:
+    def until(condition, what):
         """Send second after second: the first may come before both ends know each other."""
         nonlocal sent
         pause = threading.Event()
@@ -243,7 +228,7 @@ def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(
         peer.join(node)
         until(lambda: len(logged(folder)) > len(before), 'a rest of the second start')
 
-        def told() -> bool:
+        def told():
             values = {one.key: one.value for a in heard[-1:] for one in a.status[0].values}
             return values.get('rests gathered') == str(len(logged(folder)))
 
@@ -259,14 +244,14 @@ def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(
     assert {start.serial for start, _ in found} == {'T-1'}
 
 
-def test_the_diagnostics_warn_of_a_full_disk(small_disk: Path, unit: Path, peer: Peer) -> None:
+def test_the_diagnostics_warn_of_a_full_disk(small_disk, unit, peer):
     (small_disk / 'other').write_bytes(bytes(1 << 13)[: 1 << 12])
     with node_in_thread(*node_arguments(unit, f'rest_log:={small_disk}')) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         driver = drive(peer, node)
         send(driver, standing(12 * RATE_HZ))
 
-        def warned() -> bool:
+        def warned():
             return any(
                 'not kept in the rest log: No space left on device' in one.status[0].message
                 for one in heard
@@ -275,6 +260,6 @@ def test_the_diagnostics_warn_of_a_full_disk(small_disk: Path, unit: Path, peer:
         peer.wait_for(warned, 'the warning')
 
 
-def test_a_folder_that_cannot_be_made_is_refused(unit: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_refused(unit):
     with pytest.raises(OutputError, match='rests: parameter `rest_log`: Not a directory'):
         RestLog(f'{unit}/rests')

@@ -4,10 +4,8 @@
 Plain values to dataclasses: every type hint accepts its values and refuses others by the key.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pytest
 from hypothesis import given
@@ -45,7 +43,7 @@ class Drawing:
     is_hidden: bool = False
     frame: Circle = field(default_factory=lambda: Circle(1.0))
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         if self.corner[0] > self.corner[1]:
             raise ValueError('`corner[1]` must be at least corner[0]')
         if self.is_hidden and self.colour:
@@ -55,21 +53,18 @@ class Drawing:
 names = st.text(min_size=2, max_size=5)
 lengths = st.floats(1.0, 9.0)
 drawings = st.builds(
-    Drawing,
-    name=names,
+    Drawing, name=names,
     shapes=st.lists(st.builds(Circle, lengths) | st.builds(Square, lengths)).map(tuple),
-    layer=st.integers() | names,
-    is_hidden=st.booleans(),
-    frame=st.builds(Circle, lengths),
-)
+    layer=st.integers() | names, is_hidden=st.booleans(), frame=st.builds(Circle, lengths),
+)  # fmt: skip
 
 
 @given(drawings)
-def test_plain_values_build_the_same_again(drawing: Drawing) -> None:
+def test_plain_values_build_the_same_again(drawing):
     assert build(Drawing, plain(drawing)) == drawing
 
 
-def test_nothing_is_converted_but_integers_to_floats() -> None:
+def test_nothing_is_converted_but_integers_to_floats():
     built = build(Drawing, {'name': 'ab', 'corner': [1, 2], 'layer': '3'})
     assert built == Drawing('ab', corner=(1.0, 2.0), layer='3')
     assert [type(value) for value in built.corner] == [float, float]
@@ -105,7 +100,7 @@ def test_nothing_is_converted_but_integers_to_floats() -> None:
         ({'name': 'ab', 'frame': {'radius': '1'}}, 'frame.radius', "valid number, got '1'"),
     ],
 )
-def test_what_does_not_fit_is_refused(data: Any, key: str, message: str) -> None:
+def test_what_does_not_fit_is_refused(data, key, message):
     with pytest.raises(SchemaError, match=message) as caught:
         build(Drawing, data)
     assert caught.value.key == key

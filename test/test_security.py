@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bytes from outside stay data, and the node opens only the topics and services of the policy."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import pytest
 from builders import calibration
@@ -20,12 +17,12 @@ from thermo_comp.unit.calibration_file import save_calibration
 NODE = 'thermo_comp'
 
 
-def allowed() -> dict[str, set[str]]:
+def allowed():
     """Read the full names in the policy, by permission."""
     root = ET.parse(ROOT / 'config' / 'policy.xml').getroot()  # noqa: S314 - our own file
     (profile,) = root.iter('profile')
     assert (profile.get('ns'), profile.get('node')) == ('/', NODE)
-    found: dict[str, set[str]] = {}
+    found = {}
     for group in profile:
         ((what, verdict),) = group.attrib.items()
         assert verdict == 'ALLOW'
@@ -34,11 +31,11 @@ def allowed() -> dict[str, set[str]]:
     return found
 
 
-def test_the_policy_allows_what_the_node_opens_and_no_more(tmp_path: Path) -> None:
+def test_the_policy_allows_what_the_node_opens_and_no_more(tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from ros_helpers import node_in_thread
 
-    opened: dict[str, set[str]] = {'publish': set(), 'subscribe': set(), 'reply': set()}
+    opened = {'publish': set(), 'subscribe': set(), 'reply': set()}
     for word in ('counts', 'imu'):
         path = tmp_path / f'{word}.yaml'
         unit = Unit('T-1', 'm/s^2', 160.0, 0.01)
@@ -62,7 +59,7 @@ BOMB = '\n'.join(
 )
 
 
-def test_metadata_of_a_bag_is_no_bomb(tmp_path: Path) -> None:
+def test_metadata_of_a_bag_is_no_bomb(tmp_path):
     # WHY: merge keys of aliases multiply: 30 lines of them to 10^28 entries.
     bag = tmp_path / 'bag'
     with BagWriter(bag) as writer:
@@ -73,7 +70,7 @@ def test_metadata_of_a_bag_is_no_bomb(tmp_path: Path) -> None:
         inspect_recording(bag)
 
 
-def test_metadata_of_a_bag_leads_nowhere_else(tmp_path: Path) -> None:
+def test_metadata_of_a_bag_leads_nowhere_else(tmp_path):
     secret = tmp_path / 'secret.mcap'
     with BagWriter(secret) as writer:
         writer.write_temperature('temperature/board', [1], [20.0])

@@ -1,36 +1,35 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A whole test in memory: runs as in a bag, units of every kind, physics of their errors."""
-
-from __future__ import annotations
+"""Programs, whole tests in memory and ready-made units, whose converter loses no charge."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
 from accuracy import corrected_by_truth
 from simulation_helpers import of_part
-from triads import TRIAD_NAMES, SlipEffect, sibling, triad
+from triads import TRIAD_NAMES, SlipEffect, triad, unit_of
 
 from thermo_comp.simulation.campaign import PLAN_NAMES, Position, parse_cyclogram, plan
-from thermo_comp.simulation.drift import FlowEffect, PartHistory
+from thermo_comp.simulation.drift import FlowEffect, PartHistory, drift_of
+from thermo_comp.simulation.presets import UNIT_NAMES, unit_preset
 from thermo_comp.simulation.run import arrays, simulate
-from thermo_comp.simulation.unit import SwitchedLoad, UnitModel
-from thermo_comp.typing import Floats
+from thermo_comp.simulation.unit import SwitchedLoad, balanced, first_charge, rounded
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 10min, 30@1 20min, 24@0.5 10min')
 STATION = Position(PROGRAM, np.array([0.48, -0.6, 0.64]))
 
 
-def _history(temperature: Floats, step: float = 1.0) -> PartHistory:
+def _history(temperature, step=1.0):
     deviation = np.reshape(temperature, (len(temperature), -1))
     nodes = ('a', 'b')[: deviation.shape[1]]
     return PartHistory(nodes, deviation, np.zeros(len(nodes)), step)
 
 
 @pytest.mark.parametrize('kind', ['own-lags', 'switched-load', 'slow-noise', 'convection'])
-def test_a_record_is_the_run_of_a_bag(kind: str) -> None:
+def test_a_record_is_the_run_of_a_bag(kind):
     unit = triad(kind, 1)
     _, record = arrays(unit, [STATION, STATION], 3)
     run = simulate(unit, PROGRAM, STATION.up, rate_hz=4.0, seed=3001, start_ns=0)
@@ -44,7 +43,7 @@ def test_a_record_is_the_run_of_a_bag(kind: str) -> None:
 
 
 @pytest.mark.parametrize('kind', TRIAD_NAMES)
-def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
+def test_a_perfect_model_leaves_the_noise(kind):
     """The floor of every accuracy table: 0.65 ug of |g| over 60 s, 1.12 ug of the vector."""
     unit = triad(kind, 2)
     errors, norms = [], []
@@ -63,38 +62,15 @@ def test_a_perfect_model_leaves_the_noise(kind: str) -> None:
         assert vector == pytest.approx(1.12, abs=0.07)
 
 
-def test_siblings_are_near_and_not_the_same() -> None:
-    unit = triad('between', 1)
-    first, again, second = (sibling(unit, seed) for seed in (1, 1, 2))
-    assert first == again
-    assert first.serial != second.serial
-    for other in (first, second):
-        for name, value in unit.network.capacity.items():
-            assert 0.0 < abs(other.network.capacity[name] / value - 1.0) <= 0.15
-        for was, now in zip(unit.drift, other.drift, strict=True):
-            moved = np.array(now.bias)[np.array(was.bias) != 0.0]
-            base = np.array(was.bias)[np.array(was.bias) != 0.0]
-            assert np.all(np.abs(moved / base - 1.0) <= 0.15)
-            assert np.all(moved != base)
-
-
-def test_plans_are_what_their_names_say() -> None:
+def test_plans_are_what_their_names_say():
     hours = {
         name: sum(p.program.duration_s for p in plan(name, 1)) / 3600.0 for name in PLAN_NAMES
     }
-    assert hours == pytest.approx(
-        {
-            'chamber-18': 171.0,
-            'chamber-9': 27.0,
-            'tumble': 6.0,
-            'tumble-3': 15.0,
-            'tumble-1': 9.0,
-            'held-out': 3 * 26220 / 3600,
-            'centrifuge': 45.0,
-            'rate-table': 45.0,
-        },
-        rel=1e-2,
-    )
+    expected = {
+        'chamber-18': 171.0, 'chamber-9': 27.0, 'tumble': 6.0, 'tumble-3': 15.0, 'tumble-1': 9.0,
+        'held-out': 3 * 26220 / 3600, 'centrifuge': 45.0, 'rate-table': 45.0,
+    }  # fmt: skip
+    assert hours == pytest.approx(expected, rel=1e-2)
     for name in PLAN_NAMES:
         ups = np.array([p.up for p in plan(name, 1)])
         np.testing.assert_allclose(np.linalg.norm(ups, axis=1), 1.0)
@@ -108,7 +84,7 @@ def test_plans_are_what_their_names_say() -> None:
         plan('oven')
 
 
-def test_a_joint_that_slips_goes_round_a_loop() -> None:
+def test_a_joint_that_slips_goes_round_a_loop():
     """Independent of the rate: the way back differs from the way there, and time has no effect."""
     there_and_back = np.concatenate([np.linspace(0, 5, 200), np.linspace(5, 0, 200)])
     for is_gradual in (False, True):
@@ -124,7 +100,7 @@ def test_a_joint_that_slips_goes_round_a_loop() -> None:
         assert twice[-1, 0] == pytest.approx(quick[-1, 0], rel=0.02)
 
 
-def test_a_flow_is_even_and_zero_at_rest() -> None:
+def test_a_flow_is_even_and_zero_at_rest():
     up = np.stack([np.linspace(0, 3, 50), np.zeros(50)], axis=1)
     effect = FlowEffect('a', 'b', 1.25, bias=(1.0, 0.0, 0.0))
     warm, cold = (effect.change(_history(sign * up))[0] for sign in (1.0, -1.0))
@@ -133,7 +109,7 @@ def test_a_flow_is_even_and_zero_at_rest() -> None:
     assert warm[0, 0] == 0.0
 
 
-def test_a_limited_flow_is_a_matter_of_on_and_off() -> None:
+def test_a_limited_flow_is_a_matter_of_on_and_off():
     up = np.stack([np.array([0.0, 0.5, 50.0]), np.full(3, 2.0)], axis=1)
     up[:, 0] += 2.0
     effect = FlowEffect('a', 'b', 2.0, 0.5, True, 1, bias=(1.0, 0.0, 0.0))
@@ -141,12 +117,12 @@ def test_a_limited_flow_is_a_matter_of_on_and_off() -> None:
     np.testing.assert_allclose(bias[:, 0], [0.0, 1.0, 2.0], atol=1e-3)
 
 
-def test_a_switched_load_heats_its_part() -> None:
+def test_a_switched_load_heats_its_part():
     """The warming equals the heat balance of an endless spell, and is zero before it is on."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
-    loaded: UnitModel = replace(unit, load=load)
+    loaded = replace(unit, load=load)
     program = parse_cyclogram('20 16h')
     on, off = (
         simulate(one, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth
@@ -157,3 +133,147 @@ def test_a_switched_load_heats_its_part() -> None:
     # 0.5 W through 0.4 W/K to the case and about 4 W/K to the air.
     to_air = next(link.conductance for link in unit.network.links if link.a == 'air')
     assert warmer[-1] == pytest.approx(0.5 / 0.4 + 0.5 / to_air, rel=1e-6)
+
+
+def test_a_typed_program_is_read_as_written():
+    program = parse_cyclogram('20 30min, 35@0.5 1h; -5.5@1.5\n-5.5 90s, 20')
+    np.testing.assert_allclose(program.temperature_c, [20, 20, 35, 35, -5.5, -5.5, 20])
+    np.testing.assert_allclose(
+        np.diff(program.time_s), [1800, 30 * 60, 3600, 40.5 / 1.5 * 60, 90, 25.5 / 1.5 * 60]
+    )
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('20, 35@', "step 2 '35@' must read TARGET"),
+        ('20@1, 30', "step 1 '20@1' must read"),
+        ('20, 30@0 5min', "step 2 '30@0 5min' must read"),
+        ('20, 30@0.00 5min', r"step 2 '30@0\.00 5min' must read"),
+        ('20, 30 5', "step 2 '30 5' must read"),
+        ('nan', "step 1 'nan' must read"),
+        ('oven', "step 1 'oven' must read"),
+        (' ,\n', 'cyclogram is empty'),
+        ('20', 'a ramp or a soak'),
+        (f'20, {"9" * 400}', 'finite numbers'),
+    ],
+)
+def test_a_typed_program_that_cannot_be_read_is_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse_cyclogram(text)
+
+
+NAMES = (*UNIT_NAMES, *TRIAD_NAMES)
+
+
+def _static(unit, board):
+    """Return bias [ug] and relative scale after endless soaks at board temperatures."""
+    still = []
+    for temperature in board:
+        parts = unit.network.equilibrium(unit.network.air_for('board', float(temperature)))
+        deviation = (parts - unit.origin)[None]
+        history = PartHistory(unit.network.nodes, deviation, unit.origin, 1.0)
+        still.append(drift_of(unit.drift, history))
+    bias, scale = zip(*still, strict=True)
+    return np.concatenate(bias), np.concatenate(scale)
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_constants_hold_at_the_reference(name):
+    unit = unit_of(name, 3)
+    bias, scale = _static(unit, np.array([20.0]))
+    np.testing.assert_allclose(bias, 0.0, atol=1e-9)
+    np.testing.assert_allclose(scale, 0.0, atol=1e-12)
+    np.testing.assert_array_equal(np.triu(unit.M, 1), 0.0)
+    np.testing.assert_array_equal(np.diag(unit.M), 1.0)
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_bare_quartz_has_the_published_slopes(seed):
+    """
+    Q-Flex class: scale slope 68..87 ppm/K from 5 to 35 degC with 0.31 ppm/K^2 of curvature, bias
+    slope 0.3..5 ug/K.
+    """
+    unit = unit_preset('bare-quartz', seed)
+    board = np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5])
+    bias, scale = _static(unit, board)
+    cold, hot = (scale[1] - scale[0]) * 1e6, (scale[6] - scale[5]) * 1e6
+    # Specimens scatter by 1 % of the slope about the published values.
+    np.testing.assert_allclose(cold, 68.0, atol=1.5)
+    np.testing.assert_allclose(hot, 87.0, atol=1.5)
+    curvature = 2.0 * (scale[4] + scale[2] - 2.0 * scale[3]) * 1e6
+    np.testing.assert_allclose(curvature, 0.31, rtol=0.03)
+    slope = np.abs(bias[4] - bias[2])
+    assert np.all((slope > 0.29) & (slope < 5.05))
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_mems_bias_moves_by_hundreds_of_micro_g(seed):
+    bias, _ = _static(unit_preset('mems', seed), np.array([19.5, 20.5]))
+    slope = np.abs(bias[1] - bias[0])
+    assert np.all((slope > 90.0) & (slope < 550.0))
+
+
+def test_specimens_differ_and_return():
+    for name in NAMES:
+        assert unit_of(name, 1) == unit_of(name, 1)
+        assert unit_of(name, 1) != unit_of(name, 2)
+        assert unit_of(name, 1).serial == f'{name}-0001'
+    with pytest.raises(ValueError, match=r"`name` must be one of thermostatted, .*, got 'laser'"):
+        unit_preset('laser')
+
+    # Noise of the reference: 5 ug/sqrt(Hz) over 60 s is 0.65 ug; a count per minute at 10 Hz adds
+    # 0.23.
+
+
+def test_sum_of_counts_is_the_integral_within_one_count(rng):
+    charge = rng.uniform(-3000.0, 3000.0, (200_000, 3))
+    start = first_charge(7)
+    counts, _ = balanced(charge, start)
+    # At every cycle, not only at the end; 1e-6 is the rounding of the float sum here.
+    short = np.cumsum(charge, axis=0) + start / 2.0**40 - np.cumsum(counts, axis=0)
+    assert short.min() > -1e-6
+    assert short.max() < 1.0 + 1e-6
+
+
+def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing():
+    """
+    WHY: a float sum of 1e9 counts has no digits left for the fraction.
+
+    WHAT: integer and fraction are separate, so that a day ends at the exact count.
+    """
+    charge = np.full((400_000, 1), 2978.0 + 1.0 / 3.0)
+    remainder = np.zeros(1, dtype=np.int64)
+    total, n_cycles = 0, 0
+    for _ in range(22):  # 24 h at 100 Hz are 8.64 million cycles
+        counts, remainder = balanced(charge, remainder)
+        total += int(counts.sum())
+        n_cycles += len(counts)
+    exact = n_cycles * Fraction(8935, 3)
+    # The fraction is kept to 2^-40 count: 8.8e6 of them could be off by 8e-6 count.
+    assert abs(total - exact) < 1 + 1e-4
+
+
+def test_blocks_of_any_size_give_the_same_counts(rng):
+    charge = rng.normal(0.0, 2e4, (10_000, 3))
+    start = first_charge(1)
+    whole, last = balanced(charge, start)
+    for size in (1, 7, 999, 10_000):
+        remainder, pieces = start, []
+        for first in range(0, len(charge), size):
+            counts, remainder = balanced(charge[first : first + size], remainder)
+            pieces.append(counts)
+        np.testing.assert_array_equal(np.concatenate(pieces), whole)
+        np.testing.assert_array_equal(remainder, last)
+
+
+def test_output_saturates_at_the_words_ends_and_recovers():
+    charge = np.array([[4e4, -4e4, 0.5], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
+    counts, _ = balanced(charge, np.zeros(3, dtype=np.int64))
+    np.testing.assert_array_equal(counts, [[32767, -32768, 0], [0, 0, 1], [1, 1, 0]])
+
+
+def test_without_a_carry_each_cycle_is_rounded_by_itself():
+    charge = np.full((5, 3), 10.4)
+    counts, _ = rounded(charge, first_charge(0))
+    np.testing.assert_array_equal(counts, 10)

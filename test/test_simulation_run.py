@@ -1,22 +1,22 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The columns of a simulated run depend on its truth and its seeds only."""
+"""Simulated runs: blocks, seeds, noise and temperatures against closed forms and integrators."""
 
-from __future__ import annotations
-
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.signal import welch
 from simulation_helpers import noiseless, of_part, rippled
+from triads import TRIAD_NAMES, unit_of
 
 from thermo_comp.simulation.campaign import Cyclogram, parse_cyclogram, positions
-from thermo_comp.simulation.drift import PartEffect
-from thermo_comp.simulation.presets import unit_preset
-from thermo_comp.simulation.run import START_NS, SimulatedRun, simulate, simulate_blocks
-from thermo_comp.simulation.unit import UnitModel
-from thermo_comp.typing import Floats
+from thermo_comp.simulation.drift import CreepEffect, PartHistory
+from thermo_comp.simulation.network import AIR, Link, ThermalNetwork, ThermalResponse
+from thermo_comp.simulation.presets import UNIT_NAMES, unit_preset
+from thermo_comp.simulation.run import START_NS, simulate, simulate_blocks
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 UP = np.array([0.48, -0.6, 0.64])
@@ -27,17 +27,17 @@ CYCLES = ('cycle_s', 'bias', 'scale')
 
 
 @pytest.fixture(scope='module')
-def unit() -> UnitModel:
+def unit():
     return unit_preset('thermostatted', 4)
 
 
-def _joined(blocks: list[SimulatedRun], name: str, *, is_truth: bool = False) -> Floats:
+def _joined(blocks, name, *, is_truth=False):
     return np.concatenate([getattr(b.truth if is_truth else b, name) for b in blocks])
 
 
 @pytest.mark.parametrize('block_size', [1777, 6000, 10**6])
 @pytest.mark.parametrize('name', ['thermostatted', 'mems'])
-def test_blocks_are_the_whole_bit_for_bit(name: str, block_size: int) -> None:
+def test_blocks_are_the_whole_bit_for_bit(name, block_size):
     options = {'rate_hz': 20.0, 'seed': 9}
     arguments = (unit_preset(name, 1), rippled(SHORT), UP)
     whole = simulate(*arguments, **options)
@@ -54,7 +54,7 @@ def test_blocks_are_the_whole_bit_for_bit(name: str, block_size: int) -> None:
         assert block.board_stamp_ns[-1] <= block.accel_stamp_ns[-1]
 
 
-def test_same_seed_same_bits_other_seed_other_bits(unit: UnitModel) -> None:
+def test_same_seed_same_bits_other_seed_other_bits(unit):
     first, again, other = (simulate(unit, SHORT, UP, seed=seed) for seed in (5, 5, 6))
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(first, column), getattr(again, column))
@@ -63,14 +63,7 @@ def test_same_seed_same_bits_other_seed_other_bits(unit: UnitModel) -> None:
     assert np.any(first.case != other.case)
 
 
-def test_start_stamp_shifts_the_stamps_only(unit: UnitModel) -> None:
-    here, there = (simulate(unit, SHORT, UP, start_ns=s) for s in (START_NS, 123_456_789))
-    for column in COLUMNS:
-        shift = START_NS - 123_456_789 if column.endswith('_ns') else 0
-        np.testing.assert_array_equal(getattr(here, column) - shift, getattr(there, column))
-
-
-def test_stamps_are_the_ends_of_the_cycles(unit: UnitModel) -> None:
+def test_stamps_are_the_ends_of_the_cycles(unit):
     run = simulate(unit, SHORT, UP, rate_hz=300.0)
     assert len(run.counts) == SHORT.duration_s * 300
     assert run.accel_stamp_ns[0] == START_NS + 3_333_333
@@ -80,16 +73,7 @@ def test_stamps_are_the_ends_of_the_cycles(unit: UnitModel) -> None:
     )
 
 
-def test_one_noisy_axis_leaves_the_others_exactly_equal(unit: UnitModel) -> None:
-    quiet = noiseless(unit)
-    noisy = replace(quiet, noise_density=(0.0, 80.0, 0.0))
-    a, b = simulate(quiet, SHORT, UP), simulate(noisy, SHORT, UP)
-    np.testing.assert_array_equal(a.counts[:, [0, 2]], b.counts[:, [0, 2]])
-    assert np.any(a.counts[:, 1] != b.counts[:, 1])
-    np.testing.assert_array_equal(a.board, b.board)
-
-
-def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None:
+def test_an_error_source_more_leaves_the_others_numbers(unit):
     """
     Noise of the thermometer does not change the rest; a drifting bias is added to the same noise.
     """
@@ -107,42 +91,7 @@ def test_an_error_source_more_leaves_the_others_numbers(unit: UnitModel) -> None
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
-def test_axes_permute() -> None:
-    base = replace(
-        noiseless(unit_preset('bare-quartz', 2)),
-        misalignment=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-    )
-    order = [2, 0, 1]
-
-    def turned(value: tuple[float, float, float]) -> tuple[float, float, float]:
-        return value[order[0]], value[order[1]], value[order[2]]
-
-    effect = PartEffect(
-        'magnet', scale=(70.0, 80.0, 90.0), scale_curvature=(0.3, 0.2, 0.1), bias=(1.0, 2.0, 3.0)
-    )
-    permuted = replace(
-        effect,
-        scale=turned(effect.scale),
-        scale_curvature=turned(effect.scale_curvature),
-        bias=turned(effect.bias),
-    )
-    a = replace(base, drift=(effect,))
-    b = replace(
-        base,
-        drift=(permuted,),
-        scale_factor=turned(base.scale_factor),
-        bias_at_reference=turned(base.bias_at_reference),
-    )
-    one, two = simulate(a, SHORT, UP), simulate(b, SHORT, UP[order])
-    np.testing.assert_array_equal(one.truth.bias[:, order], two.truth.bias)
-    np.testing.assert_array_equal(one.truth.scale[:, order], two.truth.scale)
-    # The integrator of each channel starts with a separate charge: sums differ by less than a
-    # count.
-    sums = np.cumsum(one.counts[:, order] - two.counts, axis=0)
-    assert np.abs(sums).max() <= 1
-
-
-def test_counts_follow_the_truth(unit: UnitModel) -> None:
+def test_counts_follow_the_truth(unit):
     """
     Without noise the running sum of the counts equals that of ``bias + K scale inverse(M) f``.
     """
@@ -155,7 +104,7 @@ def test_counts_follow_the_truth(unit: UnitModel) -> None:
     assert np.linalg.norm(truth.specific_force) == pytest.approx(STANDARD_GRAVITY)
 
 
-def test_white_noise_has_its_density(unit: UnitModel) -> None:
+def test_white_noise_has_its_density(unit):
     """
     Second route: Welch's spectrum is flat at ``2 density^2`` (one-sided), and the scatter of
     60 s means is ``density / sqrt(60)``.
@@ -178,7 +127,7 @@ def test_white_noise_has_its_density(unit: UnitModel) -> None:
 
 
 @pytest.mark.parametrize('quantum', [0.0625, 1.0])
-def test_quantised_readings_lie_on_the_lattice(unit: UnitModel, quantum: float) -> None:
+def test_quantised_readings_lie_on_the_lattice(unit, quantum):
     coarse = simulate(unit.with_thermometers(quantum=quantum), DEMO, UP, rate_hz=1.0)
     fine = simulate(unit, DEMO, UP, rate_hz=1.0)
     np.testing.assert_array_equal(coarse.board % quantum, 0.0)
@@ -187,7 +136,7 @@ def test_quantised_readings_lie_on_the_lattice(unit: UnitModel, quantum: float) 
 
 
 @pytest.mark.parametrize('rate_hz', [0.1, 0.7, 10.0])
-def test_thermometers_have_their_rate_and_noise(unit: UnitModel, rate_hz: float) -> None:
+def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
     run = simulate(unit, DEMO, UP, rate_hz=1.0, temperature_rate_hz=rate_hz)
     np.testing.assert_allclose(np.diff(run.case_stamp_ns) * 1e-9, 1.0 / rate_hz, atol=2e-9)
     assert run.case_stamp_ns[0] == START_NS
@@ -205,7 +154,7 @@ def test_thermometers_have_their_rate_and_noise(unit: UnitModel, rate_hz: float)
 @pytest.mark.parametrize(
     ('n', 'least'), [(6, 0.0), (9, 0.4), (12, 0.6), (18, 0.7), (24, 0.8), (26, 1.2), (40, 2.0)]
 )
-def test_positions_tell_the_nine_terms_apart(n: int, least: float) -> None:
+def test_positions_tell_the_nine_terms_apart(n, least):
     """
     Six faces determine the products of axes only by their tilts of a few degrees; nine and more
     positions determine all terms of a quadric (bias, scale, misalignment).
@@ -220,7 +169,7 @@ def test_positions_tell_the_nine_terms_apart(n: int, least: float) -> None:
     assert np.abs(up.sum(axis=0)).max() < 0.1 * n
 
 
-def test_run_refuses_what_cannot_be(unit: UnitModel) -> None:
+def test_run_refuses_what_cannot_be(unit):
     with pytest.raises(ValueError, match='`rate_hz` must be positive, got 0'):
         simulate(unit, SHORT, UP, rate_hz=0.0)
     with pytest.raises(ValueError, match='`temperature_rate_hz` must be positive, got 0'):
@@ -229,3 +178,115 @@ def test_run_refuses_what_cannot_be(unit: UnitModel) -> None:
         simulate(unit, Cyclogram((0.0, 0.5), (20.0, 20.0)), UP, rate_hz=1.0)
     with pytest.raises(ValueError, match='`gravity` must be positive, got nan'):
         simulate(unit, SHORT, UP, gravity=float('nan'))
+
+
+# Both are closed forms, so only rounding differs; temperatures are tens of degrees.
+ROUNDING = 1e-9
+
+
+def response_of(network, time, air):
+    return ThermalResponse(network, np.array(time), np.array(air))
+
+
+def test_two_parts_follow_a_ramp_as_solved_by_hand():
+    """
+    Air - case - board with heat flow back: eigenvalues from the quadratic formula, lags from the
+    heat balance of an endless ramp, amplitudes from the start at rest.
+    """
+    c0, c1, g0, g1, rate = 700.0, 300.0, 3.0, 0.4, 1.0 / 60.0
+    network = ThermalNetwork(
+        {'case': c0, 'board': c1}, (Link(AIR, 'case', g0), Link('case', 'board', g1))
+    )
+    trace, determinant = -(g0 + g1) / c0 - g1 / c1, g0 * g1 / (c0 * c1)
+    root = math.sqrt(trace * trace - 4.0 * determinant)
+    modes = np.array([(trace + root) / 2.0, (trace - root) / 2.0])
+    # In a ramp the path to the air heats both capacities, the inner path the board's.
+    lag = np.array([(c0 + c1) / g0, (c0 + c1) / g0 + c1 / g1])
+    shapes = np.array([modes + g1 / c1, [g1 / c1, g1 / c1]])
+    amplitude = np.linalg.solve(shapes, lag)
+    time = np.linspace(0.0, 5400.0, 91)
+    decaying = np.exp(np.outer(time, modes)) * amplitude
+    expected = rate * (time[:, None] - lag + decaying @ shapes.T)
+
+    response = response_of(network, [0.0, 5400.0], [0.0, rate * 5400.0])
+    np.testing.assert_allclose(response.temperatures(time), expected, atol=ROUNDING)
+
+
+@pytest.mark.parametrize('name', [*UNIT_NAMES, *TRIAD_NAMES])
+def test_presets_agree_with_a_numerical_integrator(name):
+    unit = unit_of(name, 3)
+    program = parse_cyclogram('demo')
+    response = response_of(unit.network, program.time_s, program.temperature_c)
+    network = unit.network
+    A, b, p = network.system()
+    time = np.linspace(0.0, program.duration_s, 200)
+    states = response.states(time)
+
+    def air(t):
+        return float(np.interp(t, program.time_s, program.temperature_c))
+
+    solved = solve_ivp(
+        lambda t, x: A @ x + b * air(t) + p + network.convection(x, air(t)),
+        (0.0, program.duration_s), states[0], method='LSODA', t_eval=time, rtol=1e-10, atol=1e-10,
+        max_step=60.0,
+    )  # fmt: skip
+    # The integrator steps over the corners of the program, which is its error.
+    np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
+
+
+def test_creep_relaxes_towards_its_part():
+    """The creep after a step of a part lags it by its time constant."""
+    step = np.full((7201, 1), 10.0)
+    step[0] = 0.0
+    history = PartHistory(('case',), step, np.zeros(1), 1.0)
+    bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
+    # The step takes 1 s, 1.4e-4 of the time constant.
+    np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)
+    np.testing.assert_array_equal(scale, 0.0)
+
+
+def test_still_state_obeys_the_heat_balance():
+    """In the steady state all power leaves through the path to the air."""
+    unit = unit_preset('bare-quartz', 5)
+    warm = unit.network.equilibrium(12.0)
+    to_air = next(link for link in unit.network.links if AIR in (link.a, link.b))
+    case = warm[unit.network.nodes.index('case')]
+    assert to_air.conductance * (case - 12.0) == pytest.approx(sum(unit.network.power.values()))
+    response = response_of(unit.network, [0.0, 3600.0], [12.0, 12.0])
+    np.testing.assert_allclose(
+        response.temperatures(np.array([0.0, 1800.0, 3600.0])),
+        np.tile(warm, (3, 1)),
+        atol=ROUNDING,
+    )
+    board = unit.network.nodes.index('board')
+    assert unit.network.equilibrium(unit.network.air_for('board', 20.0))[board] == pytest.approx(
+        20.0
+    )
+
+
+def test_thermostat_holds_its_part_and_spends_what_leaks():
+    unit = unit_preset('thermostatted', 2)
+    network = unit.network
+    heat = network.thermostat
+    oven, head = network.nodes.index('oven'), network.nodes.index('head')
+    for air in (5.0, 20.0, 35.0):
+        still = network.equilibrium(air)
+        assert still[oven] == pytest.approx(heat.set_point)
+        leak = sum(
+            link.conductance * (heat.set_point - still[network.nodes.index(other)])
+            for link in network.links
+            for here, other in ((link.a, link.b), (link.b, link.a))
+            if here == 'oven'
+        )
+        assert network.settled(air)[len(network.nodes)] == pytest.approx(leak)
+    program = parse_cyclogram('fast')
+    response = response_of(network, program.time_s, program.temperature_c)
+    grid = np.arange(0.0, program.duration_s, 30.0)
+    # At 30 K outside and 3 K/min an oven of this class keeps the head within 0.2 K.
+    assert np.ptp(response.temperatures(grid)[:, head]) < 0.2
+
+
+def test_an_oven_refuses_air_that_it_cannot_hold_off():
+    network = unit_preset('thermostatted', 0).network
+    with pytest.raises(ValueError, match=r'air of 5\.\.90 degC needs -.* W of a thermostat'):
+        response_of(network, [0.0, 60.0], [5.0, 90.0])

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rests: none in a flight, with or without a gyroscope; each short rest of a hand-held unit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from position_helpers import START_NS, Imu, ImuBlock
@@ -18,7 +16,7 @@ RATE_HZ = 100.0
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 
 
-def source(accel, gyro=None) -> FitSource:
+def source(accel, gyro=None):
     """Make a bag of samples without thermometers."""
     stamps = START_NS + np.rint(np.arange(len(accel)) * 1e9 / RATE_HZ).astype(np.int64)
     nothing = np.zeros(0)
@@ -28,17 +26,17 @@ def source(accel, gyro=None) -> FitSource:
     return FitSource('log', lambda: [block])
 
 
-def time_of(seconds: float) -> np.ndarray:
+def time_of(seconds):
     return np.arange(round(seconds * RATE_HZ)) / RATE_HZ
 
 
-def ground(rng, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+def ground(rng, seconds):
     n = len(time_of(seconds))
     level = np.array((0.0, 0.0, GRAVITY)) + 3.0 * MG * rng.standard_normal((n, 3))
     return level, np.radians(2.0) + np.radians(0.05) * rng.standard_normal((n, 3))
 
 
-def hover(rng, seconds: float, vibration: float) -> tuple[np.ndarray, np.ndarray]:
+def hover(rng, seconds, vibration):
     """
     Make a flight: thrust of about g, a slow sway by some degrees at some deg/s, and propeller
     vibration.
@@ -95,7 +93,7 @@ def test_a_gyroscope_that_drifts_with_temperature_rests(rng):
     assert bag.n_still_cells == bag.n_cells
 
 
-def by_hand(rng, n_rests: int, rest_s: float, shaky: tuple[int, ...], misalignment: float = 0.0):
+def by_hand(rng, n_rests, rest_s, shaky, misalignment=0.0):
     """Make hand-held rests with turns between; the shaky ones scatter four times as much."""
     ups = positions(n_rests, 4)
     matrix = np.eye(3)

@@ -7,8 +7,6 @@ WHY: serials, topics and metadata of a bag reached the terminal unchanged, with 
 and lines that looked like the program's; a Cyrillic serial ended a command on a latin-1 terminal.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -20,7 +18,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders import rich_calibration
-from conftest import Cli
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -44,7 +41,7 @@ BAD_SERIALS = ('', 'a\nb', 'a\x1b[2J', 'x' * (LONGEST_SERIAL + 1), '\u202e', 'a\
 
 
 @given(st.text())
-def test_one_line_is_one_harmless_line(text: str) -> None:
+def test_one_line_is_one_harmless_line(text):
     shown = one_line(text)
     assert len(shown.splitlines()) <= 1
     assert not {unicodedata.category(c) for c in shown} & {'Cc', 'Cf', 'Cs', 'Zl', 'Zp'}
@@ -54,7 +51,7 @@ def test_one_line_is_one_harmless_line(text: str) -> None:
         assert shown == text
 
 
-def test_an_error_is_one_harmless_line() -> None:
+def test_an_error_is_one_harmless_line():
     # WHY: paths, keys and topics in the node's messages come from outside.
     for error in (
         ThermoCompError(FORGED),
@@ -67,7 +64,7 @@ def test_an_error_is_one_harmless_line() -> None:
 
 
 @pytest.mark.parametrize('serial', BAD_SERIALS)
-def test_what_is_no_serial(serial: str) -> None:
+def test_what_is_no_serial(serial):
     for take in (valid_serial, lambda text: Unit(text, 'counts', 1.0, 0.01)):
         with pytest.raises(ValueError, match='`serial` must be one printable line of 1 to 64'):
             take(serial)
@@ -78,7 +75,7 @@ def test_what_is_no_serial(serial: str) -> None:
 
 
 @pytest.mark.parametrize('serial', ['42', 'Блок 7', 'x' * LONGEST_SERIAL])
-def test_what_is_a_serial(serial: str) -> None:
+def test_what_is_a_serial(serial):
     assert valid_serial(serial) == serial
 
 
@@ -92,9 +89,7 @@ def test_what_is_a_serial(serial: str) -> None:
     ],
     ids=lambda command: command[0],
 )
-def test_a_command_line_with_another_serial(
-    command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_line_with_another_serial(command, capsys):
     assert run([*command, '--serial', FORGED]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('thermo_comp: error: ')
@@ -102,7 +97,7 @@ def test_a_command_line_with_another_serial(
 
 
 @pytest.fixture
-def forged(tmp_path: Path) -> Path:
+def forged(tmp_path):
     path = tmp_path / 'forged.mcap'
     stamps = np.arange(60) * 10**9
     with BagWriter(path, metadata={'serial': FORGED, 'converted_from': FORGED}) as bag:
@@ -112,9 +107,7 @@ def forged(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_recording_forges_no_line(
-    forged: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_forges_no_line(forged, tmp_path, capfd):
     save_calibration(rich_calibration(), tmp_path / 'unit.yaml')
     unit = ('-c', str(tmp_path / 'unit.yaml'))
     out = ('-o', str(tmp_path / 'out.yaml'))
@@ -137,9 +130,7 @@ def test_a_recording_forges_no_line(
 
 
 @pytest.mark.parametrize('encoding', ['latin-1', 'ascii', 'utf-8'])
-def test_any_terminal_can_show_it(
-    tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch, encoding: str
-) -> None:
+def test_any_terminal_can_show_it(tmp_path, cli, monkeypatch, encoding):
     calibration = rich_calibration()
     unit = replace(calibration.unit, serial='Блок')
     save_calibration(replace(calibration, unit=unit), tmp_path / 'unit.yaml')
@@ -160,10 +151,8 @@ def test_any_terminal_can_show_it(
     assert r'no\udcff.mcap: ' in absent.stderr
 
 
-def test_what_nobody_has_foreseen(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def fail(*_: object) -> None:
+def test_what_nobody_has_foreseen(tmp_path, monkeypatch, capsys):
+    def fail(*_):
         raise RuntimeError('boom\nand more')
 
     monkeypatch.setattr('thermo_comp.recording.overview.survey_recording', fail)

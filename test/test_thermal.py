@@ -119,16 +119,3 @@ def test_lost_case_is_replaced_by_the_boards_rate():
     # Lag times rate, the closed form of a first-order lag in a ramp.
     assert state[GRADIENT] == pytest.approx(600.0 * 0.01, abs=0.1)
     assert math.sqrt(state[VAR_GRADIENT]) >= LOST_GRADIENT_RELATIVE_SD * 5.9
-
-
-@pytest.mark.parametrize(
-    ('values', 'message'),
-    [
-        ({'transition_time_s': -1.0}, '`transition_time_s` must be zero or positive and finite'),
-        ({'transition_time_s': math.nan}, '`transition_time_s`'),
-        ({'case_timeout_s': 0.0}, '`case_timeout_s` must be positive'),
-    ],
-)
-def test_config_refusals(values, message):
-    with pytest.raises(ValueError, match=message):
-        ThermalConfig(**values)

@@ -17,43 +17,28 @@ from thermo_comp.thermal.thermometer import Thermometer, correct, mix, predict
 
 SOAK_S, RAMP_S = 1800.0, 2400.0
 SENSORS = {
-    '1 mK': (0.001, 0.0, 1.0),
-    '10 mK': (0.01, 0.0, 1.0),
-    '10 mK, 0.1 Hz': (0.01, 0.0, 10.0),
-    '10 mK, 10 Hz': (0.01, 0.0, 0.1),
-    '1 mK, 62.5 mK steps': (0.001, 0.0625, 1.0),
-    '10 mK, 62.5 mK steps': (0.01, 0.0625, 1.0),
-    '10 mK, 1 K steps': (0.01, 1.0, 1.0),
-}
+    '1 mK': (0.001, 0.0, 1.0), '10 mK': (0.01, 0.0, 1.0), '10 mK, 0.1 Hz': (0.01, 0.0, 10.0),
+    '10 mK, 10 Hz': (0.01, 0.0, 0.1), '1 mK, 62.5 mK steps': (0.001, 0.0625, 1.0),
+    '10 mK, 62.5 mK steps': (0.01, 0.0625, 1.0), '10 mK, 1 K steps': (0.01, 1.0, 1.0),
+}  # fmt: skip
 
 
 def run(thermometer, t, readings):
     """Temperature, rate and their variances after each reading, shape (n, 4)."""
-    rows = []
-    for stamp_ns, reading in zip(
-        np.round(t * 1e9).astype(np.int64).tolist(), readings.tolist(), strict=True
-    ):
+    names, rows = ('temperature', 'rate', 'var_temperature', 'var_rate'), []
+    stamps = np.round(t * 1e9).astype(np.int64)
+    for stamp_ns, reading in zip(stamps.tolist(), readings.tolist(), strict=True):
         thermometer.update(stamp_ns, reading)
-        rows.append(
-            (
-                thermometer.temperature,
-                thermometer.rate,
-                thermometer.var_temperature,
-                thermometer.var_rate,
-            )
-        )
+        rows.append([getattr(thermometer, name) for name in names])
     return np.array(rows)
 
 
 def state(thermometer):
     return (
-        thermometer.temperature,
-        thermometer.rate,
-        thermometer.acceleration,
-        thermometer.var_temperature,
-        thermometer.var_rate,
+        thermometer.temperature, thermometer.rate, thermometer.acceleration,
+        thermometer.var_temperature, thermometer.var_rate,
         thermometer.at((thermometer.stamp_ns or 0) + SECOND_NS),
-    )
+    )  # fmt: skip
 
 
 def settled(noise=0.001, n=600, **changes):
@@ -91,12 +76,9 @@ def errors():
 
 
 PARTS = {
-    'soak': (-0.5 * SOAK_S, 0.0),
-    'onset': (0.0, 300.0),
-    'ramp': (600.0, RAMP_S),
-    'end': (RAMP_S, RAMP_S + 600.0),
-    'late': (RAMP_S + 600.0, RAMP_S + 3600.0),
-}
+    'soak': (-0.5 * SOAK_S, 0.0), 'onset': (0.0, 300.0), 'ramp': (600.0, RAMP_S),
+    'end': (RAMP_S, RAMP_S + 600.0), 'late': (RAMP_S + 600.0, RAMP_S + 3600.0),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize('part', PARTS)
@@ -134,14 +116,6 @@ def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
     assert 60.0 * math.sqrt(np.mean(rows[:, 2])) < rate_k_min
-
-
-def test_cells_beat_taking_the_reading_for_the_temperature(errors):
-    # A staircase of 62.5 mK has an error of 18 mK RMS; edges locate the temperature ten times
-    # better.
-    rows = errors['1 mK, 62.5 mK steps']
-    rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
-    assert math.sqrt(np.mean(rows[:, 1])) < 0.0625 / math.sqrt(12.0) / 5.0
 
 
 def test_a_crossed_edge_locates_the_temperature():
@@ -239,33 +213,16 @@ def test_a_blend_has_the_moments_of_the_mixture():
     np.testing.assert_allclose(out[3:], np.cov(mixed.T)[upper], atol=0.1)
 
 
-@pytest.mark.parametrize('reading', [math.nan, math.inf, -math.inf])
-def test_what_is_no_number_changes_nothing(reading):
+@pytest.mark.parametrize(
+    ('stamp_s', 'reading'),
+    [(700, math.nan), (700, math.inf), (700, -math.inf), (599, 20.0), (300, 20.0), (-5, 20.0)],
+)
+def test_what_is_no_number_or_not_newer_changes_nothing(stamp_s, reading):
     thermometer = settled()
     before = state(thermometer)
-    assert not thermometer.update(700 * SECOND_NS, reading)
+    assert not thermometer.update(stamp_s * SECOND_NS, reading)
     assert state(thermometer) == before
     assert thermometer.n_in_row == 600
-
-
-@pytest.mark.parametrize('stamp_s', [599, 300, -5])
-def test_a_reading_that_is_not_newer_changes_nothing(stamp_s):
-    thermometer = settled()
-    before = state(thermometer)
-    assert not thermometer.update(stamp_s * SECOND_NS, 20.0)
-    assert state(thermometer) == before
-    assert thermometer.n_in_row == 600
-
-
-def test_a_single_jump_of_40_degrees_is_not_believed():
-    thermometer = settled()
-    before = thermometer.temperature
-    assert not thermometer.update(600 * SECOND_NS, 60.0)
-    assert thermometer.temperature == before
-    assert thermometer.update(601 * SECOND_NS, 20.0)
-    # The noise of one reading, 1 mK, is the scale of a possible change.
-    assert thermometer.temperature == pytest.approx(20.0, abs=0.002)
-    assert (thermometer.n_in_row, thermometer.n_restarts) == (601, 0)
 
 
 def test_a_small_jump_counts_less_than_a_reading():
@@ -315,10 +272,6 @@ def test_noise_declared_too_small_is_learnt():
     assert np.mean((out[1000:, 0] - 20.0) ** 2 / out[1000:, 2]) < 2.0
 
 
-def test_noise_declared_rightly_stays():
-    assert math.sqrt(settled(0.005, 4000)._noise_scale) == pytest.approx(1.0, abs=0.15)
-
-
 def test_a_frozen_sensor_shows_by_its_last_change():
     thermometer = settled()
     for k in range(600, 700):
@@ -347,36 +300,14 @@ def test_extrapolation_is_linear_then_held():
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 
 
-def test_before_the_first_reading_there_is_nothing():
-    thermometer = Thermometer(ThermometerSettings())
-    temperature, rate, variance = thermometer.at(0)
-    assert math.isnan(temperature)
-    assert math.isnan(rate)
-    assert variance == math.inf
-    assert thermometer.stamp_ns is None
-    assert not thermometer.is_ready
-
-
 def test_one_reading_is_a_temperature_without_a_rate():
     thermometer = Thermometer(ThermometerSettings(0.01))
+    nothing = thermometer.at(0)
+    assert np.isnan(nothing[:2]).all()
+    assert (nothing[2], thermometer.stamp_ns, thermometer.is_ready) == (math.inf, None, False)
     assert thermometer.update(5, 21.0)
     assert thermometer.at(10**9) == (21.0, 0.0, 0.01**2)
     assert not thermometer.is_ready
-
-
-@pytest.mark.parametrize('quantum', [0.0, 0.0625])
-def test_bits_do_not_depend_on_the_origin_of_time(quantum):
-    rng = np.random.default_rng(9)
-    t = np.cumsum(rng.uniform(0.5, 1.5, 500))
-    readings = read(20.0 + 0.002 * t, 0.01, quantum, rng)
-    stamps = np.round(t * 1e9).astype(np.int64)
-    states = []
-    for origin in (0, 1_800_000_000_123_456_789):
-        thermometer = Thermometer(ThermometerSettings(0.01, quantum))
-        for stamp_ns, reading in zip(stamps.tolist(), readings.tolist(), strict=True):
-            thermometer.update(stamp_ns + origin, reading)
-        states.append(state(thermometer))
-    assert states[0] == states[1]
 
 
 def test_reset_forgets_the_readings():
@@ -409,18 +340,3 @@ def test_any_readings_leave_a_valid_estimate(quantum, rows):
         assert 0.0 < thermometer.var_rate < math.inf
         assert 0.0 < thermometer.acceleration[1] < math.inf
         assert thermometer.at(stamp_ns + 10**8)[2] > 0.0
-
-
-@pytest.mark.parametrize(
-    ('changes', 'text'),
-    [
-        ({'noise_sd_c': 0.0}, '`noise_sd_c` must be positive and finite, got 0.0'),
-        ({'noise_sd_c': math.nan}, '`noise_sd_c` must be positive and finite, got nan'),
-        ({'fastest_ramp_k_min': -1.0}, '`fastest_ramp_k_min` must be positive and finite, got -1'),
-        ({'lag_s': math.inf}, '`lag_s` must be positive and finite, got inf'),
-        ({'quantum_c': -0.1}, '`quantum_c` must be zero or positive and finite, got -0.1'),
-    ],
-)
-def test_settings_refuse_what_no_sensor_has(changes, text):
-    with pytest.raises(ValueError, match=text):
-        ThermometerSettings(**changes)

@@ -7,11 +7,8 @@ The electronics under the lid are switched at random, which board and case do no
 only the lid's thermometer explains the effect on the axes.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,9 +25,8 @@ from thermo_comp.simulation.campaign import parse_cyclogram, positions
 from thermo_comp.simulation.drift import PartEffect
 from thermo_comp.simulation.network import AIR, Link, ThermalNetwork
 from thermo_comp.simulation.presets import unit_preset
-from thermo_comp.simulation.run import SimulatedRun, simulate
-from thermo_comp.simulation.unit import SwitchedLoad, UnitModel
-from thermo_comp.unit.calibration import Calibration
+from thermo_comp.simulation.run import simulate
+from thermo_comp.simulation.unit import SwitchedLoad
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
@@ -41,7 +37,7 @@ LID_UG_K = (12.0, -9.0, 15.0)
 LOAD_K = 5.0
 
 
-def unit_with_a_lid() -> UnitModel:
+def unit_with_a_lid():
     network = ThermalNetwork(
         {'case': 800.0, 'board': 120.0, 'lid': 60.0},
         (Link(AIR, 'case', 4.0), Link('case', 'board', 0.4), Link('case', 'lid', 0.1)),
@@ -55,7 +51,7 @@ def unit_with_a_lid() -> UnitModel:
     )
 
 
-def record(path: Path, run: SimulatedRun) -> Path:
+def record(path, run):
     truth, rng = run.truth, np.random.default_rng(7)
     with BagWriter(path, metadata={'serial': truth.unit.serial}) as bag:
         bag.write_temperature('temperature/board', run.board_stamp_ns, run.board)
@@ -68,7 +64,7 @@ def record(path: Path, run: SimulatedRun) -> Path:
     return path
 
 
-def fitted(bags: list[Path]) -> Calibration:
+def fitted(bags):
     sources, _ = fit_sources(bags)
     # The effect follows the present temperature of the lid; these columns are a sixth of the bank.
     groups = ('curve', 'gradient', 'board')
@@ -76,7 +72,7 @@ def fitted(bags: list[Path]) -> Calibration:
 
 
 @pytest.fixture(scope='module')
-def runs() -> list[SimulatedRun]:
+def runs():
     unit = unit_with_a_lid()
     return [
         simulate(unit, PROGRAM, up, rate_hz=2.0, temperature_rate_hz=0.5, seed=number)
@@ -84,9 +80,7 @@ def runs() -> list[SimulatedRun]:
     ]
 
 
-def test_a_third_thermometer_explains_what_the_others_do_not_see(
-    runs: list[SimulatedRun], tmp_path: Path
-) -> None:
+def test_a_third_thermometer_explains_what_the_others_do_not_see(runs, tmp_path):
     *bags, held_out = (record(tmp_path / f'{k}.mcap', run) for k, run in enumerate(runs))
     save_calibration(fitted(bags), tmp_path / 'unit.yaml')
     calibration = load_calibration(tmp_path / 'unit.yaml')
@@ -113,7 +107,6 @@ def test_a_third_thermometer_explains_what_the_others_do_not_see(
         means = error[use][:n].reshape(-1, 120, 3).mean(axis=1)
         errors[sees_lid] = float(np.sqrt(np.mean(np.var(means, axis=0)))) / MICRO_G
         judged = evaluate([held_out], [('unit', one)]).judgements['unit']
-        assert judged is not None
         norms = np.linalg.norm(judged.windows.force, axis=1)
         spreads[sees_lid] = float(np.std(norms)) / MICRO_G
     # RMS effect of the switched load on the axes.
