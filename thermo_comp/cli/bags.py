@@ -3,8 +3,9 @@
 """Owns the commands for a single bag: ``info`` (also for a calibration), ``replay``, ``play``."""
 
 from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -12,8 +13,11 @@ from ..files import bag_kind, check_output
 from ..online.status import DROPPED, CompensatorConfig
 from ..text import counted
 from . import shared_options as options
-from .output import Output, micro_g, picked
+from .output import Cell, Output, micro_g, picked
 from .shared_options import argument, option
+
+if TYPE_CHECKING:
+    from ..unit.calibration import Calibration
 
 _BAG = argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
 _AS_THE_NODE = 'As the parameter of the node, in s.'
@@ -28,7 +32,7 @@ def info(
     Describe a bag or a calibration.
 
     Bag: topics, rate, temperature span and ramps, gaps, and whether a fit
-    can use it. Calibration: unit, ranges, sets, residuals.
+    can use it. Calibration: unit, ranges, sets, residuals, nonlinear terms.
 
     Example:
       thermo_comp info chamber.mcap
@@ -121,8 +125,30 @@ def _calibration(out: Output, path: Path) -> None:
                 for n in provenance.residuals
             ],
         )
+    tell_nonlinearity(out, calibration)
     out.points(provenance.notes)
     out.end(path=path, calibration=calibration)
+
+
+def tell_nonlinearity(out: Output, calibration: 'Calibration') -> None:
+    """Print the nonlinear terms, if rests of a fit were not all at 1 g."""
+    from ..unit.prediction import nonlinear_coefficients
+
+    if calibration.nonlinearity is None:
+        return
+    rows: list[tuple[Cell, ...]] = []
+    for one in nonlinear_coefficients(calibration):
+        axes = zip(one.value.tolist(), one.sd.tolist(), strict=True)
+        said = [f'{value:.4g}' + f' +- {sd:.2g}' * isfinite(sd) for value, sd in axes]
+        rows.append((one.name, one.unit, *said))
+    terms = calibration.nonlinearity.terms
+    losses = ', '.join(f'{one.kind} {one.log_evidence_change:.1f}' for one in terms) or 'no term'
+    low, high = calibration.nonlinearity.force_range_m_s2
+    out.table(
+        ('coefficient', 'unit', 'x', 'y', 'z'),
+        rows,
+        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; log evidence: {losses}',
+    )
 
 
 def replay(

@@ -13,6 +13,7 @@ import typer
 from ..files import CALIBRATION, PAGE, check_output
 from ..text import counted
 from . import shared_options as options
+from .bags import tell_nonlinearity
 from .convert import flags_named, tell_guess
 from .output import Cell, Output, micro_g, millidegrees, picked
 from .shared_options import argument, option
@@ -142,7 +143,8 @@ def prior(
     Make the prior of a type of unit from calibrations of several units.
 
     The prior is the mean and scatter of the calibrations. With `fit --prior`
-    a further unit of the type needs less time in the chamber.
+    a further unit of the type needs less time in the chamber. Nonlinear terms
+    (K2, K3) of the calibrations are left out.
 
     Example:
       thermo_comp prior unit01.yaml unit02.yaml unit03.yaml -o type.yaml
@@ -155,27 +157,10 @@ def prior(
     found = population(units)
     save_calibration(found, output, overwrite=force)
     out.line(f'{output}: what {len(units)} units have in common, {len(found.response)} columns')
+    bent = [one.unit.serial for one in units if one.nonlinearity and one.nonlinearity.terms]
+    if bent:
+        out.line(f'- the prior leaves out the nonlinear terms (K2, K3) of {", ".join(bent)}')
     out.end(output=output, units=[one.unit.serial for one in units])
-
-
-def _say_terms(out: Output, calibration: Any) -> None:
-    """Print the nonlinear terms, if the fit had any to look for."""
-    from ..unit.prediction import nonlinear_coefficients
-
-    if calibration.nonlinearity is None:
-        return
-    rows: list[tuple[Cell, ...]] = []
-    for one in nonlinear_coefficients(calibration):
-        pairs = zip(one.value.tolist(), one.sd.tolist(), strict=True)
-        rows.append((one.name, one.unit, *(f'{value:.4g} +- {sd:.2g}' for value, sd in pairs)))
-    terms = calibration.nonlinearity.terms
-    losses = ', '.join(f'{one.kind} {one.log_evidence_change:.1f}' for one in terms) or 'no term'
-    low, high = calibration.nonlinearity.force_range_m_s2
-    out.table(
-        ('coefficient', 'unit', 'x', 'y', 'z'),
-        rows,
-        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; log evidence: {losses}',
-    )
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -220,7 +205,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
             ],
             title='groups kept; log evidence: its loss if the group is removed',
         )
-    _say_terms(out, calibration)
+    tell_nonlinearity(out, calibration)
     white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
     walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
     out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')
