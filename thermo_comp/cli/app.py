@@ -22,7 +22,7 @@ from typer import rich_utils
 from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
-from . import bags, convert, demo, field, fit, fleet, judge, output, record, simulate
+from . import bags, convert, field, fit, fleet, judge, output, record, simulate
 from .shared_options import expanded, option
 
 # Base class of all errors in a command line, which typer does not export.
@@ -62,7 +62,7 @@ def _top(
 for _command in (
     *(record.record, fit.fit, fit.prior, judge.evaluate, bags.replay, bags.play, bags.info),
     *(field.update, judge.report, convert.convert, convert.export, convert.import_),
-    *(simulate.simulate, demo.demo),
+    simulate.simulate,
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))
 _fleet = typer.Typer(name='fleet', help='Fit many units, and compare them.')

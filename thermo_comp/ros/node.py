@@ -12,9 +12,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 
 import rclpy
@@ -198,25 +196,6 @@ class CompensationNode:
         loaded = self._relay.running.loaded
         serial = loaded.calibration.unit.serial
         self._log.info(f'unit {serial}: {loaded.path} ({loaded.sha256[:12]})')
-
-
-@contextmanager
-def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
-    """Run the node in a thread of this process, in a separate context."""
-    context = rclpy.context.Context()
-    rclpy.init(args=['--ros-args', *ros_args], context=context)
-    try:
-        node = CompensationNode(context)
-        thread = threading.Thread(target=node.run, daemon=True)
-        thread.start()
-        try:
-            yield node
-        finally:
-            node.stop()
-            thread.join()
-            node.close()
-    finally:
-        context.try_shutdown()
 
 
 def main(args: list[str] | None = None) -> int:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -31,10 +31,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from ..errors import ThermoCompError
-from ..recording.blocks import ROLES, Block, RecordingInfo, Role
+from ..recording.blocks import Block, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics
-from ..topics import FLAGS, IMU_OUT, SAMPLES, TEMPERATURE, thermometer
+from ..topics import SAMPLES, TEMPERATURE, thermometer
 from .messages import message_class
 from .waitloop import own_node, wait_until
 
@@ -178,18 +178,6 @@ class Player:
         if not wait_until(is_done, PATIENCE, ACKNOWLEDGEMENT_NAP):
             name = publisher.topic_name
             raise ThermoCompError(f'{name}: a subscriber acknowledged nothing for {PATIENCE:g} s')
-
-
-def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> list[str]:
-    """Return ROS arguments under which a node loses no message, at the price of latency."""
-    inputs = [*(one.name for one in SAMPLES.values()), *map(thermometer, thermometers)]
-    overrides = [
-        *(f'{topic}.subscription.reliability:=reliable' for topic in inputs),
-        *(f'{topic}.subscription.history:=keep_all' for topic in inputs),
-        f'{IMU_OUT.name}.publisher.history:=keep_all',
-        *(f'{flag.name}.publisher.depth:=1000' for flag in FLAGS),
-    ]
-    return [word for one in overrides for word in ('-p', f'qos_overrides.{namespace}/{one}')]
 
 
 def _in_order(block: Block) -> list[tuple[float, int, Role, bytes]]:
