@@ -10,13 +10,14 @@ and temperature range (bias, curves, weights and their deviations) are in `unit.
 
 from __future__ import annotations
 
+import math
 import operator
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 from .text import counted
 
@@ -121,6 +122,8 @@ _PREPARED: dict[str, Bounds] = {
     'knots': Bounds(longest=100, why='ten per ten kelvins'),
     'columns': Bounds(longest=2000, why='all columns of ten thermometers'),
 }
+Positive = Annotated[float, Bounds(above=0.0, below=math.inf)]
+NotNegative = Annotated[float, Bounds(at_least=0.0, below=math.inf)]
 #: Bounds by the name of the quantity; the keys of a calibration refer to them.
 QUANTITIES: Final[Mapping[str, Bounds]] = MappingProxyType(_PREPARED)
 

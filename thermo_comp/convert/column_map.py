@@ -20,11 +20,11 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..plain_yaml import read_plain_yaml
-from ..quantities import Bounds
+from ..quantities import Bounds, Positive
 from ..recording.blocks import Readings
 from ..recording.topics import is_thermometer
 from ..typing import Floats
-from ..unit.schema import Positive, SchemaError, build
+from ..unit.schema import SchemaError, build
 from .headings import read_headings
 from .log import NO_STAMP, ForeignLog, Unit, believed_unit, find_stillness
 from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, read_parquet, read_text

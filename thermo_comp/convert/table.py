@@ -29,8 +29,8 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..files import open_regular
+from ..quantities import NotNegative, Positive
 from ..typing import Floats, Ints
-from ..unit.schema import NotNegative, Positive
 from .log import NO_STAMP, library
 
 Column = str | int

@@ -11,8 +11,8 @@ from typing import Annotated
 
 from ..errors import ThermoCompError
 from ..plain_yaml import read_plain_yaml
-from ..quantities import Bounds
-from ..unit.schema import NotNegative, SchemaError, build
+from ..quantities import Bounds, NotNegative
+from ..unit.schema import SchemaError, build
 
 Text = Annotated[str, Bounds(longest=500)]
 

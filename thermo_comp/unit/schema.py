@@ -39,8 +39,6 @@ class SchemaError(ValueError):
         super().__init__(f'{key}: {message}' if key else message)
 
 
-Positive = Annotated[float, Bounds(above=0.0)]
-NotNegative = Annotated[float, Bounds(at_least=0.0)]
 #: Three numbers, for x, y, z.
 Vector = tuple[float, float, float]
 
