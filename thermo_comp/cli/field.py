@@ -4,11 +4,10 @@
 
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 from ..files import CALIBRATION, check_output
 from . import shared_options as options
-from .output import Output, micro, micro_g
+from .output import Output, micro, micro_g, picked
 from .shared_options import argument, option
 
 #: Exit code of an update that gains nothing.
@@ -72,16 +71,14 @@ def update(
         out.line(f'{output}: written')
     else:
         out.line(f'nothing gained: {output} is not written, keep {calibration}')
-    facts: dict[str, Any] = {
-        'output': output if is_better else None,
-        'moved': result.moved,
-        'ageing_m_s2': result.ageing,
-        'changes': result.changes,
-        'judged': result.judged,
-        'is_better': is_better,
-        'notes': [*notes, *what_moved(result)],
-    }
-    out.end(0 if is_better else NOTHING_GAINED, **facts)
+    out.end(
+        0 if is_better else NOTHING_GAINED,
+        output=output if is_better else None,
+        **picked(result, 'moved changes judged'),
+        ageing_m_s2=result.ageing,
+        is_better=is_better,
+        notes=[*notes, *what_moved(result)],
+    )
 
 
 def evaluate_rests(
@@ -117,9 +114,7 @@ def evaluate_rests(
     out.line(str(result))
     out.end(
         result.exit_code,
-        days=result.days,
-        temperatures=result.temperatures,
-        left=result.left,
+        **picked(result, 'days temperatures left'),
         forecast_days=result.forecast,
         interval_days=result.interval,
         ageing_m_s2=result.ageing,

@@ -22,9 +22,13 @@ if TYPE_CHECKING:
     from ..convert.log import ForeignLog
     from ..fitting import FitResult
     from ..fitting.selection import Trial
+    from ..unit.calibration import Calibration
+    from ..unit.rate_bias import Gyroscope
 
 #: Largest width of a model in a table [characters].
 _MODEL_WIDTH = 46
+#: Properties of a gyroscope that are printed.
+_RATES = 'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h'
 Curve = Literal['linear', 'quadratic', 'cubic', 'spline', 'exponential']
 
 
@@ -175,69 +179,16 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
 
     calibration = result.calibration
     gyroscope = calibration.gyroscope if result.rates else None
-    rates = 'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h'
     model, left_out = calibration.provenance.model, result.residuals[-1].left_out
-    if verbose:
-        out.table(
-            ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', 'in sample ug', 'left out ug'),
-            [
-                (
-                    one.source,
-                    time.strftime('%m-%d %H:%M:%S', time.gmtime(one.start_ns // 10**9)),
-                    f'{one.duration_s / 60.0:.1f}',
-                    *(f'{component:+.3f}' for component in one.up),
-                    *(micro_g(one.residual_rms), micro_g(one.left_out_rms)),
-                )
-                for one in result.positions
-            ],
-            title='positions at rest',
-        )
-    _say_models(out, result.selected.trials)
-    if calibration.evidence:
-        out.table(
-            ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
-            [
-                (
-                    *(one.group, one.part, micro_g(one.explains_m_s2)),
-                    *(f'{one.effective_parameters:.1f}', f'{one.log_evidence_change:.1f}'),
-                )
-                for one in calibration.evidence
-            ],
-            title='groups kept; log evidence: its loss if the group is removed',
-        )
-    tell_nonlinearity(out, calibration)
-    white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
-    walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
-    out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')
-    steps = {'raw': 'raw', 'one_set': 'one set', 'two_sets': 'two sets', 'fitted': model}
-    out.table(
-        ('section', 'windows', *steps.values(), 'left out'),
-        _steps(result.residuals, (*steps, 'left_out'), micro_g),
-        title='|f| - g at rest, RMS in ug',
-    )
     n_positions = len(distinct_directions(np.array([one.up for one in result.positions])))
-    if not left_out.n:
-        out.line('left out: no error, as the fit needs all of the data')
-    elif n_positions == 1:
-        out.line('left out: drift of an axis in parts of the program that took no part in the fit')
-    else:
-        out.line(
-            'left out: on data that took no part in the fit; drift of an axis where the other '
-            'positions do not determine |f|'
-        )
+    if verbose:
+        _say_positions(out, result)
+    _say_models(out, result.selected.trials)
+    _say_groups(out, calibration)
+    tell_nonlinearity(out, calibration)
+    _say_residuals(out, result, n_positions)
     if gyroscope is not None:
-        out.table(
-            ('section', 'windows', 'raw', 'fitted', 'left out'),
-            _steps(result.rates, ('raw', 'fitted', 'left_out'), millidegrees, axes=3),
-            title='angular rate at rest less the mean of each position, RMS of an axis in mdeg/s',
-        )
-        bias, white, walk = (
-            _of_axes(values, millidegrees) for values in picked(gyroscope, rates).values()
-        )
-        out.line(
-            f'angular rate of x y z: bias {bias} mdeg/s, white {white} mdeg/s/sqrt(Hz), '
-            f'walk {walk} mdeg/s/sqrt(h)'
-        )
+        _say_rates(out, result, gyroscope)
     out.points(one.message for one in result.findings if one.level != 'good')
     headline = counted(n_positions, 'position')
     if len(result.positions) > n_positions:
@@ -256,8 +207,77 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
         residuals_m_s2=result.residuals,
         models=[_model(one) for one in result.selected.trials],
         **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
-        gyroscope=gyroscope and picked(gyroscope, rates) | {'residuals_rad_s': result.rates},
+        gyroscope=gyroscope and picked(gyroscope, _RATES) | {'residuals_rad_s': result.rates},
         **picked(result, 'positions least_known findings'),
+    )
+
+
+def _say_positions(out: Output, result: 'FitResult') -> None:
+    out.table(
+        ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', 'in sample ug', 'left out ug'),
+        [
+            (
+                one.source,
+                time.strftime('%m-%d %H:%M:%S', time.gmtime(one.start_ns // 10**9)),
+                f'{one.duration_s / 60.0:.1f}',
+                *(f'{component:+.3f}' for component in one.up),
+                *(micro_g(one.residual_rms), micro_g(one.left_out_rms)),
+            )
+            for one in result.positions
+        ],
+        title='positions at rest',
+    )
+
+
+def _say_groups(out: Output, calibration: 'Calibration') -> None:
+    if calibration.evidence:
+        out.table(
+            ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
+            [
+                (
+                    *(one.group, one.part, micro_g(one.explains_m_s2)),
+                    *(f'{one.effective_parameters:.1f}', f'{one.log_evidence_change:.1f}'),
+                )
+                for one in calibration.evidence
+            ],
+            title='groups kept; log evidence: its loss if the group is removed',
+        )
+    white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
+    walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
+    out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')
+
+
+def _say_residuals(out: Output, result: 'FitResult', n_positions: int) -> None:
+    steps = {'raw': 'raw', 'one_set': 'one set', 'two_sets': 'two sets'}
+    steps['fitted'] = result.calibration.provenance.model
+    out.table(
+        ('section', 'windows', *steps.values(), 'left out'),
+        _steps(result.residuals, (*steps, 'left_out'), micro_g),
+        title='|f| - g at rest, RMS in ug',
+    )
+    if not result.residuals[-1].left_out.n:
+        out.line('left out: no error, as the fit needs all of the data')
+    elif n_positions == 1:
+        out.line('left out: drift of an axis in parts of the program that took no part in the fit')
+    else:
+        out.line(
+            'left out: on data that took no part in the fit; drift of an axis where the other '
+            'positions do not determine |f|'
+        )
+
+
+def _say_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> None:
+    out.table(
+        ('section', 'windows', 'raw', 'fitted', 'left out'),
+        _steps(result.rates, ('raw', 'fitted', 'left_out'), millidegrees, axes=3),
+        title='angular rate at rest less the mean of each position, RMS of an axis in mdeg/s',
+    )
+    bias, white, walk = (
+        _of_axes(values, millidegrees) for values in picked(gyroscope, _RATES).values()
+    )
+    out.line(
+        f'angular rate of x y z: bias {bias} mdeg/s, white {white} mdeg/s/sqrt(Hz), '
+        f'walk {walk} mdeg/s/sqrt(h)'
     )
 
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns ``evaluate`` and ``report``: the residuals of a calibration, as table and page."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..files import CSV, PAGE, check_output, shown_name
 from ..unit.gravity import STANDARD_GRAVITY
@@ -13,6 +13,10 @@ from . import shared_options as options
 from .field import evaluate_rests
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
 from .shared_options import argument, option
+
+if TYPE_CHECKING:
+    from ..judging.evaluation import Drift
+    from ..judging.judgement import Judgement
 
 
 def evaluate(
@@ -70,28 +74,8 @@ def evaluate(
             write(columns_of(judged.windows, list(map(shown_name, bags))))
     drifts = drifts_of(history_of([one for _, one in models]))
     tell_sections(out, result.judgements)
-    columns = ['axis', 'static ug', 'dynamic ug']
-    title = 'what temperature moves each axis at rest (RMS of its windows)'
-    if judged.shifts:
-        columns += ['bias ug', '+-', 'scale ppm', '+-']
-        title += '; shift since the fit'
-    axes = [[name, *map(micro_g, rms)] for name, rms in zip('xyz', judged.axis_rms.T, strict=True)]
-    for row, one in zip(axes, judged.shifts, strict=False):
-        row += [micro_g(one.bias), micro_g(one.bias_sd)]
-        row += [micro(1e6 * one.scale), micro(1e6 * one.scale_sd)]
-    out.table(columns, axes, title=title)
-    if judged.by_force:
-        out.table(
-            ('|f| g', 'windows', 'raw ug', 'RMS ug', 'mean ug', 'claimed ug'),
-            [
-                (
-                    *(f'{size / STANDARD_GRAVITY:.4g}', one.n, micro_g(one.raw_rms)),
-                    *(micro_g(one.rms), micro_g(one.mean), micro_g(one.claimed_rms)),
-                )
-                for size, one in judged.by_force.items()
-            ],
-            title='what is left over |f|: corrected less known magnitude',
-        )
+    _tell_axes(out, judged)
+    _tell_levels(out, judged)
     rates = {name: one.rate for name, one in result.judgements.items() if one.rate is not None}
     if rows := _sections(rates, millidegrees):
         out.table(
@@ -99,18 +83,7 @@ def evaluate(
             rows,
             title='angular rate at rest less the mean of each rest, of all axes in mdeg/s',
         )
-    if drifts:
-        out.table(
-            ('from', 'to', 'constant', 'change', '+-', 'unit', 'sure'),
-            [
-                (
-                    *(one.earlier[:10], one.later[:10], one.constant, f'{one.change:+.3g}'),
-                    *(micro(one.sd), one.unit, 'yes' if one.is_sure else 'no'),
-                )
-                for one in drifts
-            ],
-            title='what drifted between the calibrations, in a soak at the reference temperature',
-        )
+    _tell_drifts(out, drifts)
     out.points(result.notes)
     out.line(str(judged))
     if judged.rate is not None:
@@ -123,6 +96,52 @@ def evaluate(
         history=drifts,
         calibrations={name: one.facts() for name, one in result.judgements.items()},
     )
+
+
+def _tell_axes(out: Output, judged: 'Judgement') -> None:
+    """Print the thermal movement of each axis, and its shift where the positions show it."""
+    columns = ['axis', 'static ug', 'dynamic ug']
+    title = 'what temperature moves each axis at rest (RMS of its windows)'
+    if judged.shifts:
+        columns += ['bias ug', '+-', 'scale ppm', '+-']
+        title += '; shift since the fit'
+    axes = [[name, *map(micro_g, rms)] for name, rms in zip('xyz', judged.axis_rms.T, strict=True)]
+    for row, one in zip(axes, judged.shifts, strict=False):
+        row += [micro_g(one.bias), micro_g(one.bias_sd)]
+        row += [micro(1e6 * one.scale), micro(1e6 * one.scale_sd)]
+    out.table(columns, axes, title=title)
+
+
+def _tell_levels(out: Output, judged: 'Judgement') -> None:
+    """Print the residuals by |f|, where it was not gravity in all windows."""
+    if judged.by_force:
+        out.table(
+            ('|f| g', 'windows', 'raw ug', 'RMS ug', 'mean ug', 'claimed ug'),
+            [
+                (
+                    *(f'{size / STANDARD_GRAVITY:.4g}', one.n, micro_g(one.raw_rms)),
+                    *(micro_g(one.rms), micro_g(one.mean), micro_g(one.claimed_rms)),
+                )
+                for size, one in judged.by_force.items()
+            ],
+            title='what is left over |f|: corrected less known magnitude',
+        )
+
+
+def _tell_drifts(out: Output, drifts: Sequence['Drift']) -> None:
+    """Print the changes from each calibration to the next."""
+    if drifts:
+        out.table(
+            ('from', 'to', 'constant', 'change', '+-', 'unit', 'sure'),
+            [
+                (
+                    *(one.earlier[:10], one.later[:10], one.constant, f'{one.change:+.3g}'),
+                    *(micro(one.sd), one.unit, 'yes' if one.is_sure else 'no'),
+                )
+                for one in drifts
+            ],
+            title='what drifted between the calibrations, in a soak at the reference temperature',
+        )
 
 
 def tell_sections(out: Output, judgements: Mapping[str, Any]) -> None:

@@ -6,7 +6,7 @@ import re
 import shlex
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from math import isnan
 from pathlib import Path
@@ -22,8 +22,9 @@ from .output import Cell, Output, micro, picked
 from .shared_options import argument, option
 
 if TYPE_CHECKING:
+    from ..recording.growing import News, PositionBags
     from ..typing import Floats
-    from .acquisition import Account, Position
+    from .acquisition import Account, Acquisition, Position
 
 _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
 
@@ -59,30 +60,17 @@ def record(
       thermo_comp record held_out.mcap --positions 1 --soak 1h -o bags/unit44
     """
     from ..recording.growing import PositionBags, growing_blocks, numbered_bags
-    from ..recording.reader import open_recording
     from ..ros.process import SignalWatch
     from .acquisition import Acquisition
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)
     _tell_leftovers(out, output, finish)
     known = numbered_bags(output)
-    # Each existing bag is a position, and holds the serial of its unit.
-    with out.progress('reading the existing bags', total=len(known)) as done:
-        for number, path in enumerate(known, 1):
-            with open_recording(path, require=()) as reader:
-                own = reader.info.metadata.get('serial')
-                if serial is not None and own not in (serial, None):
-                    raise ThermoCompError(f'{path} is of unit {own}, not {serial}')
-                serial = serial or own
-                for block in reader.blocks():
-                    test.add(block)
-            test.begin()
-            done(number)
+    serial = _read_earlier(out, known, serial, test)
     bags = PositionBags(output, serial)
     over = threading.Event()
     problems: Callable[[], Sequence[str]] = tuple
     told: dict[str, str] = {}
-    chosen: str | None = None
     # A second signal ends the process at once.
     with SignalWatch() as signals, closing(bags), ExitStack() as stack:
         signals.on_signal(over.set)
@@ -97,48 +85,88 @@ def record(
             out.line('listening; Ctrl-C ends it with complete bags')
             sys.stdout.flush()  # the reader of a pipe waits for this line
         show = stack.enter_context(out.live())
-        for new in news:
-            if new is not None:
-                block, info = new
-                if info is not None and info.chosen != chosen:
-                    chosen = info.chosen
-                    out.told([(info.path, chosen, None)])
-                bags.add(block, info)
-                for begin_ns in test.add(block):
-                    bags.close(begin_ns)
-                bags.release(test.settled_ns)
-                continue
-            account = test.account()
+        for account in _accounts(out, news, test, bags):
             if show is None:
                 _tell(out, account, problems(), told)
             else:
                 lines = [*problems(), _now(account), *_lines(account)]
                 show(_COLUMNS, _rows(account.positions), lines)
-            if account.is_complete:
-                break
     if bag is None and live.n_lost:
         out.note(f'{live.n_lost} messages were lost on the way')
-    account, written = test.account(), [*known, *bags.written]
+    _end(out, test.account(), output, [*known, *bags.written], offset, over.is_set())
+
+
+def _read_earlier(
+    out: Output, known: Sequence[Path], serial: str | None, test: 'Acquisition'
+) -> str | None:
+    """Read the bags of earlier runs, each a position; return the serial of their unit."""
+    from ..recording.reader import open_recording
+
+    with out.progress('reading the existing bags', total=len(known)) as done:
+        for number, path in enumerate(known, 1):
+            with open_recording(path, require=()) as reader:
+                of_bag = reader.info.metadata.get('serial')
+                if serial is not None and of_bag not in (serial, None):
+                    raise ThermoCompError(f'{path} is of unit {of_bag}, not {serial}')
+                serial = serial or of_bag
+                for block in reader.blocks():
+                    test.add(block)
+            test.begin()
+            done(number)
+    return serial
+
+
+def _accounts(
+    out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
+) -> Iterator['Account']:
+    """Write blocks as they come; yield the state of the test in each pause, until it is whole."""
+    chosen: str | None = None
+    for new in news:
+        if new is not None:
+            block, info = new
+            if info is not None and info.chosen != chosen:
+                chosen = info.chosen
+                out.told([(info.path, chosen, None)])
+            bags.add(block, info)
+            for begin_ns in test.add(block):
+                bags.close(begin_ns)
+            bags.release(test.settled_ns)
+            continue
+        account = test.account()
+        yield account
+        if account.is_complete:
+            return
+
+
+def _end(
+    out: Output,
+    account: 'Account',
+    folder: Path,
+    written: Sequence[Path],
+    offset: float | None,
+    is_stopped: bool,
+) -> None:
+    """Print the result of the test, and the command that fits it."""
     there = [one for one in account.positions if one.n_rests]
     out.table(_COLUMNS, _rows(there))
     for line in _lines(account):
         out.line(line)
-    command = f'thermo_comp fit {shlex.quote(str(output))}/*.mcap -o unit.yaml --gravity G'
+    command = f'thermo_comp fit {shlex.quote(str(folder))}/*.mcap -o unit.yaml --gravity G'
     if offset is not None:
         command += f' --offset {offset:g}'
-    out.line(f'{counted(len(written), "bag")} in {output}')
+    out.line(f'{counted(len(written), "bag")} in {folder}')
     if written:
         out.line('now fit them, with the local gravity in m/s^2:')
         out.line(f'  {command}')
-    bias, scale, skew = account.constants_sd.reshape(3, 3)
+    bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     out.end(
-        int(not account.is_complete and not over.is_set()),
+        int(not account.is_complete and not is_stopped),
         bags=written,
         command=command if written else None,
         positions=there,
         bias_sd_g=bias,
         scale_sd=scale,
-        misalignment_sd_rad=skew,
+        misalignment_sd_rad=misalignment,
         **picked(account, 'n_good is_complete worst_sd_g thermometers next_up findings'),
     )
 
@@ -220,12 +248,12 @@ def _next(account: 'Account') -> str:
 
 
 def _worth(account: 'Account') -> str:
-    bias, scale, skew = account.constants_sd.reshape(3, 3)
+    bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     parts = (
         f'{spoken(account.worst_sd_g * STANDARD_GRAVITY)} in the worst attitude',
         f'bias {" ".join(spoken(value * STANDARD_GRAVITY) for value in bias)}',
         f'scale {" ".join(micro(1e6 * value) for value in scale)} ppm',
-        f'misalignment {" ".join(micro(1e6 * value) for value in skew)} urad',
+        f'misalignment {" ".join(micro(1e6 * value) for value in misalignment)} urad',
     )
     return f'known to {", ".join(parts)}'
 

@@ -65,7 +65,6 @@ def simulate(
     Example:
       thermo_comp simulate --rate-hz 2 --positions 12 -o bags/sim
     """
-    from .. import __version__
     from ..recording.writer import BagWriter
     from ..simulation import campaign, presets, run
     from ..simulation.spin import Bend
@@ -99,17 +98,9 @@ def simulate(
                 'positions': n,
                 'position_seed': position_seed,
                 **settings,
-                'up': station.up.tolist(),
-                **picked(specimen, 'scale_factor bias_at_reference'),
-                'misalignment': specimen.M.tolist(),
                 **({'k2_ug_g2': k2, 'k3_ug_g3': k3} if k2 or k3 else {}),
             }
-            metadata = {
-                'serial': specimen.serial,
-                'simulated_by': f'thermo_comp {__version__}',
-                'truth': json.dumps(truth),
-                **_said_force(station, gravity, is_known=plan == 'centrifuge'),
-            }
+            metadata = _metadata(specimen, station, truth, gravity, plan == 'centrifuge')
             with options.usage_of():
                 runs = run.simulate_blocks(
                     specimen,
@@ -131,6 +122,22 @@ def simulate(
     out.table(('bag', 'counts', 'board', 'case'), [tuple(row.values()) for row in written])
     seconds = max(station.program.duration_s for station in stations)
     out.end(serial=specimen.serial, duration_s=seconds, bags=written)
+
+
+def _metadata(
+    unit: 'UnitModel', station: 'Position', truth: dict[str, Any], gravity: float, is_known: bool
+) -> dict[str, str]:
+    """Return the metadata of a bag: serial, truth, and how a fit learns |f| in a rotation."""
+    from .. import __version__
+
+    of_unit = picked(unit, 'scale_factor bias_at_reference')
+    truth |= {'up': station.up.tolist(), **of_unit, 'misalignment': unit.M.tolist()}
+    return {
+        'serial': unit.serial,
+        'simulated_by': f'thermo_comp {__version__}',
+        'truth': json.dumps(truth),
+        **_said_force(station, gravity, is_known=is_known),
+    }
 
 
 #: Topic of the rotation rate, its interval [s], and sd of the stated radius [m].
