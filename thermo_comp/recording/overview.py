@@ -15,6 +15,7 @@ import numpy as np
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..topics import TEMPERATURE
+from ..typing import Ints
 from .blocks import Readings, RecordingInfo
 from .causes import CauseCounter
 from .fields import temperature_fields
@@ -124,32 +125,20 @@ def survey_recording(
         cells, causes = CellAccumulator(_CELL_S, None), CauseCounter()
         # Kept in memory: a thermal test has few readings compared with its samples.
         readings: dict[str, list[Readings]] = {}
-        n = n_gaps = n_backwards = first_ns = last_ns = 0
-        longest_gap = step_ns = 0.0
+        clock = _Clock()
         for block in reader.blocks():
             for name, one in block.temperatures.items():
                 readings.setdefault(name, []).append(one)
-            stamp_ns = block.accel_stamp_ns
-            if not len(stamp_ns):
+            if not len(block):
                 continue
-            if not n:
-                first_ns = last_ns = int(stamp_ns[0])
-            steps = np.diff(stamp_ns, prepend=last_ns)[not n :]
-            last_ns = int(stamp_ns[-1])
-            rising = steps[steps > 0]
-            n_backwards += len(steps) - len(rising)
-            if not step_ns and len(rising):
-                step_ns = float(np.median(rising))
-            gaps = rising[rising > _GAP_INTERVALS * step_ns]
-            n_gaps += len(gaps)
-            longest_gap = max(longest_gap, float(np.max(gaps, initial=0)) * 1e-9)
-            n += len(stamp_ns)
+            clock.add(block.accel_stamp_ns)
             rate = None if block.imu is None else block.imu.angular_velocity
-            cells.add(stamp_ns, block.accel, rate)
+            cells.add(block.accel_stamp_ns, block.accel, rate)
             causes.add(block)
             if progress is not None and total:
-                progress(n / total)
+                progress(clock.n / total)
         info, candidates = reader.info, unused_thermometers(reader)
+    n = clock.n
     reduced = cells.finish()
     still = still_intervals(reduced, _MIN_REST_S) if n > 1 else []
     cause = causes.cause(reduced, STILL_SD) if n > 1 else ''
@@ -165,22 +154,49 @@ def survey_recording(
             n and not still and not cause,
             f'it never rests for 3 s, and a fit needs rests: {why_restless(reduced)}',
         ),
-        (n_backwards, f'{n_backwards} stamps do not rise: those samples are left out'),
-        (n_gaps, f'{n_gaps} gaps, the longest {longest_gap:.3g} s'),
+        (clock.n_backwards, f'{clock.n_backwards} stamps do not rise: those samples are left out'),
+        (clock.n_gaps, f'{clock.n_gaps} gaps, the longest {clock.longest_gap_s:.3g} s'),
     ]
-    duration_s = (last_ns - first_ns) * 1e-9
+    duration_s = (clock.last_ns - clock.first_ns) * 1e-9
     # The first and the last cell may extend beyond the samples.
     still_s = min(sum((upper - lower) * reduced.cell_s for lower, upper in still), duration_s)
     return Survey(
         info,
         n,
         duration_s,
-        1e9 / step_ns if step_ns else float('nan'),
+        1e9 / clock.step_ns if clock.step_ns else float('nan'),
         len(still),
         still_s,
         thermometers,
         [text for is_so, text in findings if is_so],
     )
+
+
+@dataclass
+class _Clock:
+    """The stamps so far: the usual interval, gaps, and stamps that do not rise."""
+
+    n: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    step_ns: float = 0.0
+    n_backwards: int = 0
+    n_gaps: int = 0
+    longest_gap_s: float = 0.0
+
+    def add(self, stamp_ns: Ints) -> None:
+        """Take the next stamps, at least one."""
+        if not self.n:
+            self.first_ns = self.last_ns = int(stamp_ns[0])
+        steps = np.diff(stamp_ns, prepend=self.last_ns)[not self.n :]
+        self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
+        rising = steps[steps > 0]
+        self.n_backwards += len(steps) - len(rising)
+        if not self.step_ns and len(rising):
+            self.step_ns = float(np.median(rising))
+        gaps = rising[rising > _GAP_INTERVALS * self.step_ns]
+        self.n_gaps += len(gaps)
+        self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
 
 
 def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:
