@@ -128,11 +128,7 @@ def write_log(
     progress: Callable[[float], None] = lambda _: None,
 ) -> ConversionReport:
     """Check a log and write it as a bag: a bare file ``*.mcap`` or a rosbag2 directory."""
-    if log.serial:
-        try:
-            valid_serial(log.serial)
-        except ValueError as mistake:
-            raise RecordingError(str(mistake), path=log.path) from mistake
+    _check_serial(log)
     holds_numbers = (log.stamp_ns != NO_STAMP) & np.isfinite(log.accel).all(axis=1)
     if log.gyro is not None:
         holds_numbers &= np.isfinite(log.gyro).all(axis=1)
@@ -183,6 +179,14 @@ def write_log(
         believed=believed_unit(stillness.magnitude)[1],
         stillness=stillness,
     )
+
+
+def _check_serial(log: ForeignLog) -> None:
+    if log.serial:
+        try:
+            valid_serial(log.serial)
+        except ValueError as mistake:
+            raise RecordingError(str(mistake), path=log.path) from mistake
 
 
 def _is_in_range(stamp_ns: Ints) -> Bools:

@@ -223,14 +223,10 @@ def series_of(
     noise = (v**2 * white).sum(axis=1) / sizes
     bare = SlowUncertainty(replace(calibration, posterior=None), correction)
     whole = SlowUncertainty(calibration, correction)
-    unexplained = correction.curves.unexplained(states[:, BOARD])[0].T
-    unexplained = np.broadcast_to(unexplained, x.shape)
-    residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
-    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
-    slow, claim = (
-        _along(correction, states, shares, one, v, x) - of_one_sample for one in (bare, whole)
-    )
+    slow, claim = (_along(correction, states, shares, one, v, x) for one in (bare, whole))
+    unexplained = np.broadcast_to(correction.curves.unexplained(states[:, BOARD])[0].T, x.shape)
     slow -= (v**2 * unexplained).sum(axis=1)
+    residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
     return Series(
         time=averaged(stamps / _DAY_NS),
         start=np.unique(beginnings[first], return_inverse=True)[1],
@@ -299,7 +295,7 @@ def _along(
     v: Floats,
     x: Floats,
 ) -> Floats:
-    """Project the error variance of one sample on the direction of the force."""
+    """Project the error variance, less a sample's noise, on the direction of the force."""
     parts = np.array(
         [slow.at(s, p) for s, p in zip(states.tolist(), shares.tolist(), strict=True)]
     )
@@ -310,7 +306,9 @@ def _along(
     if correction.of_force is not None:
         for row in np.moveaxis(line[21:].reshape(3, 7, -1)[:, 3:], 1, 0)[::-1]:
             higher = x.T * (row + higher)
-    return np.asarray((v.T**2 * (a + x.T * (b + x.T * (c + higher)))).sum(axis=0))
+    variance = a + x.T * (b + x.T * (c + higher))
+    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
+    return np.asarray((v.T**2 * variance).sum(axis=0) - of_one_sample)
 
 
 def _by_parameter(

@@ -24,7 +24,7 @@ from ..typing import Bools, Floats
 from ..unit.calibration import AXES, Calibration, RegimeSet, parameter_layout
 from ..unit.correction import Correction
 from ..unit.gravity import spoken
-from ..unit.provenance import ResidualSummary, Source
+from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import Series, valid_since
 
@@ -137,33 +137,34 @@ def update(
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
     axis_determined = [change.is_determined for change in moved]
     new = _shifted(calibration, shift, covariance)
-    residuals = ResidualSummary(
-        f'left-out {judged.over}',
-        judged.n,
-        judged.before,
-        judged.after,
-        float(np.abs(series.miss).max()),
-    )
-    provenance = calibration.provenance
-    day = np.datetime64(int(series.time[-1]), 'D')
-    note = (
-        f'updated by {int(series.n_windows.sum())} windows at rest up to {day}; before: '
-        f'{provenance.created or "no date"}. {judged}'
-    )
+    before = calibration.provenance
     new = replace(
         new,
         static=_with_residual(new.static, turn_on, axis_determined),
         dynamic=_with_residual(new.dynamic, turn_on, axis_determined),
         provenance=replace(
-            provenance,
-            created=created or provenance.created,
-            sources=(*provenance.sources, *([source] if source else [])),
-            residuals=(*provenance.residuals, residuals),
-            notes=(*provenance.notes, note),
+            _with_update(before, series, judged),
+            created=created or before.created,
+            sources=(*before.sources, *([source] if source else [])),
         ),
     )
     n_outliers = len(series) - len(used)
     return Update(new, moved, ageing, model.changes, judged, used, n_outliers, model, solution)
+
+
+def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Provenance:
+    """Add the residuals of left-out rests, and a note, to the origin of a calibration."""
+    largest, day = float(np.abs(series.miss).max()), np.datetime64(int(series.time[-1]), 'D')
+    residuals = ResidualSummary(
+        f'left-out {judged.over}', judged.n, judged.before, judged.after, largest
+    )
+    note = (
+        f'updated by {int(series.n_windows.sum())} windows at rest up to {day}; before: '
+        f'{provenance.created or "no date"}. {judged}'
+    )
+    return replace(
+        provenance, residuals=(*provenance.residuals, residuals), notes=(*provenance.notes, note)
+    )
 
 
 def _levels(calibration: Calibration) -> Floats:

@@ -77,11 +77,7 @@ def fit_fleet(
     `tell` is called with the number of finished tests and of all tests: before the first fit with
     None, and after each fit with its row.
     """
-    for name in ('distributed', 'fsspec', 'pyarrow'):
-        if find_spec(name) is None:
-            raise ThermoCompError(
-                f"a fleet needs Dask: pip install 'thermo_comp[fleet]' ({name} is not installed)"
-            )
+    _require_packages()
     storage = Storage(url)
     units = find_units(storage)
     results = Results(Path(output))
@@ -123,6 +119,14 @@ def fit_fleet(
     files.write_atomically(page, content, files.PAGE)
     prior_path = None if prior is None else results.folder / PRIOR
     return FleetResult(ordered, summary, len(done), parquet, csv, page, prior_path, no_prior)
+
+
+def _require_packages() -> None:
+    for name in ('distributed', 'fsspec', 'pyarrow'):
+        if find_spec(name) is None:
+            raise ThermoCompError(
+                f"a fleet needs Dask: pip install 'thermo_comp[fleet]' ({name} is not installed)"
+            )
 
 
 def _speaks(row: Row) -> bool:
