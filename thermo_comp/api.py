@@ -7,8 +7,6 @@ Times are seconds since any origin, or datetime64. Anything that numpy converts 
 accepted: lists, pandas columns, xarray arrays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial

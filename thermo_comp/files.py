@@ -9,8 +9,6 @@ kind. The file gets its final name once it is complete. If the name is a symboli
 stays and its target is written.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import re

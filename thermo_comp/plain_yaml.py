@@ -9,8 +9,6 @@ The parser's events are read in one pass, so that a too deep or too large file i
 it is built.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from itertools import takewhile

@@ -8,8 +8,6 @@ that a calibration within them gives finite results. Bounds that depend on the u
 and temperature range (bias, curves, weights and their deviations) are in `unit.reach`.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 import typing

@@ -8,8 +8,6 @@ the first sample after it in the bag. The result therefore equals, bit for bit, 
 which receives the messages in the order of the bag. Memory is limited to one block.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace

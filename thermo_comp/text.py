@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the safe printing of texts from outside, and nouns with their number."""
 
-from __future__ import annotations
-
 import os
 import sys
 

@@ -7,8 +7,6 @@ Blocks are added as they come. A rest in another direction than the present posi
 next position; knocks and handling in between belong to the previous position.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

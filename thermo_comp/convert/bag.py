@@ -8,8 +8,6 @@ type; a thermometer by its namespace: that of the Imu makes it the board's, that
 (sensor_msgs/FluidPressure) the case's. At rest the samples must read gravity in the stated unit.
 """
 
-from __future__ import annotations
-
 from pathlib import Path, PurePosixPath
 from typing import Literal
 

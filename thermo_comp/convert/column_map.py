@@ -9,8 +9,6 @@ wz]`` as for imu_tk, is guessed: times rise; readings at rest are gravity, which
 degrees per second taken for radians would be faster than any turn by hand.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -8,8 +8,6 @@ tools for tumble tests both are constant. The notes of an export name the parts 
 that are lost, with the resulting error.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ Owns the recognition of headings: time, triads, thermometers, and their units.
 A guess is printed as a column map, for the user to keep or to edit.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass

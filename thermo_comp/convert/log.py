@@ -7,8 +7,6 @@ At rest the specific force is gravity in any attitude. A log whose map contradic
 because an unnoticed factor of 9.8 would end in a calibration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module

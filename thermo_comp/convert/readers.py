@@ -4,8 +4,6 @@
 Owns the choice of a log's reader by the file name: table, autopilot's log or bag.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace

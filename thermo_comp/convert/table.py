@@ -7,8 +7,6 @@ A cell that is not a number becomes NaN, and its row is counted. Stamps are read
 decimal digits, because a float does not resolve nanoseconds since 1970.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 import re

@@ -20,8 +20,6 @@ triad at one temperature; with the reading N and the specific force a::
 An upper triangle, or a full matrix, belongs to a frame that is rotated relative to ours.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ Lines with a wrong checksum are skipped: a killed process, a power failure or a 
 only the line that is being written.
 """
 
-from __future__ import annotations
-
 import json
 import zlib
 from collections.abc import Callable, Iterable

@@ -8,8 +8,6 @@ An axis is updated only if the rests reduce the sd of some reading of it to 0.6 
 the other axes keep their values, with an increased covariance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

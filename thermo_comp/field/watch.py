@@ -8,8 +8,6 @@ forecast assumes a random walk of the error from its present estimate, with the 
 from the log: it is the distribution of the first passage of either bound.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the table of units: its columns, the cells of a fit, and its files."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the search for a fleet's bags on any file system of fsspec, and their units."""
 
-from __future__ import annotations
-
 import errno
 import os
 import tempfile

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the work on a unit (reading and fitting its bags), and its distribution by Dask."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -7,8 +7,6 @@ The compensator takes the readings one by one. Its segments are collected, evalu
 applied to all samples with the arithmetic of the stream.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from operator import itemgetter
 from typing import Final, TypeAlias

@@ -11,8 +11,6 @@ sensor, the mean of the previous window) of a second or longer. A step of |f| fr
 another is no motion: it is judged within a second.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Final

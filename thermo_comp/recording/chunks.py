@@ -9,8 +9,6 @@ are read one by one.
 https://mcap.dev/spec
 """
 
-from __future__ import annotations
-
 import bz2
 import struct
 import zlib

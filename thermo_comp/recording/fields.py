@@ -8,8 +8,6 @@ at a multiple of its size after the encapsulation; the length of a string or seq
 precedes it. The positions in all messages advance together, field by field.
 """
 
-from __future__ import annotations
-
 import re
 from collections import ChainMap
 from collections.abc import Mapping

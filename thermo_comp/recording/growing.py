@@ -8,8 +8,6 @@ The messages are written to a folder of bags, `01.mcap`, ... with the node's top
 of a position is recognised with a delay, so the newest messages are held back.
 """
 
-from __future__ import annotations
-
 import re
 import time
 from collections import Counter

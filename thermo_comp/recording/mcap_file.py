@@ -8,8 +8,6 @@ or cut off anywhere, is read record by record, and its messages are counted. Rec
 messages are read by the `mcap` library.
 """
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

@@ -6,8 +6,6 @@ metadata.yaml of rosbag2 (version 9). Messages and their indexes are numpy bytes
 records use the classes of the `mcap` library.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 import zlib

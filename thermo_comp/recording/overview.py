@@ -4,8 +4,6 @@
 Owns the survey of a recording before a fit: duration, rates, temperatures, rests, losses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

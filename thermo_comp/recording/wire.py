@@ -14,8 +14,6 @@ Only `frame_id` makes the size vary: messages of equal layout are gathered as ro
 stamps and numbers as views. ROS 1 messages are converted by `rosbags`, one by one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
 from struct import pack

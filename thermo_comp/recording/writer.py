@@ -8,8 +8,6 @@ The target's name appears only when `BagWriter.close` has succeeded; if writing 
 output stays.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence

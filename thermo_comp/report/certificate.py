@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the parts of a certificate after ISO/IEC 17025: results, budget, conformity."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the figures of bags: over time, like the paper's Fig. 3, 4, 6 and 7, and by position."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns bias and scale of a calibration over temperature, in a soak and in ramps, with their sd."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the look of the figures: lines differ by their dashes, and by colours of Okabe and Ito."""
 
-from __future__ import annotations
-
 import io
 import re
 from contextlib import AbstractContextManager

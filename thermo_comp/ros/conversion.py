@@ -9,8 +9,6 @@ its final NUL, the string, and, at the next multiple of 8 from the end of the en
 float64 values. A message in any other form is first converted to this form by rclpy.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from contextlib import suppress

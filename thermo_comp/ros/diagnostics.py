@@ -7,8 +7,6 @@ ERROR: no valid output, or samples are saturated. WARN: the output is worse than
 states. The message names every reason, the worst first; the values hold the figures.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterable, Iterator

@@ -7,8 +7,6 @@ The output equals that of the offline replay of the same messages bit for bit. P
 checked when they are set, and applied between two wake-ups.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import sys

@@ -8,8 +8,6 @@ or is refused as a whole. A thread waits while a file is read; the loop then rep
 reference. Requests are answered in order of arrival, but a request without a file waits for none.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -7,8 +7,6 @@ A parser holds the interpreter lock for milliseconds at a time, so a thread woul
 If a file makes its reader crash or hang, the node only sees a process that ended or timed out.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import hashlib

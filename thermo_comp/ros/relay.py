@@ -8,8 +8,6 @@ and so is the first batch afterwards, which may still be from the publisher that
 (`waitloop.Sources`).
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ The samples' way appends references of messages to a list. The sums are done in 
 What cannot be kept is counted and named in the diagnostics.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -12,8 +12,6 @@ Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), th
 node's `_parameter_overrides`; `test/test_waitloop.py` fails when any of them changes.
 """
 
-from __future__ import annotations
-
 import time
 import traceback
 from collections import deque

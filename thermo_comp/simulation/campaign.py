@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the plan of a test: the chamber's program, ready-made or typed in, and the attitudes."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns a run: a unit in a chamber over a program, whole or block by block, and its truth."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterator, Sequence

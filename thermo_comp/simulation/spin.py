@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns forces beyond 1 g in a simulation: a rotation in the chamber, and nonlinear axes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

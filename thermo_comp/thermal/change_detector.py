@@ -18,8 +18,6 @@ References
 
 """
 
-from __future__ import annotations
-
 import math
 from math import acos, inf, isnan, log, nan, pi, sqrt
 from typing import Final

@@ -17,8 +17,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 from math import sqrt
 from typing import Final

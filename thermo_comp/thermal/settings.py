@@ -6,8 +6,6 @@ Owns the settings of thermometers, detector and tracker.
 Calibrations hold them, and a fleet's workers receive them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated, Final, Literal, get_args
 

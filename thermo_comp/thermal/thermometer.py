@@ -20,8 +20,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from math import erf, exp, inf, nan, sqrt
 from typing import Final
 

@@ -41,8 +41,6 @@ Tracker, fit, correction, covariance and file use this table. A new regressor is
 and, if its kind is new, of `_FORMS`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

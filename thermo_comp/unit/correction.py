@@ -10,8 +10,6 @@ in `calibration`; x is an axis' specific force before the misalignment, its erro
 ``v(x) = a + b x + c x^2`` [m^2/s^4].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

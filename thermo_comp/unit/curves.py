@@ -6,8 +6,6 @@ Owns the curves of the two sets over the board temperature, within their ranges 
 States and rows are laid out as in `correction`; each state is evaluated alone.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns statistics of residuals: corrected - true, and ``|f| - g``, which needs no attitude."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -10,8 +10,6 @@ stop; in a soak (q = 0) all of them are 0. The static set holds in a soak, the d
 ramp. Noise and the uncertainty of the thermometers are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

@@ -9,8 +9,6 @@ list to tuple. Rules between keys belong to the dataclass: it raises a ValueErro
 the key in backticks.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re
