@@ -140,6 +140,6 @@ def refuse_impossible(value: Any) -> None:
     """Raise ValueError with the name of the key if a field of a dataclass violates its bounds."""
     cls: type = type(value)
     for name, bounds in _bounds_of(cls).items():
-        for one in bounds:
-            if fault := one.fault(getattr(value, name)):
+        for bound in bounds:
+            if fault := bound.fault(getattr(value, name)):
                 raise ValueError(f'`{name}` {fault}, got {getattr(value, name)}')

@@ -190,7 +190,7 @@ class Acquisition:
             for name, own in self._readings.items()
         }
         self._begin_ns, self._n_looked, self._first = end_ns, 0, None
-        means = np.array([one.mean for one in self._rests if one.n_rests]).reshape(-1, 3)
+        means = np.array([rest.mean for rest in self._rests if rest.n_rests]).reshape(-1, 3)
         self._centre = coverage.rough_centre(means)
 
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
@@ -233,13 +233,13 @@ class Acquisition:
             positions.append(
                 Position(up, rest.still_s, rest.n_rests, float(sd), rest.surveys, reason)
             )
-        found = [one for one in positions if np.isfinite(one.up).all()]
+        found = [position for position in positions if np.isfinite(position.up).all()]
         seen = np.array([one.up for one in found]).reshape(-1, 3)
         covariance = coverage.constants_covariance(seen, np.array([one.sd_g for one in found]))
         next_up = coverage.next_direction(covariance, found[-1].sd_g if found else _FLOOR_SD, seen)
         now, is_still = self._now(cells)
         hole, hole_deg = coverage.farthest(seen)
-        n_good = sum(not one.reason for one in positions)
+        n_good = sum(not position.reason for position in positions)
         thermometers = _together([one.surveys for one in rests])
         missing = self._n_wanted - n_good
         findings = [f'{missing} of {self._n_wanted} positions are missing'] * (missing > 0)

@@ -137,10 +137,10 @@ def tell_nonlinearity(out: Output, calibration: 'Calibration') -> None:
     if calibration.nonlinearity is None:
         return
     rows: list[tuple[Cell, ...]] = []
-    for one in nonlinear_coefficients(calibration):
-        axes = zip(one.value.tolist(), one.sd.tolist(), strict=True)
+    for coefficient in nonlinear_coefficients(calibration):
+        axes = zip(coefficient.value.tolist(), coefficient.sd.tolist(), strict=True)
         said = [f'{value:.4g}' + f' +- {sd:.2g}' * isfinite(sd) for value, sd in axes]
-        rows.append((one.name, one.unit, *said))
+        rows.append((coefficient.name, coefficient.unit, *said))
     terms = calibration.nonlinearity.terms
     losses = ', '.join(f'{one.kind} {one.log_evidence_change:.1f}' for one in terms) or 'no term'
     low, high = calibration.nonlinearity.force_range_m_s2
@@ -202,8 +202,8 @@ def replay(
         )
     info, counters = result.info, result.counters
     out.told([(info.path, info.chosen, info.truncated)])
-    for one in result.notes:
-        out.note(f'{info.path}: {one}')
+    for note in result.notes:
+        out.note(f'{info.path}: {note}')
     counts = asdict(counters)
     out.line(f'{output}: {counters.n_out} of {counters.n_in} samples corrected')
     for name, count in counts.items():

@@ -161,10 +161,10 @@ def prior(
     found = population(units)
     save_calibration(found, output, overwrite=force)
     out.line(f'{output}: what {len(units)} units have in common, {len(found.response)} columns')
-    bent = [one.unit.serial for one in units if one.nonlinearity and one.nonlinearity.terms]
+    bent = [unit.unit.serial for unit in units if unit.nonlinearity and unit.nonlinearity.terms]
     if bent:
         out.line(f'- the prior leaves out the nonlinear terms (K2, K3) of {", ".join(bent)}')
-    out.end(output=output, units=[one.unit.serial for one in units])
+    out.end(output=output, units=[unit.unit.serial for unit in units])
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -189,7 +189,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     _say_residuals(out, result, n_positions)
     if gyroscope is not None:
         _say_rates(out, result, gyroscope)
-    out.points(one.message for one in result.findings if one.level != 'good')
+    out.points(finding.message for finding in result.findings if finding.level != 'good')
     headline = counted(n_positions, 'position')
     if len(result.positions) > n_positions:
         headline += f' ({counted(len(result.positions), "rest")})'
@@ -205,7 +205,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
         gravity=calibration.gravity_m_s2,
         left_out_rms_m_s2=left_out.rms,
         residuals_m_s2=result.residuals,
-        models=[_model(one) for one in result.selected.trials],
+        models=[_model(trial) for trial in result.selected.trials],
         **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
         gyroscope=gyroscope and picked(gyroscope, _RATES) | {'residuals_rad_s': result.rates},
         **picked(result, 'positions least_known findings'),
@@ -217,13 +217,13 @@ def _say_positions(out: Output, result: 'FitResult') -> None:
         ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', 'in sample ug', 'left out ug'),
         [
             (
-                one.source,
-                time.strftime('%m-%d %H:%M:%S', time.gmtime(one.start_ns // 10**9)),
-                f'{one.duration_s / 60.0:.1f}',
-                *(f'{component:+.3f}' for component in one.up),
-                *(micro_g(one.residual_rms), micro_g(one.left_out_rms)),
+                position.source,
+                time.strftime('%m-%d %H:%M:%S', time.gmtime(position.start_ns // 10**9)),
+                f'{position.duration_s / 60.0:.1f}',
+                *(f'{component:+.3f}' for component in position.up),
+                *(micro_g(position.residual_rms), micro_g(position.left_out_rms)),
             )
-            for one in result.positions
+            for position in result.positions
         ],
         title='positions at rest',
     )
@@ -288,7 +288,7 @@ def _say_models(out: Output, trials: Sequence['Trial']) -> None:
         'sections': 'drift of an axis in a part of the program left out',
         'norm': '|f| - g in a position left out',
     }
-    left = [[micro_g(folds.rms) for folds in one.score.kinds] for one in trials]
+    left = [[micro_g(folds.rms) for folds in trial.score.kinds] for trial in trials]
     kept = [k for k in range(len(columns)) if any(row[k] for row in left)]
     if not kept or len(trials) < 2:
         return
@@ -311,7 +311,7 @@ def _named(groups: tuple[str, ...]) -> str:
     """Name a model by its groups; all but the smallest have the curve."""
     if len(groups) < 2 or groups[0] != 'curve':
         return '+'.join(groups) or 'constants'
-    return ''.join(f'+{one}' for one in groups[1:])
+    return ''.join(f'+{group}' for group in groups[1:])
 
 
 def _wrapped(name: str) -> list[str]:

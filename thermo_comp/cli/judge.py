@@ -146,7 +146,7 @@ def _tell_drifts(out: Output, drifts: Sequence['Drift']) -> None:
 
 def tell_sections(out: Output, judgements: Mapping[str, Any]) -> None:
     """Print the residuals of |f| of each calibration."""
-    (window_s,) = {one.windows.window_s for one in judgements.values()}
+    (window_s,) = {judgement.windows.window_s for judgement in judgements.values()}
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
         _sections(judgements, micro_g),

@@ -147,7 +147,7 @@ def _end(
     is_stopped: bool,
 ) -> None:
     """Print the result of the test, and the command that fits it."""
-    there = [one for one in account.positions if one.n_rests]
+    there = [position for position in account.positions if position.n_rests]
     out.table(_COLUMNS, _rows(there))
     for line in _lines(account):
         out.line(line)

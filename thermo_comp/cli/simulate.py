@@ -158,7 +158,7 @@ def _said_force(station: 'Position', gravity: float, *, is_known: bool) -> dict[
             known_force.RADIUS_SD: f'{_RADIUS_SD_M:g}',
         }
     end_s = station.program.duration_s
-    rows = [one for one in spin.sections(gravity) if one[0] < end_s]
+    rows = [section for section in spin.sections(gravity) if section[0] < end_s]
     lines = [f'{begin:g} {min(end, end_s):g} {size:.9g}' for begin, end, size in rows]
     return {known_force.MAGNITUDE: '; '.join(lines)}
 

@@ -94,7 +94,7 @@ def read_autopilot(
     heard = {number: _reported(readings) for number, readings in baros.items()}
     if baro is None:
         heard = {number: readings for number, readings in heard.items() if len(readings.celsius)}
-    found = [_reported(one) for one in rows.temperatures.values()]
+    found = [_reported(temperature) for temperature in rows.temperatures.values()]
     if heard or baro is not None:
         found.append(_instance(heard, baro, 'barometer', path))
     thinned = (one.thinned() for one in found if len(one.celsius))
@@ -148,7 +148,7 @@ def _ulog(path: Path) -> _Held:
         changes = [one for one in log.changed_parameters if one[1] == name]
         correction = _Correction(
             name,
-            [0, *(int(one[0]) * 1000 for one in changes)],
+            [0, *(int(change[0]) * 1000 for change in changes)],
             [float(log.initial_parameters.get(name, 0)), *(float(one[2]) for one in changes)],
             f'it holds sensor_combined alone: {_PROFILE}',
         )

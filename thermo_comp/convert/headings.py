@@ -81,7 +81,7 @@ def map_lines(columns: Any) -> list[str]:
 def _given(value: Any) -> Any:
     """Turn dataclasses into the keys that differ from their defaults, and the units."""
     if is_dataclass(value):
-        pairs = ((one, getattr(value, one.name)) for one in fields(value))
+        pairs = ((field, getattr(value, field.name)) for field in fields(value))
         return {f.name: _given(x) for f, x in pairs if x != f.default or f.name == 'unit'}
     return list(map(_given, value)) if isinstance(value, tuple) else value
 

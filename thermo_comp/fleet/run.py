@@ -178,8 +178,8 @@ def render_fleet(
         'deviations. Diamonds beyond the dashed lines are the units listed above.',
         partial(
             draw_distances,
-            [one.quantity.label for one in summary.spreads],
-            [one.z for one in summary.spreads],
+            [spread.quantity.label for spread in summary.spreads],
+            [spread.z for spread in summary.spreads],
             summary.limit,
         ),
     )

@@ -157,8 +157,8 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
     sets = calibration.regime_sets()
     static = sets[0].axes()
     bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
-    up = np.array([one.up for one in result.positions])
-    lacking = {one.name for one in result.findings if one.level != 'good'}
+    up = np.array([position.up for position in result.positions])
+    lacking = {finding.name for finding in result.findings if finding.level != 'good'}
     unseen = next(row.left_out for row in result.residuals if row.section == 'all')
     parts: dict[str, Sequence[float] | Floats] = {
         'scale_{0}': scale,

@@ -88,7 +88,7 @@ class Storage:
             return
         with tempfile.TemporaryDirectory(prefix='thermo_comp-') as scratch:
             there, copies = (
-                [f'{root}/{one.name}' for one in files] for root in (self._root, scratch)
+                [f'{root}/{file.name}' for file in files] for root in (self._root, scratch)
             )
             try:
                 self._fs.get(there, copies)

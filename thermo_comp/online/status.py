@@ -38,7 +38,7 @@ class Dropped:
     n_unsound: int = 0  # the corrected sample is not finite
 
 
-DROPPED = tuple(one.name for one in fields(Dropped))
+DROPPED = tuple(field.name for field in fields(Dropped))
 
 
 @dataclass(slots=True)

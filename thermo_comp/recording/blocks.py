@@ -303,7 +303,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     for block in blocks:
         thermometers = block.temperatures.values()
         # Reading order: a reading precedes the sample for which it counts.
-        places = [*(one.after for one in thermometers), np.arange(len(block))]
+        places = [*(thermometer.after for thermometer in thermometers), np.arange(len(block))]
         stamps = np.concatenate([*(one.stamp_ns for one in thermometers), block.accel_stamp_ns])
         if not len(stamps):
             yield block

@@ -101,7 +101,7 @@ def finish(path: Path, number: int) -> Path | None:
     if it has no message. RecordingError if nothing can be read.
     """
     with open_recording(path, require=()) as reader:
-        numbers = {int(one.stem) for one in numbered_bags(path.parent)}
+        numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}
         number = max(numbers) + 1 if number in numbers else number
         bags = PositionBags(path.parent, None, number)
         try:
@@ -119,7 +119,7 @@ class PositionBags:
 
     def __init__(self, folder: Path, serial: str | None, number: int | None = None) -> None:
         self._folder, self._serial = folder, serial
-        last = max((int(one.stem) for one in numbered_bags(folder)), default=0)
+        last = max((int(bag.stem) for bag in numbered_bags(folder)), default=0)
         self._number = number or last + 1
         check_output(folder / f'{self._number:02d}.mcap', MCAP)
         self._writer: BagWriter | None = None

@@ -149,17 +149,17 @@ class McapFile(BagFile):
         counts, n_messages = said.channel_message_counts, said.message_count
         channels: dict[int, Channel] = {one.id: one for one in found.get(Channel, [])}
         chunks = sorted(found.get(ChunkIndex, []), key=lambda one: one.chunk_start_offset)
-        spans = [Span(*_SPAN_FIELDS(one)) for one in chunks]
+        spans = [Span(*_SPAN_FIELDS(chunk)) for chunk in chunks]
         if (
             sum(counts.values()) != n_messages
             or not counts.keys() <= channels.keys()
-            or not len(spans) == len({one.position for one in spans}) == said.chunk_count
-            or any(one.position + one.length + one.index_length > self._size for one in spans)
+            or not len(spans) == len({span.position for span in spans}) == said.chunk_count
+            or any(span.position + span.length + span.index_length > self._size for span in spans)
         ):
             return
         self._channels = channels
         self._schemas = {one.id: one for one in found.get(Schema, [])}
-        self.spans = [one for one in spans if one.size]
+        self.spans = [span for span in spans if span.size]
         if self.spans:
             self._counts.update(counts)
             if n_messages:

@@ -152,15 +152,15 @@ class McapOutput:
         counted: list[dict[str, Any]] = [
             {
                 'topic_metadata': {
-                    'name': one.topic,
-                    'type': kinds[one.schema_id],
+                    'name': channel.topic,
+                    'type': kinds[channel.schema_id],
                     'serialization_format': 'cdr',
-                    'offered_qos_profiles': [_offered_qos(one.topic)],
-                    'type_description_hash': one.metadata['topic_type_hash'],
+                    'offered_qos_profiles': [_offered_qos(channel.topic)],
+                    'type_description_hash': channel.metadata['topic_type_hash'],
                 },
-                'message_count': self._counts[one.id],
+                'message_count': self._counts[channel.id],
             }
-            for one in self._channels.values()
+            for channel in self._channels.values()
         ]
         times = {
             'duration': {'nanoseconds': end_ns - start_ns},
@@ -182,8 +182,8 @@ class McapOutput:
 
     def _times(self) -> tuple[int, int]:
         """Return the log times of the first and the last message."""
-        start = min((one.message_start_time for one in self._chunks), default=0)
-        return start, max((one.message_end_time for one in self._chunks), default=0)
+        start = min((chunk.message_start_time for chunk in self._chunks), default=0)
+        return start, max((chunk.message_end_time for chunk in self._chunks), default=0)
 
     def _put(self, data: Any) -> None:
         view = memoryview(data)

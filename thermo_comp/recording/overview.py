@@ -109,7 +109,7 @@ def unused_thermometers(reader: RecordingReader) -> list[str]:
             found.append(shown(name))
             continue
         fields = temperature_fields(kind, reader.definitions)
-        found += [shown(f'{name}:{one}') for one in fields if (name, one) not in used]
+        found += [shown(f'{name}:{field}') for field in fields if (name, field) not in used]
     return found
 
 
@@ -201,8 +201,8 @@ def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None
     """Describe a thermometer by pieces of its readings; None without a finite reading."""
     if not readings:
         return None
-    stamp_ns = np.concatenate([one.stamp_ns for one in readings])
-    celsius = np.concatenate([one.celsius for one in readings])
+    stamp_ns = np.concatenate([reading.stamp_ns for reading in readings])
+    celsius = np.concatenate([reading.celsius for reading in readings])
     use = np.isfinite(celsius)
     stamp_ns, celsius = stamp_ns[use], celsius[use]
     if not len(celsius):

@@ -70,7 +70,7 @@ class RecordingReader(ExitStack):
         self.callback(self._files.clear)
         try:
             self.info = self._open(path)
-            self.definitions = {k: d for one in self._files for k, d in one.definitions.items()}
+            self.definitions = {k: d for file in self._files for k, d in file.definitions.items()}
             with translated(path):
                 found = select_topics(self.info.topics, topics, require, self.info.metadata)
                 self.topics: Mapping[Role, str] = found.topics
@@ -261,7 +261,7 @@ def _described(path: Path) -> _Description:
         for suffix in ('.mcap', '.db3'):
             files = [one for one in path.iterdir() if one.suffix == suffix and one.is_file()]
             if files:
-                if len({re.sub(r'_[0-9]+$', '', one.stem) for one in files}) > 1:
+                if len({re.sub(r'_[0-9]+$', '', file.stem) for file in files}) > 1:
                     raise RecordingError(
                         f'a folder of {len(files)} bags, not a bag: give *{suffix} in it', path
                     )

@@ -190,7 +190,7 @@ def as_cdr(messages: Messages, kind: str) -> Messages:
     """Convert ROS 1 messages to CDR; RecordingError for invalid bytes."""
     convert = typestore().ros1_to_cdr
     try:
-        pieces = [bytes(convert(one, kind)) for one in messages]
+        pieces = [bytes(convert(message, kind)) for message in messages]
     except Exception as error:  # damaged bytes surface there as nearly any exception type
         raise _misfit(kind) from error
     return Messages.of(pieces, messages.channel, messages.log_ns)

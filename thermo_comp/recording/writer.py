@@ -222,7 +222,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         if len(messages):
             channel = np.full_like(messages.channel, number)
             self._batches.append(replace(messages, channel=channel))
-            if sum(len(one.data) for one in self._batches) > _AUTO_FLUSH_BYTES:
+            if sum(len(batch.data) for batch in self._batches) > _AUTO_FLUSH_BYTES:
                 self.flush()
 
     @contextmanager

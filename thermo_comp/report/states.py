@@ -52,7 +52,7 @@ def programs(calibration: Calibration) -> list[Program]:
     if calibration.response or static != dynamic:
         cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
         ramps = (Program('heating', dynamic, heating), Program('cooling', dynamic, cooling))
-        found += [one for one in ramps if one.rate_k_min]
+        found += [ramp for ramp in ramps if ramp.rate_k_min]
     return found
 
 
@@ -73,8 +73,8 @@ def evaluate(calibration: Calibration, program: Program, temperature: Floats) ->
 def curves(calibration: Calibration) -> list[Curve]:
     """Evaluate each program over the whole range of its set."""
     return [
-        evaluate(calibration, one, np.linspace(*one.regime.temperature_range_c, _N_CURVE))
-        for one in programs(calibration)
+        evaluate(calibration, program, np.linspace(*program.regime.temperature_range_c, _N_CURVE))
+        for program in programs(calibration)
     ]
 
 

@@ -142,7 +142,7 @@ class LiveTopics:
         if field is not None:
             self._fields[role], self._feeds[role] = field, Topic(name, TEMPERATURE, 'cdr')
             self._heard[role] = self._loop.subscribe(field.kind, name, _AS_OFFERED, is_hot=False)
-        elif any(one.topic_type != kind for one in offers):
+        elif any(offer.topic_type != kind for offer in offers):
             problems.append(f'{name} has the type {offers[0].topic_type}, expected {kind}')
         elif offers:
             self._feeds[role] = Topic(name, kind, 'cdr')

@@ -126,7 +126,7 @@ class CompensationNode:
 
     def _prepare(self, changes: list[Parameter]) -> tuple[LoadedCalibration, Model] | None:
         """Read, try and build the calibration of a change, in parallel to the samples."""
-        names = [one.value for one in changes if one.name == 'calibration_file']
+        names = [change.value for change in changes if change.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
         loaded = self._reader.read(names[-1], self._config.calibration_directory)
@@ -140,7 +140,7 @@ class CompensationNode:
         loaded, model = new or (before.loaded, before.compensator.thermal.model)
         config = parameters.updated(before.config, changes)
         self._check(loaded, config, before.compensator.thermal.inputs)
-        known = [one.name for one in changes if self.node.has_parameter(one.name)]
+        known = [change.name for change in changes if self.node.has_parameter(change.name)]
         values = self.node.get_parameters(known)
         try:
             after = self._relay.successor(loaded, model, config)

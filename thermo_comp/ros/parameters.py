@@ -246,7 +246,7 @@ class ParameterRequests:
     def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
         is_each, n, reason = kind is srv.SetParameters, len(request.parameters), ''
         groups = [[one] for one in request.parameters] if is_each else [request.parameters]
-        waits = any(one.name == 'calibration_file' for one in request.parameters)
+        waits = any(parameter.name == 'calibration_file' for parameter in request.parameters)
         results: list[SetParametersResult] = []
 
         def respond() -> None:
@@ -284,7 +284,7 @@ class ParameterRequests:
         """Apply one group; an unexpected error refuses it and is logged by the loop."""
         try:
             changes, found = prepared.result()
-            news = [one for one in changes if not self._is_in_force(one)]
+            news = [change for change in changes if not self._is_in_force(change)]
             result = self._apply(news, found) if news else SetParametersResult(successful=True)
             results.append(result if result.successful else _refusal(result.reason))
         except (ThermoCompError, ParameterNotDeclaredException) as error:

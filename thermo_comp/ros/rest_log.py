@@ -216,7 +216,7 @@ def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floa
         return np.zeros(0, np.int64), np.zeros((0, 3))
     content = b''.join(messages)
     if len(content) != size * len(messages):
-        content = b''.join([one for one in messages if len(one) == size])
+        content = b''.join([message for message in messages if len(message) == size])
     at = size + (_FORCE if is_imu else _COUNTS)
     # An angular rate and the first element of its covariance, which is -1 where there is none.
     fields = [('plain', 'S4', 0), ('sec', '<i4', 4), ('nanosec', '<u4', 8), ('force', '3<f8', at)]
