@@ -114,8 +114,8 @@ class Acquisition:
 
     def add(self, block: Block) -> list[int]:
         """Take a block; return the stamps [ns] at which further positions begin."""
-        for name, one in block.temperatures.items():
-            self._readings.setdefault(name, []).append(one)
+        for name, readings in block.temperatures.items():
+            self._readings.setdefault(name, []).append(readings)
         if not len(block):
             return []
         begins: list[int] = []

@@ -72,7 +72,7 @@ def evaluate(
     if csv is not None:
         with table_writer(csv, {}, overwrite=force) as write:
             write(columns_of(judged.windows, list(map(shown_name, bags))))
-    drifts = drifts_of(history_of([one for _, one in models]))
+    drifts = drifts_of(history_of([model for _, model in models]))
     tell_sections(out, result.judgements)
     _tell_axes(out, judged)
     _tell_levels(out, judged)
@@ -94,7 +94,7 @@ def evaluate(
         notes=result.notes,
         **judged.facts(),
         history=drifts,
-        calibrations={name: one.facts() for name, one in result.judgements.items()},
+        calibrations={name: judgement.facts() for name, judgement in result.judgements.items()},
     )
 
 

@@ -200,9 +200,9 @@ def _tell(out: Output, account: 'Account', problems: Sequence[str], told: dict[s
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         told.pop('problem', None)
-    for number, one in enumerate(account.positions, 1):
-        if one.n_rests:
-            news[f'position {number}'] = f'{one.reason or "good"}; {_reading(one.up)}'
+    for number, position in enumerate(account.positions, 1):
+        if position.n_rests:
+            news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
     # Ignore the reading after the semicolon, which always changes a little.
     new = {name: said for name, said in news.items() if told.get(name) != said.partition(';')[0]}
     for name, said in new.items():
@@ -219,18 +219,18 @@ def _reading(up: 'Floats') -> str:
 
 def _rows(positions: Sequence['Position']) -> list[tuple[Cell, ...]]:
     rows: list[tuple[Cell, ...]] = []
-    for number, one in enumerate(positions, 1):
-        board = one.thermometers.get('board')
+    for number, position in enumerate(positions, 1):
+        board = position.thermometers.get('board')
         spans: tuple[Cell, ...] = ('', '')
         if board is not None:
             spans = (
                 f'{board.lowest:.1f} .. {board.highest:.1f}',
                 f'{board.steepest_cooling_k_min:.2f} .. {board.steepest_heating_k_min:.2f}',
             )
-        up = [f'{value:+.2f}' for value in one.up] if one.n_rests else [''] * 3
-        more = f', {one.n_rests} rests' if one.n_rests > 1 else ''
-        still = f'{one.still_s / 60.0:.1f}'
-        rows.append((number, *up, still, *spans, (one.reason or 'good') + more))
+        up = [f'{value:+.2f}' for value in position.up] if position.n_rests else [''] * 3
+        more = f', {position.n_rests} rests' if position.n_rests > 1 else ''
+        still = f'{position.still_s / 60.0:.1f}'
+        rows.append((number, *up, still, *spans, (position.reason or 'good') + more))
     return rows
 
 

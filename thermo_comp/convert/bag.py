@@ -51,8 +51,8 @@ def bag_log(
         columns.accel,
         None if columns.imu is None else columns.imu.angular_velocity,
         {
-            name: one.take(np.isfinite(one.celsius))
-            for name, one in columns.temperatures.items()
+            name: readings.take(np.isfinite(readings.celsius))
+            for name, readings in columns.temperatures.items()
             if name in found
         },
         unit=unit,

@@ -111,7 +111,7 @@ def _static_curves(calibration: Calibration) -> _Curves:
     return _Curves(
         temperature,
         K,
-        level=np.array([axis.bias + one.delta for axis, one in levels]),
+        level=np.array([axis.bias + regime.delta for axis, regime in levels]),
         bias=np.array([one.bias_function.value(t) for one in sets]) / K[:, None],
         scale=np.array([one.scale_function.value(t) for one in sets]) - 1.0,
     )

@@ -159,7 +159,7 @@ def write_log(
     steps = np.diff(newest)
     low, high = log.clip or (-np.inf, np.inf)
     beyond = (log.accel <= low) | (log.accel >= high)
-    counts = {name: len(one.stamp_ns) for name, one in log.temperatures.items()}
+    counts = {name: len(readings.stamp_ns) for name, readings in log.temperatures.items()}
     return ConversionReport(
         log,
         rows=len(usable) + log.n_short,

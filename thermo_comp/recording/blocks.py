@@ -178,7 +178,7 @@ class Block:
     @property
     def stamp_ns(self) -> dict[Role, Ints]:
         """The stamps of each role."""
-        stamps = {name: one.stamp_ns for name, one in self.temperatures.items()}
+        stamps = {name: readings.stamp_ns for name, readings in self.temperatures.items()}
         return {'accel': self.accel_stamp_ns, **stamps}
 
     def take(self, rows: Mapping[Role, Bools]) -> Block:
@@ -186,9 +186,9 @@ class Block:
         own = rows['accel']
         n_before = np.concatenate(([0], np.cumsum(own)))
         temperatures = {}
-        for name, one in self.temperatures.items():
-            after = n_before[one.after[rows[name]]]
-            temperatures[name] = one.take(rows[name])._replace(after=after)
+        for name, readings in self.temperatures.items():
+            after = n_before[readings.after[rows[name]]]
+            temperatures[name] = readings.take(rows[name])._replace(after=after)
         return Block(
             self.accel_stamp_ns[own],
             self.accel[own],
@@ -259,11 +259,11 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
     newest = np.concatenate([np.maximum.accumulate(run) for run in np.split(samples, jumps)])
     temperatures, kept = dict(block.temperatures), {}
-    for name, one in block.temperatures.items():
-        is_bare = one.stamp_ns == NO_STAMP_NS
+    for name, readings in block.temperatures.items():
+        is_bare = readings.stamp_ns == NO_STAMP_NS
         if is_bare.any():
-            stamp_ns = np.where(is_bare, newest[one.after], one.stamp_ns)
-            temperatures[name] = one._replace(stamp_ns=stamp_ns)
+            stamp_ns = np.where(is_bare, newest[readings.after], readings.stamp_ns)
+            temperatures[name] = readings._replace(stamp_ns=stamp_ns)
             kept[name] = stamp_ns != NO_STAMP_NS
             if name in block.raw:
                 _restamp(block.raw[name], stamp_ns)
@@ -281,9 +281,9 @@ def _restamp(messages: Messages, stamp_ns: Ints) -> None:
 
 def clocks_apart(block: Block) -> str:
     """Name a thermometer whose stamps are far from those of the samples around it."""
-    for name, one in block.temperatures.items():
-        inside = (one.after > 0) & (one.after < len(block))
-        stamp_ns, after = one.stamp_ns[inside], one.after[inside]
+    for name, readings in block.temperatures.items():
+        inside = (readings.after > 0) & (readings.after < len(block))
+        stamp_ns, after = readings.stamp_ns[inside], readings.after[inside]
         edges = block.accel_stamp_ns[after - 1], block.accel_stamp_ns[after]
         apart_s = (stamp_ns - np.clip(stamp_ns, *edges)) * 1e-9
         if len(apart_s) >= _FEWEST_READINGS and abs(middle := np.median(apart_s)) > _APART_S:

@@ -179,8 +179,8 @@ class _Cursor:
         """Advance past a field."""
         node, content = description
         if node == _NAME:
-            for _, one in self._definitions[content][1]:
-                self.skip(one)
+            for _, definition in self._definitions[content][1]:
+                self.skip(definition)
         elif node != _BASE:
             counts = self._count(description)
             kind = _KINDS.get(content[0][1][0]) if content[0][0] == _BASE else None

@@ -148,7 +148,7 @@ class McapOutput:
     def _information(self) -> dict[str, Any]:
         """Build metadata.yaml as in Jazzy."""
         start_ns, end_ns = self._times()
-        kinds = {one.id: kind for kind, one in self._schemas.items()}
+        kinds = {schema.id: kind for kind, schema in self._schemas.items()}
         counted: list[dict[str, Any]] = [
             {
                 'topic_metadata': {

@@ -82,11 +82,11 @@ def thermal_findings(
         for name, rate in (('heating', heating), ('cooling', cooling)):
             if rate < RAMP_K_MIN:
                 found.append(f'no {name} ramp: the dynamic set would be extrapolated to {name}')
-    for name, one in thermometers.items():
-        reads = f'{name} reads {one.lowest:.4g} .. {one.highest:.4g}'
-        if one.lowest < COLDEST or one.highest > HOTTEST:
+    for name, thermometer in thermometers.items():
+        reads = f'{name} reads {thermometer.lowest:.4g} .. {thermometer.highest:.4g}'
+        if thermometer.lowest < COLDEST or thermometer.highest > HOTTEST:
             found.append(f'{reads}: that is not degC')
-        elif KELVINS[0] < one.lowest and one.highest < KELVINS[1]:
+        elif KELVINS[0] < thermometer.lowest and thermometer.highest < KELVINS[1]:
             found.append(f'temperature/{reads} degC: that looks like kelvins')
     if 'case' not in thermometers:
         found.append(
@@ -125,8 +125,8 @@ def survey_recording(
         readings: dict[str, list[Readings]] = {}
         clock = _Clock()
         for block in reader.blocks():
-            for name, one in block.temperatures.items():
-                readings.setdefault(name, []).append(one)
+            for name, temperature in block.temperatures.items():
+                readings.setdefault(name, []).append(temperature)
             if not len(block):
                 continue
             clock.add(block.accel_stamp_ns)

@@ -149,10 +149,10 @@ class RecordingReader(ExitStack):
         def decoded() -> Iterator[Block]:
             for path, topics, messages in self._read(set(self.topics.values()), {'cdr', 'ros1'}):
                 feeds = [
-                    Feed(number, role, one, self.fields.get(role))
+                    Feed(number, role, topic, self.fields.get(role))
                     for role, name in self.topics.items()
-                    for number, one in topics.items()
-                    if one.name == name
+                    for number, topic in topics.items()
+                    if topic.name == name
                 ]
                 with translated(path):
                     found = decode_blocks(messages, feeds, self.topics, keep_raw=raw)

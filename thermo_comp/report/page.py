@@ -173,8 +173,8 @@ def drawn_figures(figures: Sequence[ReportFigure]) -> list[tuple[ReportFigure, s
     """Draw figures for a page, as SVG."""
     with drawing():
         return [
-            (one, svg(one.draw(), f'f{number}', one.question))
-            for number, one in enumerate(figures, 1)
+            (figure, svg(figure.draw(), f'f{number}', figure.question))
+            for number, figure in enumerate(figures, 1)
         ]
 
 

@@ -125,7 +125,7 @@ class Player:
         """Send the bag; after each window `throttle` gets the number of samples, and may block."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
-        topics = {one.topic_name: role for role, one in self._publishers.items()}
+        topics = {publisher.topic_name: role for role, publisher in self._publishers.items()}
         unheard = self.unheard()
         lossy = [
             name

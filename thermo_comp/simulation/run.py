@@ -96,14 +96,14 @@ def arrays(
     return [
         simulate(
             unit,
-            one.program,
-            one.up,
+            station.program,
+            station.up,
             rate_hz=rate_hz,
             seed=1000 * seed + k,
             start_ns=0,
-            spin=one.spin,
+            spin=station.spin,
         )
-        for k, one in enumerate(stations)
+        for k, station in enumerate(stations)
     ]
 
 

@@ -133,8 +133,8 @@ class Curves:
         result = []
         for place, functions in enumerate(zip(*self._functions.rows, strict=True)):
             found = []
-            for regime, one in enumerate(functions):
-                basis = shares[regime] * np.reshape(one.basis(held[regime]), (-1, len(t)))
+            for regime, function in enumerate(functions):
+                basis = shares[regime] * np.reshape(function.basis(held[regime]), (-1, len(t)))
                 if is_outside:
                     basis += self._followed(regime, place, t, shares)
                 found += [shares[regime], *basis]

@@ -142,14 +142,14 @@ def nonlinear_coefficients(calibration: Calibration) -> list[Coefficients]:
         sd = np.sqrt(variance).reshape(sd.shape)
     names = {'square': ('K2', 'µg/g²'), 'odd_square': ('Kq', 'µg/g²'), 'cube': ('K3', 'µg/g³')}
     found = []
-    for k, one in enumerate(terms):
-        name, unit = names[one.kind]
+    for k, term in enumerate(terms):
+        name, unit = names[term.kind]
         found += [
-            Coefficients(name, unit, 1e6 * np.array(one.coefficient), 1e6 * sd[:, 0, k]),
+            Coefficients(name, unit, 1e6 * np.array(term.coefficient), 1e6 * sd[:, 0, k]),
             Coefficients(
                 f'{name} per kelvin',
                 f'{unit}/K',
-                1e6 * np.array(one.per_kelvin),
+                1e6 * np.array(term.per_kelvin),
                 1e6 * sd[:, 1, k],
             ),
         ]
