@@ -87,7 +87,7 @@ _PREPARED: dict[str, Bounds] = {
     'temperature rate': _between(-1e5, 1e5, 'K/min', 'a thermal shock is 1e3'),
     'rate span': _positive(1e-6, 2e5, 'K/min', 'a kelvin in two years'),
     'time constant': _positive(1e-3, 1e8, 's', 'a bare wire; three years'),
-    'lag': _nil_or(1e-3, 1e8, 's', 'as a time constant; 0 is none'),
+    'lag': _nil_or(1e-3, 1e8, 's', 'as for a time constant; 0 is no lag'),
     # The response.
     'value of a column': _between(-1e10, 1e10, 'of its kind', 'the cube of 1273 K is 2e9'),
     'span of a column': _positive(1e-9, 2e10, 'of its kind', 'a millionth of a rate of 0.1 K/min'),
@@ -95,8 +95,10 @@ _PREPARED: dict[str, Bounds] = {
     'gradient': _between(-1273.15, 1273.15, 'K', '0 K to where solder melts'),
     'power': Bounds(at_least=0, at_most=4, why='powers above the third are not observed'),
     # Noise and deviations.
-    'noise density': _positive(1e-12, 1e3, 'm/s^2/sqrt(Hz)', 'a thousandth of the best; 100 g'),
-    'rate noise density': _positive(1e-12, 1e3, 'rad/s/sqrt(Hz)', 'of the best; 57000 deg/s'),
+    'noise density': _positive(1e-12, 1e3, 'm/s^2/sqrt(Hz)', 'far below any sensor; 100 g'),
+    'rate noise density': _positive(
+        1e-12, 1e3, 'rad/s/sqrt(Hz)', 'far below any sensor; 57000 deg/s'
+    ),
     'slow noise': _up_to(1e3, 'm/s^2/sqrt(h)', '100 g in an hour'),
     'rate slow noise': _up_to(1e3, 'rad/s/sqrt(h)', '57000 deg/s in an hour'),
     'deviation': _up_to(1e4, 'm/s^2', '1000 g: nothing is known'),

@@ -20,7 +20,7 @@ def update(
     output: Path = options.NEW_CALIBRATION,
     gravity: float | None = options.place,
     ahead: float = option(
-        'Days until the next update: the claim is aged by them.', 1.0, min=0.0, max=3650.0
+        'Days until the next update; the uncertainty is aged by them.', 1.0, min=0.0, max=3650.0
     ),
     force: bool = options.FORCE,
     out: Output = options.out,

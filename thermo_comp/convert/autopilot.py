@@ -41,7 +41,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while the autopilot corrects drift: values from stamps on; advice."""
+    """A parameter that is 1 while drift is corrected: its changes, and advice to the user."""
 
     parameter: str
     since_ns: Sequence[int]
@@ -228,7 +228,7 @@ def _dataflash(path: Path) -> _Held:
     metadata = {}
     changes: dict[str, list[tuple[int, float]]] = {}
     if any(str(key).startswith('SIM_') for key in reader.params):
-        metadata['ardupilot_simulated'] = 'it has SIM_ parameters: a simulator wrote this log'
+        metadata['ardupilot_simulated'] = 'the log has SIM_ parameters: a simulator wrote it'
     try:
         for name in sorted(reader.name_to_id):
             if not re.fullmatch(r'IMU\d?|BARO|BAR\d|PARM', name):

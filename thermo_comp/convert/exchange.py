@@ -71,8 +71,8 @@ def _content(
         of_counts = 'offsets are counts divided by K: the driver must scale by these K'
     else:
         content = _constant(calibration, curves)
-        of_counts = 'it is for counts, like the calibration'
-    of_type = 'it is the mean of a type of unit, without the deviations of this unit'
+        of_counts = 'the file is for counts, like the calibration'
+    of_type = 'the calibration is the mean of a type of unit, without the deviations of this unit'
     notes = [
         *[of_type] * (calibration.provenance.model == unit.POPULATION),
         *content.notes,
@@ -158,7 +158,7 @@ def _thermal(
 
 def _constant(calibration: Calibration, curves: _Curves) -> Content:
     """Return bias, scale and misalignment at the reference, for tools of tumble tests."""
-    drift = 'it has no correction for temperature'
+    drift = 'the calibration has no correction for temperature'
     if calibration.needs_temperature:
         drift = (
             f'over the calibrated range the bias moves by up to '
@@ -166,7 +166,7 @@ def _constant(calibration: Calibration, curves: _Curves) -> Content:
             f'{1e6 * curves.scale_drift:.2g} ppm'
         )
     reference_c = calibration.reference_temperature_c
-    notes = [f'it holds at {reference_c:g} degC: {drift}']
+    notes = [f'the file holds at {reference_c:g} degC: {drift}']
     notes += ['angular rate: is lost'] * (calibration.gyroscope is not None)
     cubics = np.pad(curves.level[:, None], ((0, 0), (0, 3)))
     matrix = np.array(calibration.misalignment) / curves.K

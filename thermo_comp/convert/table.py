@@ -264,8 +264,9 @@ def read_parquet(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, _style: Format | None = None
 ) -> Table:
     """
-    Read columns of a Parquet file as of text; its own timestamps state their unit. Of all columns,
-    None, those that hold no numbers are NaN.
+    Read columns of a Parquet file as of text; its own timestamps state their unit.
+
+    If `columns` is None all columns are read; those without numbers become NaN.
     """
     pq = library('pyarrow.parquet', 'parquet', 'a Parquet file', path)
     import pyarrow as pa

@@ -105,7 +105,7 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
     classes = [f'{one:g} .. {one + _CLASS_K:g} degC' for one in lower]
     warmer = [f'{one:g} .. {one + _CLASS_K:g} degC' for one in np.unique(lower)]
     is_out = [not row.is_within for row in days]
-    # Two days in a row are required, because a single day may be a disturbed place.
+    # Two days in a row are required: on a single day the unit may have been disturbed.
     n_out = ([*is_out[::-1], False]).index(False)
     left = days[-n_out].name if n_out >= min(2, len(days)) and n_out else None
     last, ageing = days[-1].name, None

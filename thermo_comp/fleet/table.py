@@ -27,7 +27,7 @@ from ..unit.prediction import in_a_soak
 Cell = str | int | float | None
 Row = Mapping[str, Cell]
 
-#: Values of the column `verdict` without a verdict of `judging`.
+#: Values of the column `verdict` for tests that were not judged.
 REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
 # First characters of a spreadsheet formula.
 _FORMULA = ('=', '+', '-', '@')

@@ -122,7 +122,8 @@ def judge(
 ) -> Judgement:
     """
     Judge a calibration by its windows; windows of the fit's bags (`is_seen`) by the RMS on
-    positions left out. A `tolerance` on the RMS [m/s^2] decides if given.
+    positions left out. If a `tolerance` on the RMS
+    [m/s^2] is given, it decides instead of the claim.
     """
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)

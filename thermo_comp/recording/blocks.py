@@ -274,7 +274,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
 
 
 def _restamp(messages: Messages, stamp_ns: Ints) -> None:
-    """Write stamps into serialized messages, little-endian and with a header each."""
+    """Write stamps into the headers of serialized little-endian messages."""
     stamps = np.stack((stamp_ns // 10**9, stamp_ns % 10**9), axis=1).astype('<i4')
     scatter(messages.data, messages.start + 4, stamps.view((np.void, 8))[:, 0])
 

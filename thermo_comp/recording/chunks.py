@@ -84,7 +84,8 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 class Span:
     """
     A part of a file: a chunk, a chunk without end ('torn'), or messages outside chunks ('loose').
-    `position` and `length` [bytes] exclude the message indexes after it; `size` is the content's.
+    `position` and `length` [bytes] exclude the message indexes after it; `size` is that of its
+    decompressed content [bytes].
     """
 
     position: int

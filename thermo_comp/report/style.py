@@ -84,7 +84,7 @@ def svg(figure: Figure, name: str, label: str) -> str:
     figure.savefig(buffer, format='svg', metadata=nothing)
     text = re.sub(r'>\s+<', '><', buffer.getvalue().replace('xlink:', ''))
     text = re.sub(r'\b(id="|href="#|url\(#)', rf'\g<1>{name}-', text)
-    # Two decimals are a hundredth of a point.
+    # Coordinates with two decimals, a hundredth of a point, keep the file small.
     text = re.sub(r' d="[^"]*"', lambda path: re.sub(r'(\.\d\d)\d+|\n', r'\1', path[0]), text)
     about = f'role="img" aria-label="{escape(label)}"'
     return text[text.index('<svg') :].replace('<svg', f'<svg {about}', 1).strip()

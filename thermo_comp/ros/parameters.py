@@ -272,7 +272,7 @@ class ParameterRequests:
                 future = self._beside.submit(read) if waits else _done(read)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
-        # Limited: to write a result per parameter would take as long as to read them.
+        # The number of results is limited: to write one per parameter takes as long as to read it.
         results += [_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT)
         respond()
 

@@ -274,7 +274,7 @@ class Correction:
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
             v += self._spread(np.concatenate((bent, bent)), bends)
-            # The residual of the fit does not hold far outside: it grows with the distance.
+            # The variance is that of the calibrated ranges: it grows with the distance from them.
             v *= (1.0 + (outside + columns_out) ** 2)[:, np.newaxis]
         doubt = unknown + weight * rest + outside * outside
         if not (is_beyond or doubt.any()):

@@ -17,7 +17,7 @@ _WeightSd = Annotated[float, QUANTITIES['deviation of a weight']]
 class GroupEvidence:
     """Contribution of one group of columns to the fit."""
 
-    group: Annotated[str, 'The group, as in `response`.']
+    group: Annotated[str, 'Name of the group, as in the key `response`.']
     part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
     explains_m_s2: Annotated[_Error, "RMS of the group's correction."]
     effective_parameters: Annotated[
