@@ -36,7 +36,7 @@ class Kind:
     suffixes: tuple[str, ...] = ()  # accepted suffixes; empty: any
 
     def refusal(self, path: Path) -> str:
-        """Say why an existing file or folder is not of this kind; empty if it is."""
+        """Return why an existing file or folder is not of this kind; empty if it is."""
         if path.is_dir() != self.is_folder:
             return f'it is a {"folder" if path.is_dir() else "file"}'
         if self.is_folder:

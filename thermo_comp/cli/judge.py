@@ -124,7 +124,7 @@ def _tell_levels(out: Output, judged: 'Judgement') -> None:
                 )
                 for size, one in judged.by_force.items()
             ],
-            title='what is left over |f|: corrected less known magnitude',
+            title='residual by |f|: corrected magnitude less the known one',
         )
 
 

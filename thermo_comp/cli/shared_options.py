@@ -246,7 +246,7 @@ def force(
         'Its standard deviation, in m: the radius is then estimated.', min=0.0
     ),
 ) -> Any:
-    """Build what the user says of |f|."""
+    """Build the statement of the user about |f|."""
     from ..fitting.known_force import AskedForce
 
     with usage_of():

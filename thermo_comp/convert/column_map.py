@@ -184,7 +184,7 @@ def _read(
 
 
 def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
-    """Tell the columns of a table, by its headings if any; `rate_hz` is for one without times."""
+    """Guess the columns of a table, by headings if any; `rate_hz` is for one without times."""
     table = _read(path, None, Stamp(rate_hz=1.0))
     named = read_headings(table.headings) if table.headings else _unnamed(path, len(table.values))
     if named is None or (named.time is None and rate_hz is None):
@@ -251,7 +251,7 @@ def spoken_columns(columns: ColumnMap) -> str:
 def _stamp(
     path: Path, named: Headings, times: Floats | None, rate_hz: float | None, accel: Floats
 ) -> Stamp:
-    """Tell the kind of times, if not by their heading, by the sample interval."""
+    """Guess the unit of the times by their heading, or else by the sample interval."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
     if rate_hz is not None:

@@ -204,7 +204,7 @@ def _blocks(
 
 
 def _along_axes(part: Truth, to_axes: Floats) -> Floats:
-    """Return the force along the sensitivity axes, with what nonlinear axes read beside it."""
+    """Return the force along the sensitivity axes, with the nonlinear part of their readings."""
     s: Floats = np.zeros(3)
     for j in range(3):
         s = s + part.specific_force[..., j, None] * to_axes[:, j]

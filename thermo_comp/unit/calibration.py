@@ -219,7 +219,8 @@ class Calibration:
         Posterior | None, 'Covariance of all parameters; null where it is unknown.'
     ] = None
     nonlinearity: Annotated[
-        Nonlinearity | None, 'Of the axes over specific force; null: only 1 g was seen.'
+        Nonlinearity | None,
+        'Nonlinearity of the axes over specific force; null: only 1 g was seen.',
     ] = None
     gyroscope: Annotated[
         Gyroscope | None, "Bias of the unit's gyroscope; null: the angular rate is not corrected."

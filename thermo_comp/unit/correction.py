@@ -49,8 +49,8 @@ class Excess(NamedTuple):
     """How far a thermal state lies outside the calibrated ranges; 0 inside."""
 
     temperature: float  # beyond the range of the regime's set, signed [K]
-    rate: float  # the same [K/s]
-    gradient: float  # of the sensor farthest outside, signed [K]
+    rate: float  # rate of the board beyond the range, signed [K/s]
+    gradient: float  # gradient of the sensor farthest outside, signed [K]
     relative: float  # sum of all distances, each in half ranges
 
 

@@ -30,8 +30,8 @@ def residual_statistics(residual: Floats) -> ResidualStatistics:
 
 def norm_residual(specific_force: Floats, gravity: float | Floats) -> Floats:
     """
-    Return ``|f| - g`` of forces, shape (..., 3): the residual that needs no attitude. Where |f| is
-    known and not g it takes its place.
+    Return ``|f| - g`` of forces, shape (..., 3): the residual that needs no attitude. If the known
+    |f| of a rest is not g, it is passed as `gravity`.
     """
     square = np.einsum('...i,...i->...', specific_force, specific_force)
     return np.asarray(np.sqrt(square) - gravity)

@@ -57,7 +57,7 @@ class SlowUncertainty:
     def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[float]:
         """
         Evaluate a, b, c of each axis at one state: ``v(x) = a + b x + c x^2`` [m^2/s^4]; with a
-        nonlinearity then what it adds to the coefficients of x^2 to x^6 of each axis.
+        nonlinearity then its contribution to the coefficients of x^2 to x^6 of each axis.
         """
         states = np.array(state)[:, np.newaxis]
         table = self._correction.table

@@ -12,7 +12,7 @@ from .functions import TemperatureFunction, check_reference
 from .posterior import Posterior, lay_out
 from .schema import Vector
 
-#: A unit of angular rates [rad/s].
+#: One millidegree per second, a unit of gyroscope errors [rad/s].
 MILLIDEGREE = math.radians(1e-3)
 NIL = (0.0, 0.0, 0.0)
 #: The largest angular rate of a gyroscope, and its largest bias [rad/s].
