@@ -36,7 +36,7 @@ class PlainYamlError(ValueError):
 
     def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
         where = '' if line is None else f' (line {line})'
-        self.rule = f'{problem}{where}'  # the same without the detail
+        self.rule = f'{problem}{where}'  # the message without the detail
         super().__init__(f'{problem}: {detail}{where}' if detail else self.rule)
 
 

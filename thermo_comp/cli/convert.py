@@ -60,7 +60,8 @@ def convert(
     from the headings and printed; a table of [t] ax ay az [wx wy wz] needs no
     headings. In a PX4 or ArduPilot log the IMU's temperature becomes the
     board's, the barometer's the case's. In a bag the thermometer in the
-    namespace of the Imu becomes the board's, of a barometer the case's.
+    namespace of the Imu becomes the board's, that of a
+    barometer the case's.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42

@@ -223,7 +223,7 @@ class ParameterRequests:
     """Answers a node's parameter services."""
 
     # `prepare` does the slow part of a change in parallel to the samples, `apply` sets its result
-    # between two samples. An exception of either refuses the change.
+    # between two samples. An exception of `prepare` or `apply` refuses the change.
     def __init__(
         self,
         loop: WaitLoop,
