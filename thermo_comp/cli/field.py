@@ -18,7 +18,7 @@ def update(
     calibration: Path = argument('Calibration of the unit (YAML).', metavar='YAML'),
     rests: list[Path] = argument('Rest logs: folders of the node, or files.', metavar='RESTS...'),
     output: Path = options.NEW_CALIBRATION,
-    gravity: float | None = options.place,
+    where: tuple[float | None, float] = options.place,
     ahead: float = option(
         'Days until the next update; the uncertainty is aged by them.', 1.0, min=0.0, max=3650.0
     ),
@@ -45,7 +45,7 @@ def update(
     old = load_calibration(calibration)
     logged, source, notes = read_rests(rests, old, ahead=ahead)
     created = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
-    result = run(series_of(logged, old, gravity), old, source, created, ahead)
+    result = run(series_of(logged, old, gravity=where[0]), old, source, created, ahead)
     out.points(notes)
     out.table(
         ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),

@@ -266,10 +266,6 @@ class Compensator:
         """Use another calibration from the next sample on."""
         vars(self).update(vars(self.successor(Model(calibration), self.config)))
 
-    def reconfigure(self, config: CompensatorConfig) -> None:
-        """Use other settings from the next sample on."""
-        vars(self).update(vars(self.successor(self.thermal.model, config)))
-
     def successor(self, model: Model, config: CompensatorConfig) -> Compensator:
         """
         Build a compensator that continues from the last sample with another model or settings.

@@ -116,11 +116,11 @@ def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]
     return np.insert(time, at, time[at - 1]), np.insert(value, at, np.nan, axis=0)
 
 
-def legend_above(axes: Axes, title: str | None = None, *, share: float = 1.0) -> None:
-    """Put the legend above axes with a `share` of the width, in as many columns as fit."""
+def legend_above(axes: Axes, title: str | None = None) -> None:
+    """Put the legend above axes, in as many columns as fit."""
     if labels := axes.get_legend_handles_labels()[1]:
         # Width of a legend entry: its label, and a handle as wide as eight letters.
-        n = min(max(1, int(share * 100 / (8 + max(map(len, labels))))), len(labels))
+        n = min(max(1, int(100 / (8 + max(map(len, labels))))), len(labels))
         look: Line = {'ncols': n, 'title': title, 'alignment': 'left'}
         axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.01), **look)
 

@@ -365,9 +365,7 @@ class Calibration:
         """Whether it was fitted with a case thermometer, or has columns computed from it."""
         columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
         return self.detector.case != ThermometerSettings() or any(
-            column.kind in {'gradient', 'gradient_lag', 'size', 'gradient_even'}
-            or (column.kind == 'square' and not column.tau_s)
-            for column in columns
+            column.is_of_sensor for column in columns
         )
 
     @property
