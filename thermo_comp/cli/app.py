@@ -133,17 +133,17 @@ def _plain(message: str, arguments: list[str]) -> str:
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Split arguments into a command's and those of ROS (from ``--ros-args`` up to ``--``)."""
-    own: list[str] = []
-    ros: list[str] = []
-    target = own
+    for_command: list[str] = []
+    for_ros: list[str] = []
+    target = for_command
     for argument in arguments:
         if argument == '--ros-args':
-            target = ros
-        elif argument == '--' and target is ros:
-            target = own
+            target = for_ros
+        elif argument == '--' and target is for_ros:
+            target = for_command
         else:
             target.append(argument)
-    return own, ros
+    return for_command, for_ros
 
 
 def _unexpected(failure: Exception) -> int:

@@ -44,21 +44,21 @@ def info(
         return
     with out.progress(f'reading {path.name}') as done:
         survey = survey_recording(path, topics, done)
-    found, thermometers = survey.info, survey.thermometers
-    out.line(f'{path}: {found.storage}, {found.n_messages} messages')
-    for key, value in found.metadata.items():
+    bag, thermometers = survey.info, survey.thermometers
+    out.line(f'{path}: {bag.storage}, {bag.n_messages} messages')
+    for key, value in bag.metadata.items():
         if key in ('serial', 'converted_from', 'corrected_from', 'simulated_by'):
             out.line(f'  {key.replace("_", " ")}: {value}')
-    rows = sorted((name, kind, count) for name, (kind, count) in found.topics.items())
+    rows = sorted((name, kind, count) for name, (kind, count) in bag.topics.items())
     out.table(('topic', 'type', 'messages'), rows)
     if survey.n:
         out.line(
-            f'{survey.n} samples of {found.input}, {survey.rate_hz:.4g} Hz, '
+            f'{survey.n} samples of {bag.input}, {survey.rate_hz:.4g} Hz, '
             f'{survey.duration_s:.1f} s; {counted(survey.n_still, "still interval")}, '
             f'{survey.still_s:.1f} s'
         )
-    if found.chosen:
-        out.line(found.chosen)
+    if bag.chosen:
+        out.line(bag.chosen)
     if thermometers:
         facts = 'rate_hz lowest highest steepest_heating_k_min steepest_cooling_k_min'
         out.table(
@@ -69,10 +69,10 @@ def info(
     if not survey.findings:
         out.line('a fit can use it, together with other positions')
     out.end(
-        int(bool(found.truncated)),
+        int(bool(bag.truncated)),
         path=path,
-        **picked(found, 'storage truncated metadata input chosen'),
-        topics={name: {'type': kind, 'messages': n} for name, (kind, n) in found.topics.items()},
+        **picked(bag, 'storage truncated metadata input chosen'),
+        topics={name: {'type': kind, 'messages': n} for name, (kind, n) in bag.topics.items()},
         samples=survey.n,
         still_intervals=survey.n_still,
         board=thermometers.get('board'),

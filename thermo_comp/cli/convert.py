@@ -105,22 +105,22 @@ def _tell_conversion(out: Output, report: 'ConversionReport', output: Path) -> N
     """Print what was written, what was left out or is strange, and when the unit moved."""
     from ..convert.log import SLOW_HZ
 
-    found = report.log
-    accel = SAMPLES[found.input].name
+    log = report.log
+    accel = SAMPLES[log.input].name
     out.line(
-        f'{found.path}: {report.rows} rows, {report.duration_s:.1f} s at {report.rate_hz:.4g} Hz'
+        f'{log.path}: {report.rows} rows, {report.duration_s:.1f} s at {report.rate_hz:.4g} Hz'
     )
     out.line(f'{output}:')
     for name, count in report.messages.items():
         out.line(f'  {count:8} {accel if name == "accel" else thermometer(name)}')
-    out.line(f'unit: {found.unit}; {report.believed}')
+    out.line(f'unit: {log.unit}; {report.believed}')
     if report.rate_hz < SLOW_HZ:
         out.line(
             f'{report.rate_hz:.3g} Hz: good for soaks of minutes; too slow for short rests by '
             'hand, and for detecting vibration or a knock between two samples'
         )
-    if found.hint:
-        out.line(found.hint)
+    if log.hint:
+        out.line(log.hint)
     for name, finding in report.findings.items():
         if finding.count:
             more = ', ...' if finding.count > len(finding.lines) else ''
@@ -129,9 +129,9 @@ def _tell_conversion(out: Output, report: 'ConversionReport', output: Path) -> N
     if report.stillness.moving_ns:
         out.line('moved or shaken, not at rest:')
         for stretch in report.stillness.moving_ns:
-            begin, end = ((stamp_ns - int(found.stamp_ns[0])) * 1e-9 for stamp_ns in stretch)
+            begin, end = ((stamp_ns - int(log.stamp_ns[0])) * 1e-9 for stamp_ns in stretch)
             out.line(f'  {begin:9.1f} .. {end:.1f} s')
-    out.told([(found.path, found.chosen, found.missing)])
+    out.told([(log.path, log.chosen, log.missing)])
 
 
 @contextmanager

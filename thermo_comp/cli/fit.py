@@ -158,9 +158,9 @@ def prior(
 
     check_output(output, CALIBRATION, overwrite=force, others=calibrations)
     units = [load_calibration(path) for path in calibrations]
-    found = population(units)
-    save_calibration(found, output, overwrite=force)
-    out.line(f'{output}: what {len(units)} units have in common, {len(found.response)} columns')
+    common = population(units)
+    save_calibration(common, output, overwrite=force)
+    out.line(f'{output}: what {len(units)} units have in common, {len(common.response)} columns')
     bent = [unit.unit.serial for unit in units if unit.nonlinearity and unit.nonlinearity.terms]
     if bent:
         out.line(f'- the prior leaves out the nonlinear terms (K2, K3) of {", ".join(bent)}')

@@ -189,24 +189,24 @@ def _tell_leftovers(out: Output, folder: Path, is_finishing: bool) -> None:
 
 def _duration(text: str) -> float:
     """Read a duration with its unit, like ``45min``, ``1.5h`` or ``30s`` [s]."""
-    found = re.fullmatch(r'\s*(\d+\.?\d*|\.\d+)\s*(h|min|s)\s*', text)
-    if found is None or not float(found[1]):
+    match = re.fullmatch(r'\s*(\d+\.?\d*|\.\d+)\s*(h|min|s)\s*', text)
+    if match is None or not float(match[1]):
         raise options.usage(f'--soak: expected a duration like 45min, 1.5h or 30s, got {text!r}')
-    return float(found[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[found[2]]
+    return float(match[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[match[2]]
 
 
-def _tell(out: Output, account: 'Account', problems: Sequence[str], told: dict[str, str]) -> None:
+def _tell(out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]) -> None:
     """Print each change since the last call on a line."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
-        told.pop('problem', None)
+        last.pop('problem', None)
     for number, position in enumerate(account.positions, 1):
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
     # Ignore the reading after the semicolon, which always changes a little.
-    new = {name: said for name, said in news.items() if told.get(name) != said.partition(';')[0]}
+    new = {name: said for name, said in news.items() if last.get(name) != said.partition(';')[0]}
     for name, said in new.items():
-        told[name] = said.partition(';')[0]
+        last[name] = said.partition(';')[0]
         out.note(f'{name}: {said}')
     if any(said.startswith('good') for said in new.values()):
         out.note(_worth(account))

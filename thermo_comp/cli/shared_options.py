@@ -137,10 +137,10 @@ def names(
     """Collect the topics of `--topic`, and those of the file that it does not name."""
     from ..recording.topics import parse_name, read_names
 
-    found = {} if topics is None else read_names(topics)
+    named = {} if topics is None else read_names(topics)
     with usage_of('--topic: '):
-        found |= map(parse_name, topic or ())
-    return found
+        named |= map(parse_name, topic or ())
+    return named
 
 
 def _reading(

@@ -107,9 +107,9 @@ def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
     name, since_ns, values, advice = correction
     at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
-    told = 'the autopilot has already corrected the thermal drift of these samples'
+    reason = 'the autopilot has already corrected the thermal drift of these samples'
     if is_corrected.all():
-        raise RecordingError(f'{name} was 1: {told}; {advice}', path=rows.path)
+        raise RecordingError(f'{name} was 1: {reason}; {advice}', path=rows.path)
     if not is_corrected.any():
         return rows
     share = 100.0 * float(is_corrected.mean())
@@ -119,7 +119,7 @@ def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
         stamp_ns=rows.stamp_ns[kept],
         accel=rows.accel[kept],
         gyro=None if rows.gyro is None else rows.gyro[kept],
-        chosen=f'{name} was 1 for {share:.0f} % of the samples, which are left out: {told}',
+        chosen=f'{name} was 1 for {share:.0f} % of the samples, which are left out: {reason}',
     )
 
 

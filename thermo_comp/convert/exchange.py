@@ -216,8 +216,8 @@ def import_calibration(
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same set.
     `number` chooses a set or IMU, None the only one. `full_scale` is in m/s^2.
     """
-    found = (tool.read(text, number) for tool in TOOLS.values())
-    content = next((one for one in found if one is not None), None)
+    readings = (tool.read(text, number) for tool in TOOLS.values())
+    content = next((one for one in readings if one is not None), None)
     if content is None:
         raise CalibrationError(
             'no TC_A* (PX4) or INS_TCAL* (ArduPilot) parameters in the text, nor the matrices of '

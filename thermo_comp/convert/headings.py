@@ -92,8 +92,8 @@ def _plain(heading: str) -> str:
 
 
 def _unit(heading: str) -> str:
-    found = _UNIT.search(heading)
-    return found[1].strip().lower() if found else ''
+    match = _UNIT.search(heading)
+    return match[1].strip().lower() if match else ''
 
 
 def _triads(names: dict[str, str]) -> Iterator[tuple[str, tuple[str, str, str]]]:

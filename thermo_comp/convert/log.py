@@ -192,8 +192,8 @@ def _is_in_range(stamp_ns: Ints) -> Bools:
 
 
 def _finding(rows: Bools, line: Ints) -> Finding:
-    found = np.flatnonzero(rows)
-    return Finding(len(found), tuple(line[found[:_EXAMPLES]].tolist()))
+    indices = np.flatnonzero(rows)
+    return Finding(len(indices), tuple(line[indices[:_EXAMPLES]].tolist()))
 
 
 def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
@@ -238,8 +238,8 @@ def _write(
             until = newest[rows.stop - 1] if rows.stop < n else np.iinfo(np.int64).max
             for topic, readings, log_ns in waiting:
                 run = slice(*np.searchsorted(log_ns, (since, until), side='right'))
-                own = readings.take(run)
-                writer.write_temperature(topic, *own[:2], log_ns[run], log.frame_id)
+                due = readings.take(run)
+                writer.write_temperature(topic, *due[:2], log_ns[run], log.frame_id)
             since = until
             stamp_ns, values = log.stamp_ns[rows], log.accel[rows] * factor
             if log.input == 'counts':

@@ -66,7 +66,7 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
 
 @contextmanager
 def as_bags(
-    paths: Sequence[Path], told: Callable[[ForeignLog], None] = lambda _: None, **given: Any
+    paths: Sequence[Path], tell: Callable[[ForeignLog], None] = lambda _: None, **given: Any
 ) -> Iterator[list[Path]]:
     """Convert tables and logs to temporary bags; `told` is called with each log."""
     others = [path for path in paths if path.is_file() and kind_of(path) != 'bag']
@@ -78,6 +78,6 @@ def as_bags(
         for number, path in enumerate(others):
             bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
             log = read_log(path, **given)
-            told(log)
+            tell(log)
             write_log(log, bags[path])
         yield [bags.get(path, path) for path in paths]

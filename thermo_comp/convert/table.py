@@ -123,12 +123,12 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = (lines[:-1] if len(lines) > 2 else lines)[-50:]
-    found: list[tuple[int, str, int]] = []
+    candidates: list[tuple[int, str, int]] = []
     for one in (',', ';', '\t', '|', ' ') if delimiter is None else (delimiter,):
         widths = [_n_cells(row) for _, row in _rows(lines, one)]
         width = max(set(widths), key=widths.count, default=0)
-        found.append((widths.count(width) if width > 1 else 0, one, width))
-    return max(found, key=itemgetter(0))[1:]
+        candidates.append((widths.count(width) if width > 1 else 0, one, width))
+    return max(candidates, key=itemgetter(0))[1:]
 
 
 def _is_comment(cell: str) -> bool:
@@ -246,10 +246,10 @@ def exact_ns(cell: object, unit: TimeUnit | None) -> int:
 
 
 def _iso_ns(text: str) -> int:
-    found = _ISO.fullmatch(text)
-    if found is None:
+    match = _ISO.fullmatch(text)
+    if match is None:
         return NO_STAMP
-    *moment, fraction, _, sign, hours, minutes = found.groups()
+    *moment, fraction, _, sign, hours, minutes = match.groups()
     year, month, day, hour, minute, second = (int(part or 0) for part in moment)
     try:
         seconds = timegm(datetime(year, month, day, hour, minute, second).timetuple())
@@ -273,14 +273,14 @@ def read_parquet(
 
     try:
         with open_regular(path) as file:
-            found = pq.ParquetFile(file)
-            if found.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
-                raise RecordingError(f'it declares {found.metadata.num_rows} rows', path=path)
-            headings = list(found.schema_arrow.names)
+            parquet = pq.ParquetFile(file)
+            if parquet.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
+                raise RecordingError(f'it declares {parquet.metadata.num_rows} rows', path=path)
+            headings = list(parquet.schema_arrow.names)
             wanted = range(len(headings)) if columns is None else columns
             names = [*wanted] if stamp.column is None else [*wanted, stamp.column]
             places = {name: _place(path, name, headings, len(headings)) for name in names}
-            table = found.read(columns=[headings[i] for i in sorted(set(places.values()))])
+            table = parquet.read(columns=[headings[i] for i in sorted(set(places.values()))])
     except RecordingError:
         raise
     except Exception as failure:  # a damaged file may raise any exception

@@ -105,10 +105,10 @@ def read_rests(
     """
     files: list[Path] = []
     for path in paths:
-        found = sorted(path.glob(f'*{SUFFIX}')) if path.is_dir() else [path]
-        if not found or not path.exists():
+        matching = sorted(path.glob(f'*{SUFFIX}')) if path.is_dir() else [path]
+        if not matching or not path.exists():
             raise RecordingError(f'no rest log: expected a folder of *{SUFFIX} files', path)
-        files += found
+        files += matching
     others: set[str] = set()
     unit = calibration.unit
 

@@ -202,7 +202,7 @@ def _moved(
     states = np.array([series.state.mean(axis=0), series.state[coolest], series.state[warmest]]).T
     regressors = correction.curves.regressors(states, correction.table.values(states))
     determined = np.zeros(layout.n_parameters, dtype=np.bool_)
-    gravity, found = calibration.gravity_m_s2, []
+    gravity, shifts = calibration.gravity_m_s2, []
     weights = series.n_windows / series.n_windows.sum()
     for axis, name in enumerate(AXES):
         bias, scale = layout.bias[axis], layout.scale[axis]
@@ -221,9 +221,9 @@ def _moved(
         sd = np.sqrt(np.maximum(np.diag(posterior if is_determined else prior), 0.0))
         of_scale = change[1] / gravity, sd[1] / gravity
         values = (change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3])
-        found.append(Moved(name, is_determined, *map(float, values)))
-    determined[layout.misalignment :] = all(one.is_determined for one in found)
-    return determined, tuple(found)
+        shifts.append(Moved(name, is_determined, *map(float, values)))
+    determined[layout.misalignment :] = all(one.is_determined for one in shifts)
+    return determined, tuple(shifts)
 
 
 def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:

@@ -112,8 +112,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
     forecast: tuple[float, ...] = ()
     interval: tuple[float, ...] = ()
     if series.start[-1] >= 2:
-        found = update(series, calibration)
-        ageing, used, solution = found.ageing, found.series, found.solution
+        updated = update(series, calibration)
+        ageing, used, solution = updated.ageing, updated.series, updated.solution
         recent = used.at(used.start == used.start[-1])
         of_parameters, of_levels = (
             one.mean(axis=0) for one in (recent.by_parameter, recent.by_level)

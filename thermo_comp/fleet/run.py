@@ -260,8 +260,8 @@ class Results:
 
 def _key(unit: FoundUnit, options: FleetOptions) -> dict[str, Any]:
     """Return everything that a result depends on, for JSON."""
-    found = [list(file) for bag in unit.bags.values() for file in bag]
-    return {'format': _FORMAT, 'options': options.digest(), 'files': found}
+    files = [list(file) for bag in unit.bags.values() for file in bag]
+    return {'format': _FORMAT, 'options': options.digest(), 'files': files}
 
 
 def _safe(part: str) -> str:

@@ -197,14 +197,14 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
         'unseen_ug': unseen.rms / MICRO_G,
     }
     if judgement is not None:
-        found = judgement.sections
-        whole = found['all']
+        of = judgement.sections
+        whole = of['all']
         cells |= {
             'verdict': judgement.verdict,
             'reason': judgement.reason,
             'window_s': judgement.windows.window_s,
             'raw_ug': whole.raw_rms / MICRO_G,
-            **{f'{name}_ug': found[name].rms / MICRO_G for name in ('static', 'dynamic', 'all')},
+            **{f'{name}_ug': of[name].rms / MICRO_G for name in ('static', 'dynamic', 'all')},
             'peak_ug': whole.peak / MICRO_G,
             'claimed_ug': whole.claimed_rms / MICRO_G,
         }
@@ -240,14 +240,14 @@ def read_parquet(path: Path) -> list[Row]:
     from pyarrow import ArrowException, parquet
 
     try:
-        found = parquet.read_table(path).to_pylist()
+        rows = parquet.read_table(path).to_pylist()
     except (ArrowException, OSError) as error:
         raise ThermoCompError(
             f'{path}: not a fleet table: {" ".join(str(error).split())}'
         ) from error
     names = {one.name for one in COLUMNS}
-    if not all('serial' in row and 'verdict' in row for row in found):
+    if not all('serial' in row and 'verdict' in row for row in rows):
         raise ThermoCompError(
             f'{path}: not a fleet table: it lacks the columns serial and verdict'
         )
-    return [row_of(**{k: v for k, v in row.items() if k in names}) for row in found]
+    return [row_of(**{k: v for k, v in row.items() if k in names}) for row in rows]

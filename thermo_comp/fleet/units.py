@@ -121,15 +121,15 @@ def find_units(storage: Storage) -> list[FoundUnit]:
             'is .mcap, .db3, .bag or a rosbag2 directory'
         )
     folders = {_folder(name) for name in bags}
-    found: dict[tuple[str, str], Bags] = defaultdict(dict)
+    by_unit: dict[tuple[str, str], Bags] = defaultdict(dict)
     for name, files in bags.items():
         unit = _folder(name)
         lot = unit.partition('/')[0] if '/' in unit else ''
         if not unit:
             serial = _serial(storage, name, files)
             unit = f'{serial} (in {storage.name})' if serial in folders else serial
-        found[one_line(unit), one_line(lot)][name] = files
-    return [FoundUnit(unit, lot, found[unit, lot]) for unit, lot in sorted(found)]
+        by_unit[one_line(unit), one_line(lot)][name] = files
+    return [FoundUnit(unit, lot, by_unit[unit, lot]) for unit, lot in sorted(by_unit)]
 
 
 def group_files(files: Sequence[StoredFile]) -> Bags:
@@ -150,9 +150,9 @@ def group_files(files: Sequence[StoredFile]) -> Bags:
 def _is_bag(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
     """Whether a folder is a rosbag2 directory, even without metadata (recorder killed)."""
     stems = [one.name.rpartition('.')[0].rpartition('_') for one in stored]
-    own = f'{folder}/{folder.rpartition("/")[2]}'
+    usual = f'{folder}/{folder.rpartition("/")[2]}'
     return any(one.name == f'{folder}/metadata.yaml' for one in inside) or all(
-        stem == own and number.isdigit() for stem, _, number in stems
+        stem == usual and number.isdigit() for stem, _, number in stems
     )
 
 

@@ -211,9 +211,9 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
             versions = client.run(version)
         except Exception as error:  # an import on a worker may raise any exception
             raise ThermoCompError(f'{scheduler}: {said}') from error
-        for worker, found in versions.items():
-            if found != __version__:
-                said = f'worker {worker} runs thermo_comp {found}, not {__version__}'
+        for worker, answer in versions.items():
+            if answer != __version__:
+                said = f'worker {worker} runs thermo_comp {answer}, not {__version__}'
                 raise ThermoCompError(f'{scheduler}: {said}')
         yield client
 

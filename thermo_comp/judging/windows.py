@@ -227,21 +227,21 @@ def _table(
         sums: list[_Table] = [np.zeros(0, kind)]
         for one in bag.intervals:
             n = one.n_whole // per * per
-            own = np.zeros(n, kind)
-            own['bag'], own['position'] = number, n_positions
+            rows = np.zeros(n, kind)
+            rows['bag'], rows['position'] = number, n_positions
             begin_s = one.begin_s + bag.window_s * np.arange(n)
-            own['start_ns'] = bag.start_ns + np.rint(begin_s * 1e9).astype(np.int64)
-            own['count'], own['time'], own['mean'] = one.count[:n], one.time[:n], one.mean[:n]
-            own['gyro'] = np.nan
-            own['size'] = gravity
+            rows['start_ns'] = bag.start_ns + np.rint(begin_s * 1e9).astype(np.int64)
+            rows['count'], rows['time'], rows['mean'] = one.count[:n], one.time[:n], one.mean[:n]
+            rows['gyro'] = np.nan
+            rows['size'] = gravity
             if (known := bag.source.force) is not None:
                 first_ns = bag.start_ns - round(bag.since_s * 1e9)
                 size = known.of(one.start_ns, one.end_ns, first_ns)
-                own['size'] = size.norm(gravity)
-                own['size_sd'] = np.hypot(size.sd, known.radius_part(size, gravity))
+                rows['size'] = size.norm(gravity)
+                rows['size_sd'] = np.hypot(size.sd, known.radius_part(size, gravity))
             if n_gyro and one.angular_rate is not None:
-                own['gyro'][:, :3] = one.angular_rate[:n]
-            sums.append(own)
+                rows['gyro'][:, :3] = one.angular_rate[:n]
+            sums.append(rows)
             n_positions += 1
         whole = np.concatenate(sums)
         if calibration is None:

@@ -62,8 +62,8 @@ def process_block(
         if name in block.temperatures:
             stamp_ns, celsius, place = map(np.asarray, block.temperatures[name])
             order, names = np.maximum.accumulate(stamp_ns), np.full(len(place), name)
-            own = (place, order, names, stamp_ns, celsius)
-            arrivals += zip(*(column.tolist() for column in own), strict=True)
+            lists = (place, order, names, stamp_ns, celsius)
+            arrivals += zip(*(column.tolist() for column in lists), strict=True)
     arrivals.sort(key=itemgetter(0, 1))
     arrivals.reverse()
     runs = _runs(compensator, stamps, arrivals)

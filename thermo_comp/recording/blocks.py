@@ -183,17 +183,17 @@ class Block:
 
     def take(self, rows: Mapping[Role, Bools]) -> Block:
         """Select messages of each role."""
-        own = rows['accel']
-        n_before = np.concatenate(([0], np.cumsum(own)))
+        is_taken = rows['accel']
+        n_before = np.concatenate(([0], np.cumsum(is_taken)))
         temperatures = {}
         for name, readings in self.temperatures.items():
             after = n_before[readings.after[rows[name]]]
             temperatures[name] = readings.take(rows[name])._replace(after=after)
         return Block(
-            self.accel_stamp_ns[own],
-            self.accel[own],
+            self.accel_stamp_ns[is_taken],
+            self.accel[is_taken],
             self.frame_id,
-            self.imu and self.imu.take(own),
+            self.imu and self.imu.take(is_taken),
             temperatures,
             {role: log_ns[rows[role]] for role, log_ns in self.log_ns.items()},
             {role: one.take(rows[role]).packed() for role, one in self.raw.items()},
@@ -232,8 +232,8 @@ def joined(blocks: Sequence[Block]) -> Block:
     begins = np.cumsum([0, *map(len, blocks)])
     temperatures = {}
     for name in blocks[0].temperatures:
-        own = zip((block.temperatures[name] for block in blocks), begins, strict=False)
-        moved = [one._replace(after=one.after + begin) for one, begin in own]
+        parts = zip((block.temperatures[name] for block in blocks), begins, strict=False)
+        moved = [one._replace(after=one.after + begin) for one, begin in parts]
         temperatures[name] = Readings(*map(np.concatenate, zip(*moved, strict=True)))
     imus = [block.imu for block in blocks if block.imu is not None]
     raws = {role: [b.raw[role] for b in blocks if role in b.raw] for b in blocks for role in b.raw}
@@ -244,7 +244,7 @@ def joined(blocks: Sequence[Block]) -> Block:
         ImuColumns(*map(np.concatenate, zip(*imus, strict=True))) if imus else None,
         temperatures,
         {role: np.concatenate([b.log_ns[role] for b in blocks]) for role in blocks[0].log_ns},
-        {role: join_messages(own) for role, own in raws.items()},
+        {role: join_messages(parts) for role, parts in raws.items()},
     )
 
 
@@ -318,9 +318,9 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
         n_messages += len(read)
         span_ns += int(np.sum(np.where(is_jump, LONGEST_PAUSE_NS, np.maximum(steps, 0))))
         if n_jumps > _MOST_JUMPS or span_ns > max(_SPARSE_NS, n_messages * _SPARSEST_NS):
-            told = f'{n_messages} messages stamped over {span_ns / 86400e9:.0f} days, '
-            told += f'{n_jumps} jumps by more than an hour: no recording of a thermal test'
-            raise RecordingError(clocks_apart(block) or told, path)
+            reason = f'{n_messages} messages stamped over {span_ns / 86400e9:.0f} days, '
+            reason += f'{n_jumps} jumps by more than an hour: no recording of a thermal test'
+            raise RecordingError(clocks_apart(block) or reason, path)
         offsets = np.empty_like(moved)
         offsets[order] = moved
         parts = np.split(offsets, np.cumsum([len(one.after) for one in thermometers]))

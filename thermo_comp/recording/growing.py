@@ -81,18 +81,18 @@ def _size(path: Path) -> int:
 
 def numbered_bags(folder: Path) -> list[Path]:
     """List the bags of a folder, in the order of their numbers."""
-    found = {int(one.stem): one for one in folder.glob('*.mcap') if one.stem.isdecimal()}
-    return [found[number] for number in sorted(found)]
+    bags = {int(one.stem): one for one in folder.glob('*.mcap') if one.stem.isdecimal()}
+    return [bags[number] for number in sorted(bags)]
 
 
 def leftovers(folder: Path) -> dict[Path, int]:
     """List the unfinished bags left by crashed runs, with their numbers."""
-    found: dict[Path, int] = {}
+    unfinished: dict[Path, int] = {}
     for path in sorted(folder.glob('.*.partial.mcap')):
         named = _LEFT.fullmatch(path.name)
         if named and not Path(f'/proc/{named["process"]}').exists():
-            found[path] = int(named['number'])
-    return found
+            unfinished[path] = int(named['number'])
+    return unfinished
 
 
 def finish(path: Path, number: int) -> Path | None:
@@ -138,11 +138,11 @@ class PositionBags:
         try:
             for block in held:
                 is_late = {
-                    role: np.maximum.accumulate(own >= stamp_ns)
-                    for role, own in block.stamp_ns.items()
+                    role: np.maximum.accumulate(stamps >= stamp_ns)
+                    for role, stamps in block.stamp_ns.items()
                 }
-                self._write(block.take({role: ~own for role, own in is_late.items()}))
-                if any(own.any() for own in is_late.values()):
+                self._write(block.take({role: ~late for role, late in is_late.items()}))
+                if any(late.any() for late in is_late.values()):
                     self._held.append(block.take(is_late))
             if self._writer is not None:
                 self._writer.flush()

@@ -138,17 +138,17 @@ class McapFile(BagFile):
 
     def _read_summary(self, content: bytes) -> None:
         """Read the summary; ignore it if damaged or incomplete."""
-        found: dict[type, list[Any]] = {}
+        records_of: dict[type, list[Any]] = {}
         try:
             reader = StreamReader(BytesIO(content), skip_magic=True, emit_chunks=True)
             for record in reader.records:
-                found.setdefault(type(record), []).append(record)
-            (said,) = found[Statistics]
+                records_of.setdefault(type(record), []).append(record)
+            (said,) = records_of[Statistics]
         except Exception:  # noqa: BLE001 - damaged bytes surface as nearly any exception type
             return
         counts, n_messages = said.channel_message_counts, said.message_count
-        channels: dict[int, Channel] = {one.id: one for one in found.get(Channel, [])}
-        chunks = sorted(found.get(ChunkIndex, []), key=lambda one: one.chunk_start_offset)
+        channels: dict[int, Channel] = {one.id: one for one in records_of.get(Channel, [])}
+        chunks = sorted(records_of.get(ChunkIndex, []), key=lambda one: one.chunk_start_offset)
         spans = [Span(*_SPAN_FIELDS(chunk)) for chunk in chunks]
         if (
             sum(counts.values()) != n_messages
@@ -158,13 +158,13 @@ class McapFile(BagFile):
         ):
             return
         self._channels = channels
-        self._schemas = {one.id: one for one in found.get(Schema, [])}
+        self._schemas = {one.id: one for one in records_of.get(Schema, [])}
         self.spans = [span for span in spans if span.size]
         if self.spans:
             self._counts.update(counts)
             if n_messages:
                 self.start_ns, self.end_ns = said.message_start_time, said.message_end_time
-        for index in found.get(MetadataIndex, []):
+        for index in records_of.get(MetadataIndex, []):
             is_small = PREFIX.size <= index.length <= _MAX_SMALL_RECORD
             if index.name == METADATA_NAME and is_small and index.offset < self._size:
                 pairs = self._read_at(index.offset, index.length)[PREFIX.size :]

@@ -227,11 +227,11 @@ class McapOutput:
         rows = np.empty(len(log_ns), _INDEX_ROW)
         rows['log'], rows['offset'] = log_ns, at
         for number in np.unique(channel).tolist():
-            own = rows[channel == number]
-            self._counts[number] += len(own)
+            entries = rows[channel == number]
+            self._counts[number] += len(entries)
             offsets[number] = self._at
-            index_head = (Opcode.MESSAGE_INDEX, 6 + own.nbytes, number, own.nbytes)
-            self._put(struct.pack('<BQHI', *index_head) + own.tobytes())
+            index_head = (Opcode.MESSAGE_INDEX, 6 + entries.nbytes, number, entries.nbytes)
+            self._put(struct.pack('<BQHI', *index_head) + entries.tobytes())
         self._chunks.append(
             records.ChunkIndex(
                 chunk_length=chunk_length,

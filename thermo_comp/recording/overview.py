@@ -66,11 +66,11 @@ def thermal_findings(
     thermometers: Mapping[str, ThermometerSurvey], candidates: Sequence[str] = ()
 ) -> list[str]:
     """List missing thermometers, span and ramps; `candidates` are unused topics."""
-    found = []
+    findings = []
     among = f': {", ".join(candidates)}' if candidates else ''
     board = thermometers.get('board')
     if board is None:
-        found.append(
+        findings.append(
             'no board temperature: a thermal fit needs temperature/board, or name yours with '
             f'--topic board=TOPIC{among}'
         )
@@ -78,27 +78,29 @@ def thermal_findings(
         heating, cooling = board.steepest_heating_k_min, -board.steepest_cooling_k_min
         span = board.highest - board.lowest
         if span < ADVISED_SPAN_K:
-            found.append(f'board temperature spans {span:.1f} K: {ADVISED_SPAN_K:g} are advised')
+            findings.append(
+                f'board temperature spans {span:.1f} K: {ADVISED_SPAN_K:g} are advised'
+            )
         for name, rate in (('heating', heating), ('cooling', cooling)):
             if rate < RAMP_K_MIN:
-                found.append(f'no {name} ramp: the dynamic set would be extrapolated to {name}')
+                findings.append(f'no {name} ramp: the dynamic set would be extrapolated to {name}')
     for name, thermometer in thermometers.items():
         reads = f'{name} reads {thermometer.lowest:.4g} .. {thermometer.highest:.4g}'
         if thermometer.lowest < COLDEST or thermometer.highest > HOTTEST:
-            found.append(f'{reads}: that is not degC')
+            findings.append(f'{reads}: that is not degC')
         elif KELVINS[0] < thermometer.lowest and thermometer.highest < KELVINS[1]:
-            found.append(f'temperature/{reads} degC: that looks like kelvins')
+            findings.append(f'temperature/{reads} degC: that looks like kelvins')
     if 'case' not in thermometers:
-        found.append(
+        findings.append(
             'no case temperature: the regime will follow the slower board sensor; name yours '
             f'with --topic case=TOPIC{among}'
         )
-    return found
+    return findings
 
 
 def unused_thermometers(reader: RecordingReader) -> list[str]:
     """List unused topics that may hold a temperature: a barometer's, the air's, another IMU's."""
-    found = []
+    candidates = []
     paths = {role: one.path for role, one in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}
     for name, (kind, count) in sorted(reader.info.topics.items()):
@@ -106,11 +108,11 @@ def unused_thermometers(reader: RecordingReader) -> list[str]:
         if not count or not used.isdisjoint({(name, None), (name, PLAIN.get(kind))}):
             continue
         if kind == TEMPERATURE or (kind in PLAIN and 'temp' in name.lower()):
-            found.append(shown(name))
+            candidates.append(shown(name))
             continue
         fields = temperature_fields(kind, reader.definitions)
-        found += [shown(f'{name}:{field}') for field in fields if (name, field) not in used]
-    return found
+        candidates += [shown(f'{name}:{field}') for field in fields if (name, field) not in used]
+    return candidates
 
 
 def survey_recording(
@@ -140,8 +142,8 @@ def survey_recording(
     reduced = cells.finish()
     still = still_intervals(reduced, _MIN_REST_S) if n > 1 else []
     cause = causes.cause(reduced, STILL_SD) if n > 1 else ''
-    found = ((name, survey_thermometer(own)) for name, own in readings.items())
-    thermometers = {name: one for name, one in found if one is not None}
+    surveys = ((name, survey_thermometer(parts)) for name, parts in readings.items())
+    thermometers = {name: one for name, one in surveys if one is not None}
     findings = [
         (info.truncated, f'cut off: {info.truncated}'),
         (reader.apart, 'a fit needs one clock for all'),

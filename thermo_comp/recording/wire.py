@@ -65,15 +65,15 @@ def decode_blocks(
         kind = TEMPERATURE if role != 'accel' else IMU if is_imu else VECTOR3_STAMPED
         channels = {feed.channel: feed.topic for feed in feeds if feed.role == role}
         rank = messages.places_of(channels)
-        own = messages.take(rank)
+        taken = messages.take(rank)
         try:
             if len({topic[:3] for topic in channels.values()}) > 1:
                 raise RecordingError('its messages have several encodings')
             if role in topics and topics[role].encoding == 'ros1':
-                own = as_cdr(own, topics[role].type)
+                taken = as_cdr(taken, topics[role].type)
             if role in fields:
-                own = _as_temperatures(own, *fields[role].read(own))
-            stamp_ns, numbers, frame = decode_stamped(own, kind)
+                taken = _as_temperatures(taken, *fields[role].read(taken))
+            stamp_ns, numbers, frame = decode_stamped(taken, kind)
         except RecordingError as error:
             raise RecordingError(error.message, key=shown(topics[role].name)) from error
         if role == 'accel':
@@ -89,9 +89,9 @@ def decode_blocks(
         else:
             after = np.searchsorted(accel, rank).astype(np.int64)
             temperatures[role] = Readings(stamp_ns, numbers[:, 0], after)
-        log_ns[role] = own.log_ns
-        if keep_raw and len(own):
-            raw[role] = own.packed()
+        log_ns[role] = taken.log_ns
+        if keep_raw and len(taken):
+            raw[role] = taken.packed()
     return [
         Block(
             samples_ns,
@@ -128,13 +128,13 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
     # Usually all have the same length, byte order and frame length.
     for key in (size, number_at(rows, 0, 'u2'), number_at(rows, 12, 'u4')):
         if (key != key[0]).any():
-            found = np.empty(n, np.int64), np.empty((n, n_numbers)), np.empty(n, object)
+            columns = np.empty(n, np.int64), np.empty((n, n_numbers)), np.empty(n, object)
             order = np.argsort(key, kind='stable')
-            for own in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
-                parts = decode_stamped(messages.take(own), kind)
-                for column, part in zip(found, parts, strict=True):
-                    column[own] = part
-            return found
+            for alike in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+                parts = decode_stamped(messages.take(alike), kind)
+                for column, part in zip(columns, parts, strict=True):
+                    column[alike] = part
+            return columns
     representation = int(number_at(rows, 0, '>u2')[0])
     if representation > 1:
         raise RecordingError(

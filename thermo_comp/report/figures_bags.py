@@ -86,9 +86,9 @@ def draw_residuals(evidence: Evidence) -> Figure:
         axes.locator_params(axis='y', nbins=5)
         if rung != RAW:
             _symmetric(axes, residual[rows])
-        found = statistics_by_regime(residual[rows], dynamic)
-        del found['all']
-        parts = [f'{name} {number(one.rms / MICRO_G)}' for name, one in found.items() if one.n]
+        stats = statistics_by_regime(residual[rows], dynamic)
+        del stats['all']
+        parts = [f'{name} {number(one.rms / MICRO_G)}' for name, one in stats.items() if one.n]
         title = f'{rung}: RMS {", ".join(parts)} µg'
         if axes is panels[0]:
             style.legend_above(axes, title)

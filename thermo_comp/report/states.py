@@ -48,12 +48,12 @@ class Curve(NamedTuple):
 def programs(calibration: Calibration) -> list[Program]:
     """List a soak and, where they differ from it, ramps at half of the fastest rate calibrated."""
     static, dynamic = calibration.regime_sets()
-    found = [Program('soak', static, 0.0)]
+    result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:
         cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
         ramps = (Program('heating', dynamic, heating), Program('cooling', dynamic, cooling))
-        found += [ramp for ramp in ramps if ramp.rate_k_min]
-    return found
+        result += [ramp for ramp in ramps if ramp.rate_k_min]
+    return result
 
 
 def evaluate(calibration: Calibration, program: Program, temperature: Floats) -> Curve:

@@ -264,10 +264,10 @@ def _of_axes(key: str, values: Iterable[float]) -> dict[str, str]:
 def _mismatch(node: Node, subscription: Subscription) -> str:
     """Return why no publisher on a topic is heard: type or QoS; empty if there is none."""
     topic, expected = subscription.topic_name, type_name(subscription.msg_type)
-    for found in node.get_publishers_info_by_topic(topic):
-        if found.topic_type != expected:
-            return f'its type is {found.topic_type}, not {expected}'
-        fit, reason = qos_check_compatible(found.qos_profile, subscription.qos_profile)
+    for publisher in node.get_publishers_info_by_topic(topic):
+        if publisher.topic_type != expected:
+            return f'its type is {publisher.topic_type}, not {expected}'
+        fit, reason = qos_check_compatible(publisher.qos_profile, subscription.qos_profile)
         if fit == QoSCompatibility.ERROR:
             said = reason.replace('ERROR: ', '').rstrip('; ')
             return f'{said} (qos_overrides.{topic}.subscription)'

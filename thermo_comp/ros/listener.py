@@ -120,8 +120,8 @@ class LiveTopics:
             and name.startswith(front)
             and is_thermometer(name.removeprefix(front))
         }
-        own = {'board': self._topics.board, 'case': self._topics.case}
-        for name, topic in {**own, **further, **self._topics.further}.items():
+        both = {'board': self._topics.board, 'case': self._topics.case}
+        for name, topic in {**both, **further, **self._topics.further}.items():
             self._hear(name, topic, TEMPERATURE, problems)
         self.problems = tuple(problems)
 

@@ -127,8 +127,8 @@ class NodeConfig:
     def compensator_config(self) -> CompensatorConfig:
         """Return the settings of the compensator, whose names end in the unit."""
         names = [field.name for field in fields(CompensatorConfig)]
-        own = (getattr(self, name.removesuffix('_m_s2').removesuffix('_s')) for name in names)
-        return CompensatorConfig(**dict(zip(names, own, strict=True)))
+        values = (getattr(self, name.removesuffix('_m_s2').removesuffix('_s')) for name in names)
+        return CompensatorConfig(**dict(zip(names, values, strict=True)))
 
 
 _TABLE: Mapping[str, Field[Any]] = {entry.name: entry for entry in fields(NodeConfig)}

@@ -164,8 +164,8 @@ class Player:
             left_s = max(0.0, due - now)
             if now >= self._next_clock:
                 self._next_clock = now + CLOCK_PERIOD
-                told, message = log_ns - int(left_s * self._rate * 1e9), Clock()
-                message.clock.sec, message.clock.nanosec = divmod(told, 1_000_000_000)
+                clock_ns, message = log_ns - int(left_s * self._rate * 1e9), Clock()
+                message.clock.sec, message.clock.nanosec = divmod(clock_ns, 1_000_000_000)
                 self._clock.publish(message)
             if not left_s:
                 return

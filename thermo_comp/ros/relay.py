@@ -126,7 +126,7 @@ class Relay:
         one = self._loop.subscribe(field.kind, topic, qos_of(BOARD), is_hot=False)
         everything = {**self.thermometers, name: one}
         names = self.running.compensator.thermal.inputs
-        self.thermometers = {own: everything[own] for own in names if own in everything}
+        self.thermometers = {key: everything[key] for key in names if key in everything}
 
     @property
     def samples(self) -> RawSubscription:

@@ -268,8 +268,8 @@ class Calibration:
                 '`sensors` must be different names, at least one, none of them board, '
                 f'got {list(names)}'
             )
-        own = self.gyroscope.response if self.gyroscope else ()
-        for key, response in (('response', self.response), ('gyroscope.response', own)):
+        of_rate = self.gyroscope.response if self.gyroscope else ()
+        for key, response in (('response', self.response), ('gyroscope.response', of_rate)):
             for k, term in enumerate(response):
                 if term.is_of_sensor and term.sensor not in names:
                     raise ValueError(

@@ -39,8 +39,8 @@ class Curves:
         ]
         self._functions, self._others = Functions(rows), Functions(rows[::-1])
         # Which set's tangent a set follows at the lower and at the upper end, shape (2, 2).
-        own, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
-        self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - own, own)
+        regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
+        self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - regimes, regimes)
         self._ends = lower.min(), upper.max()
         self._reaches = TANGENT_SPANS * (upper - lower)[self._leads][:, :, np.newaxis]
         biases = [axis.bias for axis in calibration.axes]
@@ -147,9 +147,9 @@ class Curves:
         tangent in each set that takes it, and its curve beyond the range of the other set.
         """
         function = self._functions.rows[regime][place]
-        own, other = (edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]])
+        span, other = (edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]])
         here, edge = (
-            np.reshape(function.basis(hold(one, *own)), (-1, len(t)))
+            np.reshape(function.basis(hold(one, *span)), (-1, len(t)))
             for one in (t, hold(t, *other))
         )
         result = shares[1 - regime] * (here - edge)
