@@ -51,7 +51,7 @@ class Output:
             if chosen:
                 alike.setdefault(chosen, []).append(bag)
             if missing:
-                # It sets the exit code, so it is printed even with --quiet.
+                # A missing part sets the exit code, so it is printed even with --quiet.
                 _print(f'thermo_comp: {bag}: {missing}', sys.stderr)
                 self._is_torn = True
         for said, names in alike.items():

@@ -33,8 +33,8 @@ Triple = tuple[Column, Column, Column]
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible sample intervals [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
-#: Longest interval [s] of a table in which the unit turns by at least this angle [rad] between
-#: blocks of this number of still samples (scatter [g]): in ms such a turn would be impossible.
+#: Times of a table in which the unit turns by `_TURN` rad between blocks of `_BLOCK` still samples
+#: (scatter below `_QUIET` g) cannot be in ms: then intervals up to `_SLOW_S` s are plausible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
 _A_MAP = 'a column map: --columns MAP'

@@ -3,9 +3,9 @@
 """
 Owns the exchange with other tools: calibrations to the content of their files, and back.
 
-All use ``a = A (N - b)`` of a reading N. In autopilots b depends on temperature and A is 1; in
-tools for tumble tests both are constant. The notes of an export name the parts of a calibration
-that are lost, with the resulting error.
+All of these tools correct a reading N by ``a = A (N - b)``. In autopilots b depends on temperature
+and A is 1; in tools for tumble tests both are constant. The notes of an export name the parts of a
+calibration that are lost, with the resulting error.
 """
 
 from dataclasses import replace

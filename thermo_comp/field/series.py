@@ -172,7 +172,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
         ahead = float(aged.removesuffix(' d') or 0.0)
     except ValueError:
         return -np.inf, -np.inf, False
-    # An ageing of a century or more is an invalid file.
+    # A file that says it was aged by a century or more is invalid.
     if np.isnat(moment) or not 0.0 <= ahead < 36525.0:
         return -np.inf, -np.inf, False
     begin = int(moment.astype(np.int64)) / _DAY_NS

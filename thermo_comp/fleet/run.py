@@ -167,8 +167,8 @@ def render_fleet(
         'residuals',
         'How large are the residuals of |f| in the fleet?',
         'Share of the units whose residual at rest is below the value: raw (constants at the '
-        'reference temperature), and with each unit’s calibration. Steep: the units are alike; '
-        'a tail to the right: units to inspect.',
+        'reference temperature), and with each unit’s calibration. A steep curve: '
+        'the units are alike; a tail to the right: units to inspect.',
         partial(draw_shares, curves),
     )
     distances = ReportFigure(

@@ -58,7 +58,7 @@ class UnitOutcome:
 
     row: dict[str, Cell]
     hashes: dict[str, str]  # of its bags
-    is_final: bool  # the same bags give the same result, unlike after a file system failure
+    is_final: bool  # another attempt would give the same; False if the file system failed
     calibration: str = ''
     certificate: str = ''
 
@@ -164,7 +164,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Keep Ctrl-C, which a terminal sends to all processes, for this one; raise it afterwards."""
+    """Keep Ctrl-C, which a terminal sends to all processes, from workers; raise it afterwards."""
     heard: list[int] = []
     # Processes inherit the ignored signal from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

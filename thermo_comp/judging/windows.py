@@ -31,7 +31,7 @@ from ..unit.metrics import norm_residual
 WINDOW_S = 60.0
 # Distance outside a calibrated range that still counts as inside, in half ranges: noise.
 _EDGE = 0.02
-# |f| that differs from gravity by a smaller part than this is gravity.
+# Largest relative difference of a known |f| from gravity at which the rest counts as one at 1 g.
 _USUAL = 0.01
 # Smallest number of samples of a partial sum / median number.
 _LEAST_FILLED = 0.9
@@ -104,7 +104,7 @@ def sum_length(window_s: float) -> float:
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Choose the window length [s] for a fit's bags: the next multiple of their sums from 60 s."""
+    """Choose the window length [s]: the least multiple of the bags' sums that is 60 s or more."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 

@@ -124,7 +124,7 @@ class ImuColumns(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Readings of a thermometer, shape (m,); `after`: the block's samples before each."""
+    """Readings of a thermometer, shape (m,); `after`: number of samples before each."""
 
     stamp_ns: Ints
     celsius: Floats

@@ -30,7 +30,7 @@ _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: Hidden name of a bag that is being written: its number and the process number.
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
-_SHARE = 0.2  # largest share of the time spent reading
+_SHARE = 0.2  # largest share of the time in which the growing bag is read
 
 #: A new block with its serialized messages, and the bag that it comes from.
 News = tuple[Block, RecordingInfo | None]

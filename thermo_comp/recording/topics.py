@@ -44,7 +44,7 @@ Present = Mapping[str, tuple[str, int]]
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """From `begin` to before `end`: seconds since the bag's first sample; from 1e8 stamps."""
+    """From `begin` to before `end`: seconds since the first sample, or stamps, from 1e8 on."""
 
     begin: float | None = None
     end: float | None = None
@@ -264,7 +264,7 @@ def _candidates(
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
-            return  # several candidates: none is chosen
+            return  # several Imu topics could be meant: none is chosen
 
 
 def _corrected(present: Present, metadata: Mapping[str, str]) -> str:

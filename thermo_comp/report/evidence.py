@@ -82,7 +82,7 @@ class Evidence:
 
     @property
     def is_seen(self) -> bool:
-        """Whether the calibration was fitted on one of these bags."""
+        """Whether the calibration was fitted on a bag of this evidence."""
         known = {source.sha256 for source in self.sources if source.sha256}
         return bool(self.steps) or any(bag.source.sha256 in known for bag in self.bags)
 

@@ -71,7 +71,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
             raise
         raise CalibrationError(error.rule, name) from error
     except Exception as error:
-        # RuntimeError: the home folder of an unknown user. No error of a file may end the node.
+        # No error of a file may end the node; a home folder of an unknown user is a RuntimeError.
         has_reason = isinstance(error, OSError) or type(error) is ValueError
         reason = getattr(error, 'strerror', None) or (has_reason and str(error))
         raise CalibrationError(

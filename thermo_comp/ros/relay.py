@@ -119,7 +119,7 @@ class Relay:
             if field is not None:
                 self._fields[name], topic = field, one.subscription.topic_name
                 self._loop.unsubscribe(self.thermometers.pop(name))
-                # The middleware allows one type per topic: after the loop has released the first.
+                # The middleware allows one type per topic: the loop must release the first before.
                 self._loop.call_soon(partial(self._hear, name, topic, field))
 
     def _hear(self, name: str, topic: str, field: LiveField) -> None:

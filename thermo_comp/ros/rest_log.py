@@ -35,7 +35,8 @@ DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 _FLOOR = 16_000
 #: Largest number of lines that wait for the disk.
 _WAITING = 1000
-#: Stamps before 2000-01-01 [ns] count from a start: such rests get the time of this computer.
+#: Stamps before 2000-01-01 [ns] are times since the start of a driver, no dates: rests with such
+#: stamps get the time of this computer.
 _EPOCH_NS = 946_684_800 * 10**9
 #: Backward step of the stamps [ns] from which a recording has begun anew.
 _JUMP_NS = 10**9
@@ -73,7 +74,7 @@ class RestLog:
             self._lose('the disk does not answer')
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Write what waits, within the time."""
+        """Write the waiting lines, as far as that takes no longer than `timeout_s`."""
         try:
             self._lines.put(None, timeout=timeout_s)
         except Full:

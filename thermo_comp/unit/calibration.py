@@ -106,7 +106,7 @@ class Axes:
 
 @dataclass(frozen=True)
 class AxisSet:
-    """The curves of one axis in one regime (method section 3: items 2 to 4)."""
+    """The curves of one axis in one regime."""
 
     bias_function: Annotated[TemperatureFunction, 'Fs(t), input units; Fs(0) = 0.']
     scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
@@ -362,7 +362,7 @@ class Calibration:
 
     @property
     def needs_case(self) -> bool:
-        """Whether it was fitted with a case thermometer, or has columns computed from it."""
+        """Whether the unit was fitted with a case thermometer, or has columns computed from it."""
         columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
         return self.detector.case != ThermometerSettings() or any(
             column.is_of_sensor for column in columns

@@ -30,7 +30,7 @@ from .nonlinearity import ForceCorrection
 GENTLE_RATE = MICRO_G
 #: ... unless blending would then take more than this number of transition times.
 LONGEST_TRANSITION = 10.0
-#: Number of temperatures at which the difference of the sets is evaluated for it.
+#: Number of temperatures at which the difference of the sets is evaluated for that time.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter carries the remainder on.
 ROUNDING_VARIANCE = 1.0 / 6.0
@@ -109,8 +109,8 @@ class Correction:
 
     def _find_felt(self) -> None:
         """Find the columns that depend on each gradient and lag, to propagate its variance."""
-        # In a state each gradient and lag is followed by its variance. A play has none: it is
-        # taken to follow its input.
+        # In a state each gradient and lag is followed by its variance. A play has no variance: its
+        # uncertainty is neglected.
         pair = (self.table.places - GRADIENT) // 2
         n_pairs = len(self.memory.sensors) + len(self.memory.lags)
         self._felt_variances = slice(VAR_GRADIENT, GRADIENT + 2 * n_pairs, 2)
@@ -267,9 +267,9 @@ class Correction:
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0).max(
                 axis=1, initial=0.0
             )
-            # Outside the range only the curves are extrapolated (the lags will follow). Add the
-            # change of slope as a separate error: for parts still outside, and where the bias and
-            # scale slopes cancel.
+            # Outside the range the curves are extrapolated, while lagging parts are still inside.
+            # Add the change of slope as a separate error: for parts outside, and where the slopes
+            # of bias and scale cancel.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
