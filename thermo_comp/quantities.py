@@ -101,9 +101,9 @@ _PREPARED: dict[str, Bounds] = {
     ),
     'slow noise': _up_to(1e3, 'm/s^2/sqrt(h)', '100 g in an hour'),
     'rate slow noise': _up_to(1e3, 'rad/s/sqrt(h)', '57000 deg/s in an hour'),
-    'deviation': _up_to(1e4, 'm/s^2', '1000 g: nothing is known'),
-    'rate deviation': _up_to(1e3, 'rad/s', '57000 deg/s: nothing is known'),
-    'misalignment deviation': _up_to(1.0, 'rad', 'nothing is known'),
+    'deviation': _up_to(1e4, 'm/s^2', '1000 g: the quantity is unknown'),
+    'rate deviation': _up_to(1e3, 'rad/s', '57000 deg/s: the quantity is unknown'),
+    'misalignment deviation': _up_to(1.0, 'rad', 'the quantity is unknown'),
     'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'at 1 g it reads 2 g'),
     # Results of a fit and numbers of samples.
     'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),

@@ -109,8 +109,8 @@ class Correction:
 
     def _find_felt(self) -> None:
         """Find the columns that depend on each gradient and lag, to propagate its variance."""
-        # In a state each gradient and lag is followed by its variance. A play has no variance: its
-        # uncertainty is neglected.
+        # In a state each gradient and lag is followed by its variance. A play has no variance:
+        # an error of its input v is taken to move the play P(v) along, so that P(v) - v stays.
         pair = (self.table.places - GRADIENT) // 2
         n_pairs = len(self.memory.sensors) + len(self.memory.lags)
         self._felt_variances = slice(VAR_GRADIENT, GRADIENT + 2 * n_pairs, 2)
