@@ -38,7 +38,7 @@ help:
 
 demo: $(VENV)/.installed
 	@echo "thermo_comp: fitting nine sample bags three ways, playing a tenth through the node: a minute"
-	$(BIN)/thermo_comp demo --out out
+	$(BIN)/python benchmarks/demo.py --out out
 
 test: $(VENV)/.installed-test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder $(PYTEST_ARGS)

@@ -24,6 +24,7 @@ from pathlib import Path
 os.environ |= {'ROS_DOMAIN_ID': '87', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
 import numpy as np
+from live_node import node_in_thread
 from node_relay import (
     MEETING_S,
     _calibration_for,
@@ -34,7 +35,7 @@ from node_relay import (
     _say,
 )
 
-from thermo_comp.ros.node import CompensationNode, node_in_thread
+from thermo_comp.ros.node import CompensationNode
 from thermo_comp.ros.relay import Relay
 from thermo_comp.ros.rest_log import RestKeeper
 from thermo_comp.typing import Floats

@@ -304,10 +304,9 @@ def main() -> int:
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
     import rclpy
+    from live_node import lossless
     from node_process import NodeProcess
     from rclpy.context import Context
-
-    from thermo_comp.ros.player import lossless
 
     context = Context()
     rclpy.init(args=[], context=context)

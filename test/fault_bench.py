@@ -18,6 +18,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from fault_rig import CONFIG, STANDS_S, START_NS, counts_of, force_at, seconds_of
 from geometry_msgs.msg import Vector3Stamped
+from live_node import lossless
 from node_process import NodeProcess
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
@@ -27,7 +28,6 @@ from rclpy.serialization import deserialize_message
 from ros_helpers import Peer
 from sensor_msgs.msg import Imu, Temperature
 
-from thermo_comp.ros.player import lossless
 from thermo_comp.ros.waitloop import WaitLoop
 
 #: Longest wait for any event [s]; reached only if the bench is broken.

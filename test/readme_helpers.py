@@ -32,8 +32,9 @@ def shown():
         if kind == 'console':
             command, _, output = text.partition('\n')
             words = shlex.split(command.removeprefix('$ '))
-            assert words[0] == 'thermo_comp'
-            found[words[1]] = (words[1:], output)
+            name = Path(words[1]).stem
+            assert words[0] == ('python' if name == 'demo' else 'thermo_comp')
+            found[name] = (words[1:], output)
     return found
 
 
@@ -60,13 +61,15 @@ def refresh():
     """Write the real output of the console examples into their page."""
     environment = {**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80'}
     with tempfile.TemporaryDirectory() as folder:
-        Path(folder, 'bags').symlink_to(ROOT / 'bags')
+        for name in ('bags', 'benchmarks'):
+            Path(folder, name).symlink_to(ROOT / name)
 
         def run(match):
             command = match[1].partition('\n')[0]
-            program = f'{shlex.quote(sys.executable)} -m thermo_comp'
+            python = shlex.quote(sys.executable)
+            line = command.replace('$ thermo_comp', f'{python} -m thermo_comp', 1)
             finished = subprocess.run(
-                ['bash', '-c', command.replace('$ thermo_comp', program, 1)], cwd=folder,
+                ['bash', '-c', line.replace('$ python', python, 1)], cwd=folder,
                 env=environment, capture_output=True, text=True, check=True,
             )  # fmt: skip
             return f'```console\n{command}\n{finished.stdout.rstrip()}\n```'

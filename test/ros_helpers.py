@@ -10,14 +10,13 @@ import threading
 
 import rclpy
 from geometry_msgs.msg import Vector3Stamped
+from live_node import node_in_thread  # noqa: F401 - for the tests
 from rcl_interfaces.srv import DescribeParameters, SetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
-
-from thermo_comp.ros.node import CompensationNode, node_in_thread  # noqa: F401 - for the tests
 
 SECOND_NS = 1_000_000_000
 #: Stamp of the first sample of a test, and interval between samples [ns].

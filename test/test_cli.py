@@ -10,6 +10,7 @@ import pty
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from thermo_comp.cli.app import split_arguments
 from thermo_comp.recording.reader import inspect_recording, read_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import save_calibration
+from thermo_comp.unit.nonlinearity import Nonlinearity, NonlinearTerm
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -164,6 +166,18 @@ class TestSimulate:
         assert [round((info.end_ns - info.start_ns) / 6e10) for info in infos] == [*[20] * 18, 180]
         assert {info.metadata['serial'] for info in infos} == {'demo-0001'}
         assert json.loads(infos[0].metadata['truth'])['profile'] == 'tumble-1'
+
+
+class TestInfo:
+    def test_lists_nonlinear_terms(self, unit, cli, tmp_path):
+        square = NonlinearTerm('square', (1e-5, -2e-5, 0.0), (1e-7, 0.0, 0.0), 1e-4)
+        bent = Nonlinearity((9.8, 98.0), 1e-4, (square,))
+        known = replace(rich_calibration(), nonlinearity=bent, posterior=None)
+        save_calibration(known, tmp_path / 'unit.yaml')
+        said = cli('info', tmp_path / 'unit.yaml').stdout
+        assert re.search(r'^K2 +µg/g² +10 +-20 +0$', said, re.MULTILINE)
+        assert re.search(r'^K2 per kelvin +µg/g²/K +0\.1 +0 +0$', said, re.MULTILINE)
+        assert 'nonlinearity' not in cli('info', unit).stdout
 
 
 class TestTopics:

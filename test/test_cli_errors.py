@@ -62,7 +62,7 @@ class TestUsage:
             (('replay', 'a', '-o', 'b', '-c', 'c', '--spin'), r'No such option.*--spin'),
             (('replay', 'a', '-o', 'b', '-c', 'c', '--input', 'gps'), r"'gps' is not one of"),
             (('replay', 'a', '-o', 'b', '-c', 'c', '--temperature-timeout', '0'),
-             r'`temperature_timeout_s` must be positive'),
+             r'`temperature_timeout_s` must be greater than 0'),
             (('fit', 'a', '-o', 'b'), r'give --gravity, or --latitude and --height'),
             (('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', 'nan'),
              r'--reference-temperature: must be at least -273.15, got nan'),

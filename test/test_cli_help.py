@@ -26,11 +26,9 @@ def leaves(group, prefix=''):
 
 
 COMMANDS = leaves(get_command(app))
-# `demo` is run by test_cli_demo.
 EXAMPLES = [
     line.strip()
     for name, command in COMMANDS.items()
-    if name != 'demo'
     for line in re.findall(r'^ +(thermo_comp .*)$', command.help or '', re.MULTILINE)
 ]
 # This example runs in a separate process, all others in this one.
@@ -53,7 +51,7 @@ def test_every_command_has_an_example():
         for name in COMMANDS
         if any(one.startswith(f'thermo_comp {name} ') for one in EXAMPLES)
     }
-    assert with_example == set(COMMANDS) - {'demo'}
+    assert with_example == set(COMMANDS)
     assert all(f'thermo_comp {name} ' in (one.help or '') for name, one in COMMANDS.items()), (
         'an example of another command'
     )

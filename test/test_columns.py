@@ -165,9 +165,17 @@ def test_one_state_has_the_bits_of_many(boards):
     [
         ({'range': (1.0, 1.0)}, '`range` must be .* got .1.0, 1.0.'),
         ({'kind': 'board', **WIDE}, '`tau_s` must be greater than 0 for board'),
+        ({'kind': 'cube', **WIDE}, '`tau_s` must be greater than 0 for cube'),
         ({'kind': 'play', **WIDE}, '`width_k` must be greater than 0 for play'),
     ],
 )
 def test_refusals(keys, message):
     with pytest.raises(ValueError, match=message):
         Column(**{'group': 'gradient', 'kind': 'gradient', **keys})
+
+
+def test_a_kind_without_a_source_is_not_read_from_a_gradient():
+    unknown = Column('rate', 'rate', **WIDE)
+    object.__setattr__(unknown, 'kind', 'pressure')
+    with pytest.raises(ValueError, match='kind pressure'):
+        ColumnTable([unknown], memory_of([]), 20.0)

@@ -304,7 +304,8 @@ def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
     while compensator.process(stamp, 0.0, 0.0, 1.0)[0] > -0.01 / 300.0:
         stamp += SECOND_NS // 10
     before = compensator.process(stamp + 1, 0.0, 0.0, 1.0)[0]
-    compensator.reconfigure(replace(compensator.config, transition_time_s=50.0))
+    other = replace(compensator.config, transition_time_s=50.0)
+    compensator.take_over(compensator.thermal.model, other)
     after = compensator.process(stamp + 2, 0.0, 0.0, 1.0)[0]
     assert after == pytest.approx(before, abs=1e-9)
 

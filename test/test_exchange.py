@@ -17,6 +17,7 @@ from thermo_comp.convert.tools import TOOLS
 from thermo_comp.errors import CalibrationError
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
 from thermo_comp.unit.functions import CubicSpline, Polynomial
+from thermo_comp.unit.nonlinearity import Nonlinearity, NonlinearTerm
 from thermo_comp.unit.prediction import bias_and_scale, ramp_states
 from thermo_comp.unit.rate_bias import Gyroscope, RateCurve, RateSet
 from thermo_comp.unit.rate_triad import rate_triad
@@ -217,12 +218,14 @@ def test_what_is_lost_is_said(cubic):
     spline = CubicSpline((-15.0, 0.0, 10.0, 25.0), (0.01, 0.0, 0.02, -0.01))
     static = replace(cubic.static, x=AxisSet(spline, ONE))
     dynamic = replace(static, y=replace(static.y, delta=0.1))
+    square = NonlinearTerm('square', (1e-5,) * 3, (0.0,) * 3, 1e-4)
     calibration = replace(
         cubic,
         static=static,
         dynamic=dynamic,
         response=(term('gradient', (0.0, 1e-3, 0.0)), term('board', tau_s=60.0)),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        nonlinearity=Nonlinearity((9.81, 20.0), 1e-4, (square,)),
     )
     text = export_calibration(calibration, 'ardupilot')
     for expected in (
@@ -230,6 +233,7 @@ def test_what_is_lost_is_said(cubic):
         '1e+03 urad',
         r'response is lost (gradient): ',
         'dynamic set is lost',
+        'nonlinear terms over specific force are lost',
     ):
         assert any(expected in note for note in text.notes), expected
         assert expected in text.text

@@ -17,11 +17,11 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import calibration
+from live_node import lossless
 from node_process import NodeProcess
 from ros_helpers import Driver, stamp_of, standing
 from sensor_msgs.msg import Imu
 
-from thermo_comp.ros.player import lossless
 from thermo_comp.ros.process import LOCAL_PROFILE, PROFILE, VARIABLE, use_profile
 from thermo_comp.unit.calibration_file import save_calibration
 

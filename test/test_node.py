@@ -14,6 +14,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 from builders import calibration, rich_calibration, thermal_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
+from live_node import lossless
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_helpers import (
     CYCLE_NS,
@@ -30,7 +31,6 @@ from ros_helpers import (
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
-from thermo_comp.ros.player import lossless
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration

@@ -12,9 +12,9 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import rich_calibration
+from live_node import through_the_node
 from rosbags.highlevel import AnyReader
 
-from thermo_comp.cli.demo import through_the_node
 from thermo_comp.recording.blocks import ImuColumns
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics

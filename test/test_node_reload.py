@@ -14,6 +14,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 import rclpy
 from builders import calibration
+from live_node import lossless
 from node_process import NodeProcess
 from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
@@ -23,7 +24,6 @@ from sensor_msgs.msg import Imu
 
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.ros.node import CompensationNode
-from thermo_comp.ros.player import lossless
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import dump_calibration, save_calibration

@@ -12,27 +12,20 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from recording_helpers import ACCEL, BOARD, Message, write_rosbag1
 from ros_helpers import TIMEOUT, stamp_of
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Bool
 
-from thermo_comp.errors import OutputError, RecordingError, ThermoCompError
+from thermo_comp.errors import RecordingError, ThermoCompError
 from thermo_comp.recording.blocks import ImuColumns
-from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.ros import player
-from thermo_comp.ros.listener import Recorder
 from thermo_comp.ros.player import play
-from thermo_comp.ros.waitloop import wait_until
-from thermo_comp.topics import IMU
 
 WINDOW = player.WINDOW['accel']
 
@@ -213,79 +206,3 @@ def test_a_subscriber_that_takes_nothing_is_not_waited_for_without_end(
         assert held.is_set()
     finally:
         hold.set()
-
-
-def test_recorder_keeps_every_message_under_its_stamp(peer, tmp_path):
-    with Recorder(tmp_path / 'out') as recorder:
-        imu = peer.publisher(Imu, 'imu/data_raw')
-        flag = peer.publisher(Bool, 'regime/dynamic')
-        stamped = peer.publisher(DiagnosticArray, 'regime/stamped')
-        assert wait_until(lambda: recorder.has_publishers, TIMEOUT)
-        sent = []
-        for k in range(500):
-            message = Imu()
-            message.header.stamp.sec, message.header.stamp.nanosec = 7, k
-            message.linear_acceleration.x = float(k)
-            sent.append(message)
-            imu.publish(message)
-        assert wait_until(lambda: recorder.counts['imu/data_raw'] == 500, TIMEOUT)
-        flag.publish(Bool(data=True))
-        assert wait_until(lambda: recorder.counts['regime/dynamic'] == 1, TIMEOUT)
-        stamped.publish(DiagnosticArray())
-        assert wait_until(lambda: recorder.counts['regime/stamped'] == 1, TIMEOUT)
-        assert recorder.counts == {'imu/data_raw': 500, 'regime/dynamic': 1, 'regime/stamped': 1}
-    with AnyReader([tmp_path / 'out']) as reader:
-        rows = [(c.topic, log_ns, bytes(data)) for c, log_ns, data in reader.messages()]
-    imus = [row for row in rows if row[0].endswith('imu/data_raw')]
-    assert [log_ns for _, log_ns, _ in imus] == [7 * 10**9 + k for k in range(500)]
-    assert [deserialize_message(data, Imu) for _, _, data in imus] == sent
-    # A message without stamp is placed at the newest Imu stamp before it.
-    flagged, unstamped = (row for row in rows if row not in imus)
-    assert flagged[1] == unstamped[1] == 7 * 10**9 + 499
-    assert deserialize_message(unstamped[2], DiagnosticArray) == DiagnosticArray()
-    assert deserialize_message(flagged[2], Bool).data
-    block = read_recording(
-        tmp_path / 'out', Topics(imu='imu/data_raw', input='imu'), require=('accel',)
-    )
-    assert len(block.columns) == 500
-
-
-def test_record_ends_when_told_or_when_nothing_comes(peer, tmp_path):
-    imu = peer.node.create_publisher(Imu, 'imu/data_raw', UNLIMITED)
-    stop = threading.Event()
-
-    def flood():
-        while not stop.wait(0.005):
-            imu.publish(Imu())
-
-    thread = threading.Thread(target=flood, daemon=True)
-    thread.start()
-    topics = {'imu/data_raw': IMU}
-    path = tmp_path / 'out.mcap'
-    with Recorder(path, topics=topics) as recorder:
-        assert wait_until(lambda: recorder.counts['imu/data_raw'] >= 20, TIMEOUT)
-    stop.set()
-    thread.join(TIMEOUT)
-    with Recorder(tmp_path / 'no.mcap', topics={'nobody/is/there': IMU}) as recorder:
-        assert not wait_until(lambda: False, 0.2)
-        assert recorder.counts == {'nobody/is/there': 0}
-    with pytest.raises(OutputError, match=r'out.mcap'), Recorder(path, topics=topics):
-        pass
-
-
-def test_a_recorder_says_that_the_disk_is_full(peer, tmp_path, monkeypatch):
-    def full(*_):
-        raise OutputError('cannot be written: No space left on device', tmp_path / 'out')
-
-    monkeypatch.setattr(BagWriter, 'write_raw', full)
-
-    def run():
-        with Recorder(tmp_path / 'out', topics={'imu/data_raw': IMU}) as recorder:
-            imu = peer.publisher(Imu, 'imu/data_raw')
-            assert wait_until(lambda: recorder.has_publishers, TIMEOUT)
-            imu.publish(Imu())
-            wait_until(lambda: recorder.counts['imu/data_raw'] > 0, TIMEOUT)
-
-    with pytest.raises(OutputError, match='No space left on device'):
-        run()
-    assert list(tmp_path.iterdir()) == []

@@ -21,6 +21,8 @@ from thermo_comp.simulation.run import arrays
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
+from thermo_comp.unit.nonlinearity import Nonlinearity, NonlinearTerm
+from thermo_comp.unit.posterior import Posterior
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
@@ -203,6 +205,24 @@ def test_population_refuses_what_is_not_alike():
     other = replace(third, reference_temperature_c=25.0)
     with pytest.raises(FitError, match='not of one type'):
         population([first, second, other])
+
+
+def test_the_command_names_the_nonlinear_terms_that_a_prior_leaves_out(cli, tmp_path):
+    cube = NonlinearTerm('cube', (1e-6,) * 3, (0.0,) * 3, 1e-5)
+    first, *others = siblings()
+    assert first.posterior is not None
+    row = parameter_layout(first).nonlinear
+    bent = Posterior.of(
+        np.insert(first.posterior.matrix, [row] * 6, 0.0, axis=0),
+        np.insert(first.posterior.variances, [row] * 6, 1e-14),
+    )
+    first = replace(first, nonlinearity=Nonlinearity((9.8, 50.0), 1e-4, (cube,)), posterior=bent)
+    paths = [tmp_path / f'{k}.yaml' for k in range(3)]
+    for one, path in zip((first, *others), paths, strict=True):
+        save_calibration(one, path)
+    said = cli('prior', *paths, '-o', tmp_path / 'type.yaml').stdout
+    assert f'leaves out the nonlinear terms (K2, K3) of {first.unit.serial}\n' in said
+    assert load_calibration(tmp_path / 'type.yaml').nonlinearity is None
 
 
 def test_prior_without_claim_is_refused():

@@ -7,8 +7,6 @@ Times are seconds since any origin, or datetime64. Anything that numpy converts 
 accepted: lists, pandas columns, xarray arrays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -181,8 +179,8 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
         recording = read_recording(bag, topics, require=['accel'])
     block = recording.columns
     readings = {name: one for name, one in block.temperatures.items() if len(one[0])}
-    stamps = [block.accel_stamp_ns, *(one[0] for one in readings.values())]
-    first_ns = min((int(one.min()) for one in stamps if len(one)), default=0)
+    stamps = [block.accel_stamp_ns, *(reading[0] for reading in readings.values())]
+    first_ns = min((int(stamp.min()) for stamp in stamps if len(stamp)), default=0)
     start_ns = first_ns // _MINUTE_NS * _MINUTE_NS
     return Columns(
         time_s=_seconds(block.accel_stamp_ns, start_ns),

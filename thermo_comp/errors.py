@@ -7,8 +7,6 @@ They are raised for files, bags and data that do not suffice for a fit. A caller
 numeric core is a plain `ValueError`. The command line prints `str(error)` and nothing else.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from .text import one_line

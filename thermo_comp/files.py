@@ -9,8 +9,6 @@ kind. The file gets its final name once it is complete. If the name is a symboli
 stays and its target is written.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import re
@@ -38,7 +36,7 @@ class Kind:
     suffixes: tuple[str, ...] = ()  # accepted suffixes; empty: any
 
     def refusal(self, path: Path) -> str:
-        """Say why an existing file or folder is not of this kind; empty if it is."""
+        """Return why an existing file or folder is not of this kind; empty if it is."""
         if path.is_dir() != self.is_folder:
             return f'it is a {"folder" if path.is_dir() else "file"}'
         if self.is_folder:

@@ -9,8 +9,6 @@ The parser's events are read in one pass, so that a too deep or too large file i
 it is built.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from itertools import takewhile
@@ -38,7 +36,7 @@ class PlainYamlError(ValueError):
 
     def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
         where = '' if line is None else f' (line {line})'
-        self.rule = f'{problem}{where}'  # the same without the detail
+        self.rule = f'{problem}{where}'  # the message without the detail
         super().__init__(f'{problem}: {detail}{where}' if detail else self.rule)
 
 

@@ -8,15 +8,14 @@ that a calibration within them gives finite results. Bounds that depend on the u
 and temperature range (bias, curves, weights and their deviations) are in `unit.reach`.
 """
 
-from __future__ import annotations
-
+import math
 import operator
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 from .text import counted
 
@@ -88,21 +87,23 @@ _PREPARED: dict[str, Bounds] = {
     'temperature rate': _between(-1e5, 1e5, 'K/min', 'a thermal shock is 1e3'),
     'rate span': _positive(1e-6, 2e5, 'K/min', 'a kelvin in two years'),
     'time constant': _positive(1e-3, 1e8, 's', 'a bare wire; three years'),
-    'lag': _nil_or(1e-3, 1e8, 's', 'as a time constant; 0 is none'),
+    'lag': _nil_or(1e-3, 1e8, 's', 'as for a time constant; 0 is no lag'),
     # The response.
     'value of a column': _between(-1e10, 1e10, 'of its kind', 'the cube of 1273 K is 2e9'),
     'span of a column': _positive(1e-9, 2e10, 'of its kind', 'a millionth of a rate of 0.1 K/min'),
-    'width': _nil_or(1e-4, 1e4, 'K', 'resolution of a thermometer; above any difference'),
+    'width': _nil_or(1e-4, 1e4, 'K', 'resolution of a thermometer; more than temperatures differ'),
     'gradient': _between(-1273.15, 1273.15, 'K', '0 K to where solder melts'),
     'power': Bounds(at_least=0, at_most=4, why='powers above the third are not observed'),
     # Noise and deviations.
-    'noise density': _positive(1e-12, 1e3, 'm/s^2/sqrt(Hz)', 'a thousandth of the best; 100 g'),
-    'rate noise density': _positive(1e-12, 1e3, 'rad/s/sqrt(Hz)', 'of the best; 57000 deg/s'),
+    'noise density': _positive(1e-12, 1e3, 'm/s^2/sqrt(Hz)', 'far below any sensor; 100 g'),
+    'rate noise density': _positive(
+        1e-12, 1e3, 'rad/s/sqrt(Hz)', 'far below any sensor; 57000 deg/s'
+    ),
     'slow noise': _up_to(1e3, 'm/s^2/sqrt(h)', '100 g in an hour'),
     'rate slow noise': _up_to(1e3, 'rad/s/sqrt(h)', '57000 deg/s in an hour'),
-    'deviation': _up_to(1e4, 'm/s^2', '1000 g: nothing is known'),
-    'rate deviation': _up_to(1e3, 'rad/s', '57000 deg/s: nothing is known'),
-    'misalignment deviation': _up_to(1.0, 'rad', 'nothing is known'),
+    'deviation': _up_to(1e4, 'm/s^2', '1000 g: the quantity is unknown'),
+    'rate deviation': _up_to(1e3, 'rad/s', '57000 deg/s: the quantity is unknown'),
+    'misalignment deviation': _up_to(1.0, 'rad', 'the quantity is unknown'),
     'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'at 1 g it reads 2 g'),
     # Results of a fit and numbers of samples.
     'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
@@ -121,6 +122,8 @@ _PREPARED: dict[str, Bounds] = {
     'knots': Bounds(longest=100, why='ten per ten kelvins'),
     'columns': Bounds(longest=2000, why='all columns of ten thermometers'),
 }
+Positive = Annotated[float, Bounds(above=0.0, below=math.inf)]
+NotNegative = Annotated[float, Bounds(at_least=0.0, below=math.inf)]
 #: Bounds by the name of the quantity; the keys of a calibration refer to them.
 QUANTITIES: Final[Mapping[str, Bounds]] = MappingProxyType(_PREPARED)
 
@@ -139,6 +142,6 @@ def refuse_impossible(value: Any) -> None:
     """Raise ValueError with the name of the key if a field of a dataclass violates its bounds."""
     cls: type = type(value)
     for name, bounds in _bounds_of(cls).items():
-        for one in bounds:
-            if fault := one.fault(getattr(value, name)):
+        for bound in bounds:
+            if fault := bound.fault(getattr(value, name)):
                 raise ValueError(f'`{name}` {fault}, got {getattr(value, name)}')

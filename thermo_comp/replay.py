@@ -8,8 +8,6 @@ the first sample after it in the bag. The result therefore equals, bit for bit, 
 which receives the messages in the order of the bag. Memory is limited to one block.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -151,7 +149,7 @@ def replay(
 
 def _beyond(calibration: Calibration, block: Block) -> float:
     """Return how far the board readings lie outside all ranges [K], single outliers ignored."""
-    ranges = [one.temperature_range_c for one in calibration.regime_sets()]
+    ranges = [regime_set.temperature_range_c for regime_set in calibration.regime_sets()]
     lower, upper = min(one[0] for one in ranges), max(one[1] for one in ranges)
     celsius = block.temperatures['board'].celsius
     bulk = np.nanquantile(celsius, _BULK) if np.isfinite(celsius).any() else np.array([lower])

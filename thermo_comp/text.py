@@ -2,17 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the safe printing of texts from outside, and nouns with their number."""
 
-from __future__ import annotations
-
 import os
 import sys
 
 LONGEST_SERIAL = 64  # characters; serials are used in file names, parameter files and tables
 
 
-def counted(n: int, noun: str, ending: str = 's') -> str:
+def counted(n: int, noun: str) -> str:
     """Return a number with its noun, as in ``1 window`` and ``2 windows``."""
-    return f'{n} {noun}{ending * (n != 1)}'
+    return f'{n} {noun}{"s" * (n != 1)}'
 
 
 def one_line(text: str) -> str:

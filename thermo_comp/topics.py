@@ -7,8 +7,6 @@ Node, replay, recorders, player, bag writer and docs/ros_interface.md read this 
 packed in little-endian CDR: 4 bytes of encapsulation, then the fields.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from struct import pack

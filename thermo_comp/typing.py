@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the array types that all rooms share."""
 
-from __future__ import annotations
-
 from typing import TypeAlias
 
 import numpy as np

@@ -7,8 +7,6 @@ Blocks are added as they come. A rest in another direction than the present posi
 next position; knocks and handling in between belong to the previous position.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -116,8 +114,8 @@ class Acquisition:
 
     def add(self, block: Block) -> list[int]:
         """Take a block; return the stamps [ns] at which further positions begin."""
-        for name, one in block.temperatures.items():
-            self._readings.setdefault(name, []).append(one)
+        for name, readings in block.temperatures.items():
+            self._readings.setdefault(name, []).append(readings)
         if not len(block):
             return []
         begins: list[int] = []
@@ -192,16 +190,16 @@ class Acquisition:
             for name, own in self._readings.items()
         }
         self._begin_ns, self._n_looked, self._first = end_ns, 0, None
-        means = np.array([one.mean for one in self._rests if one.n_rests]).reshape(-1, 3)
+        means = np.array([rest.mean for rest in self._rests if rest.n_rests]).reshape(-1, 3)
         self._centre = coverage.rough_centre(means)
 
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
         """Combine the rests of the position, up to the begin of the next."""
-        found = {
+        by_name = {
             name: survey_thermometer([_part(one, _EVER_NS, end_ns) for one in own])
             for name, own in self._readings.items()
         }
-        surveys = {name: one for name, one in found.items() if one is not None}
+        surveys = {name: one for name, one in by_name.items() if one is not None}
         end_s = (end_ns - cells.start_ns) * 1e-9 - 0.5 * cells.cell_s
         cells = cells.part(slice(int(np.searchsorted(cells.time, end_s))))
         ranges = still_intervals(cells, self._rest_s)
@@ -235,13 +233,13 @@ class Acquisition:
             positions.append(
                 Position(up, rest.still_s, rest.n_rests, float(sd), rest.surveys, reason)
             )
-        found = [one for one in positions if np.isfinite(one.up).all()]
-        seen = np.array([one.up for one in found]).reshape(-1, 3)
-        covariance = coverage.constants_covariance(seen, np.array([one.sd_g for one in found]))
-        next_up = coverage.next_direction(covariance, found[-1].sd_g if found else _FLOOR_SD, seen)
+        known = [position for position in positions if np.isfinite(position.up).all()]
+        seen = np.array([one.up for one in known]).reshape(-1, 3)
+        covariance = coverage.constants_covariance(seen, np.array([one.sd_g for one in known]))
+        next_up = coverage.next_direction(covariance, known[-1].sd_g if known else _FLOOR_SD, seen)
         now, is_still = self._now(cells)
         hole, hole_deg = coverage.farthest(seen)
-        n_good = sum(not one.reason for one in positions)
+        n_good = sum(not position.reason for position in positions)
         thermometers = _together([one.surveys for one in rests])
         missing = self._n_wanted - n_good
         findings = [f'{missing} of {self._n_wanted} positions are missing'] * (missing > 0)
@@ -309,9 +307,9 @@ def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
 
 def _together(surveys: Sequence[Surveys]) -> Surveys:
     """Describe thermometers over several positions."""
-    found: dict[str, list[ThermometerSurvey]] = {}
+    by_name: dict[str, list[ThermometerSurvey]] = {}
     for name, one in (item for survey in surveys for item in survey.items()):
-        found.setdefault(name, []).append(one)
+        by_name.setdefault(name, []).append(one)
     return {
         name: replace(
             own[-1],
@@ -321,5 +319,5 @@ def _together(surveys: Sequence[Surveys]) -> Surveys:
             steepest_heating_k_min=max(one.steepest_heating_k_min for one in own),
             steepest_cooling_k_min=min(one.steepest_cooling_k_min for one in own),
         )
-        for name, own in found.items()
+        for name, own in by_name.items()
     }

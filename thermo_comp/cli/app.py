@@ -22,7 +22,7 @@ from typer import rich_utils
 from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
-from . import bags, convert, demo, field, fit, fleet, judge, output, record, simulate
+from . import bags, convert, field, fit, fleet, judge, output, record, simulate
 from .shared_options import expanded, option
 
 # Base class of all errors in a command line, which typer does not export.
@@ -62,7 +62,7 @@ def _top(
 for _command in (
     *(record.record, fit.fit, fit.prior, judge.evaluate, bags.replay, bags.play, bags.info),
     *(field.update, judge.report, convert.convert, convert.export, convert.import_),
-    *(simulate.simulate, demo.demo),
+    simulate.simulate,
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))
 _fleet = typer.Typer(name='fleet', help='Fit many units, and compare them.')
@@ -133,17 +133,17 @@ def _plain(message: str, arguments: list[str]) -> str:
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Split arguments into a command's and those of ROS (from ``--ros-args`` up to ``--``)."""
-    own: list[str] = []
-    ros: list[str] = []
-    target = own
+    for_command: list[str] = []
+    for_ros: list[str] = []
+    target = for_command
     for argument in arguments:
         if argument == '--ros-args':
-            target = ros
-        elif argument == '--' and target is ros:
-            target = own
+            target = for_ros
+        elif argument == '--' and target is for_ros:
+            target = for_command
         else:
             target.append(argument)
-    return own, ros
+    return for_command, for_ros
 
 
 def _unexpected(failure: Exception) -> int:

@@ -3,8 +3,9 @@
 """Owns the commands for a single bag: ``info`` (also for a calibration), ``replay``, ``play``."""
 
 from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -12,8 +13,11 @@ from ..files import bag_kind, check_output
 from ..online.status import DROPPED, CompensatorConfig
 from ..text import counted
 from . import shared_options as options
-from .output import Output, micro_g, picked
+from .output import Cell, Output, micro_g, picked
 from .shared_options import argument, option
+
+if TYPE_CHECKING:
+    from ..unit.calibration import Calibration
 
 _BAG = argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
 _AS_THE_NODE = 'As the parameter of the node, in s.'
@@ -28,7 +32,7 @@ def info(
     Describe a bag or a calibration.
 
     Bag: topics, rate, temperature span and ramps, gaps, and whether a fit
-    can use it. Calibration: unit, ranges, sets, residuals.
+    can use it. Calibration: unit, ranges, sets, residuals, nonlinear terms.
 
     Example:
       thermo_comp info chamber.mcap
@@ -40,21 +44,21 @@ def info(
         return
     with out.progress(f'reading {path.name}') as done:
         survey = survey_recording(path, topics, done)
-    found, thermometers = survey.info, survey.thermometers
-    out.line(f'{path}: {found.storage}, {found.n_messages} messages')
-    for key, value in found.metadata.items():
+    bag, thermometers = survey.info, survey.thermometers
+    out.line(f'{path}: {bag.storage}, {bag.n_messages} messages')
+    for key, value in bag.metadata.items():
         if key in ('serial', 'converted_from', 'corrected_from', 'simulated_by'):
             out.line(f'  {key.replace("_", " ")}: {value}')
-    rows = sorted((name, kind, count) for name, (kind, count) in found.topics.items())
+    rows = sorted((name, kind, count) for name, (kind, count) in bag.topics.items())
     out.table(('topic', 'type', 'messages'), rows)
     if survey.n:
         out.line(
-            f'{survey.n} samples of {found.input}, {survey.rate_hz:.4g} Hz, '
+            f'{survey.n} samples of {bag.input}, {survey.rate_hz:.4g} Hz, '
             f'{survey.duration_s:.1f} s; {counted(survey.n_still, "still interval")}, '
             f'{survey.still_s:.1f} s'
         )
-    if found.chosen:
-        out.line(found.chosen)
+    if bag.chosen:
+        out.line(bag.chosen)
     if thermometers:
         facts = 'rate_hz lowest highest steepest_heating_k_min steepest_cooling_k_min'
         out.table(
@@ -65,10 +69,10 @@ def info(
     if not survey.findings:
         out.line('a fit can use it, together with other positions')
     out.end(
-        int(bool(found.truncated)),
+        int(bool(bag.truncated)),
         path=path,
-        **picked(found, 'storage truncated metadata input chosen'),
-        topics={name: {'type': kind, 'messages': n} for name, (kind, n) in found.topics.items()},
+        **picked(bag, 'storage truncated metadata input chosen'),
+        topics={name: {'type': kind, 'messages': n} for name, (kind, n) in bag.topics.items()},
         samples=survey.n,
         still_intervals=survey.n_still,
         board=thermometers.get('board'),
@@ -121,8 +125,30 @@ def _calibration(out: Output, path: Path) -> None:
                 for n in provenance.residuals
             ],
         )
+    tell_nonlinearity(out, calibration)
     out.points(provenance.notes)
     out.end(path=path, calibration=calibration)
+
+
+def tell_nonlinearity(out: Output, calibration: 'Calibration') -> None:
+    """Print the nonlinear terms, if rests of a fit were not all at 1 g."""
+    from ..unit.prediction import nonlinear_coefficients
+
+    if calibration.nonlinearity is None:
+        return
+    rows: list[tuple[Cell, ...]] = []
+    for coefficient in nonlinear_coefficients(calibration):
+        axes = zip(coefficient.value.tolist(), coefficient.sd.tolist(), strict=True)
+        said = [f'{value:.4g}' + f' +- {sd:.2g}' * isfinite(sd) for value, sd in axes]
+        rows.append((coefficient.name, coefficient.unit, *said))
+    terms = calibration.nonlinearity.terms
+    losses = ', '.join(f'{one.kind} {one.log_evidence_change:.1f}' for one in terms) or 'no term'
+    low, high = calibration.nonlinearity.force_range_m_s2
+    out.table(
+        ('coefficient', 'unit', 'x', 'y', 'z'),
+        rows,
+        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; log evidence: {losses}',
+    )
 
 
 def replay(
@@ -176,8 +202,8 @@ def replay(
         )
     info, counters = result.info, result.counters
     out.told([(info.path, info.chosen, info.truncated)])
-    for one in result.notes:
-        out.note(f'{info.path}: {one}')
+    for note in result.notes:
+        out.note(f'{info.path}: {note}')
     counts = asdict(counters)
     out.line(f'{output}: {counters.n_out} of {counters.n_in} samples corrected')
     for name, count in counts.items():

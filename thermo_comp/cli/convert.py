@@ -17,7 +17,7 @@ from .output import Output, picked
 from .shared_options import argument, option
 
 if TYPE_CHECKING:
-    from ..convert.log import ForeignLog
+    from ..convert.log import ConversionReport, ForeignLog
 
 Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
@@ -60,13 +60,14 @@ def convert(
     from the headings and printed; a table of [t] ax ay az [wx wy wz] needs no
     headings. In a PX4 or ArduPilot log the IMU's temperature becomes the
     board's, the barometer's the case's. In a bag the thermometer in the
-    namespace of the Imu becomes the board's, of a barometer the case's.
+    namespace of the Imu becomes the board's, that of a
+    barometer the case's.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
       thermo_comp convert flight.ulg --imu 1 -o unit43
     """
-    from ..convert.log import SLOW_HZ, write_log
+    from ..convert.log import write_log
     from ..convert.readers import read_log
 
     inputs = [log] if columns is None else [log, columns]
@@ -85,45 +86,52 @@ def convert(
             read = read_log(log, **given)
         tell_guess(out, read)
         report = write_log(read, output, force, done)
+    _tell_conversion(out, report, output)
     found, further = report.log, dict(report.messages)
     usual = {f'{name}_messages': further.pop(name) for name in ('accel', 'board', 'case')}
-    accel = SAMPLES[found.input].name
-    out.line(
-        f'{found.path}: {report.rows} rows, {report.duration_s:.1f} s at {report.rate_hz:.4g} Hz'
-    )
-    out.line(f'{output}:')
-    for name, count in report.messages.items():
-        out.line(f'  {count:8} {accel if name == "accel" else thermometer(name)}')
-    out.line(f'unit: {found.unit}; {report.believed}')
-    if report.rate_hz < SLOW_HZ:
-        out.line(
-            f'{report.rate_hz:.3g} Hz: good for soaks of minutes; too slow for short rests by '
-            'hand, and for detecting vibration or a knock between two samples'
-        )
-    if found.hint:
-        out.line(found.hint)
-    for name, finding in report.findings.items():
-        if finding.count:
-            more = ', ...' if finding.count > len(finding.lines) else ''
-            where = f' (line {", ".join(map(str, finding.lines))}{more})' if finding.lines else ''
-            out.line(f'{_FINDINGS[name]}: {finding.count}{where}')
-    start_ns = int(found.stamp_ns[0])
-    if report.stillness.moving_ns:
-        out.line('moved or shaken, not at rest:')
-        for stretch in report.stillness.moving_ns:
-            begin, end = ((stamp_ns - start_ns) * 1e-9 for stamp_ns in stretch)
-            out.line(f'  {begin:9.1f} .. {end:.1f} s')
-    out.told([(found.path, found.chosen, found.missing)])
     out.end(
         output=output,
         **picked(report, 'rows rate_hz duration_s believed stillness'),
         **picked(found, 'input unit missing chosen hint'),
         source=found.path,
-        start_ns=start_ns,
+        start_ns=int(found.stamp_ns[0]),
         **usual,
         further_messages=further,
         **report.findings,
     )
+
+
+def _tell_conversion(out: Output, report: 'ConversionReport', output: Path) -> None:
+    """Print what was written, what was left out or is strange, and when the unit moved."""
+    from ..convert.log import SLOW_HZ
+
+    log = report.log
+    accel = SAMPLES[log.input].name
+    out.line(
+        f'{log.path}: {report.rows} rows, {report.duration_s:.1f} s at {report.rate_hz:.4g} Hz'
+    )
+    out.line(f'{output}:')
+    for name, count in report.messages.items():
+        out.line(f'  {count:8} {accel if name == "accel" else thermometer(name)}')
+    out.line(f'unit: {log.unit}; {report.believed}')
+    if report.rate_hz < SLOW_HZ:
+        out.line(
+            f'{report.rate_hz:.3g} Hz: good for soaks of minutes; too slow for short rests by '
+            'hand, and for detecting vibration or a knock between two samples'
+        )
+    if log.hint:
+        out.line(log.hint)
+    for name, finding in report.findings.items():
+        if finding.count:
+            more = ', ...' if finding.count > len(finding.lines) else ''
+            where = f' (line {", ".join(map(str, finding.lines))}{more})' if finding.lines else ''
+            out.line(f'{_FINDINGS[name]}: {finding.count}{where}')
+    if report.stillness.moving_ns:
+        out.line('moved or shaken, not at rest:')
+        for stretch in report.stillness.moving_ns:
+            begin, end = ((stamp_ns - int(log.stamp_ns[0])) * 1e-9 for stamp_ns in stretch)
+            out.line(f'  {begin:9.1f} .. {end:.1f} s')
+    out.told([(log.path, log.chosen, log.missing)])
 
 
 @contextmanager

@@ -4,11 +4,10 @@
 
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 from ..files import CALIBRATION, check_output
 from . import shared_options as options
-from .output import Output, micro, micro_g
+from .output import Output, micro, micro_g, picked
 from .shared_options import argument, option
 
 #: Exit code of an update that gains nothing.
@@ -19,9 +18,9 @@ def update(
     calibration: Path = argument('Calibration of the unit (YAML).', metavar='YAML'),
     rests: list[Path] = argument('Rest logs: folders of the node, or files.', metavar='RESTS...'),
     output: Path = options.NEW_CALIBRATION,
-    gravity: float | None = options.place,
+    where: tuple[float | None, float] = options.place,
     ahead: float = option(
-        'Days until the next update: the claim is aged by them.', 1.0, min=0.0, max=3650.0
+        'Days until the next update; the uncertainty is aged by them.', 1.0, min=0.0, max=3650.0
     ),
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -46,7 +45,7 @@ def update(
     old = load_calibration(calibration)
     logged, source, notes = read_rests(rests, old, ahead=ahead)
     created = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
-    result = run(series_of(logged, old, gravity), old, source, created, ahead)
+    result = run(series_of(logged, old, gravity=where[0]), old, source, created, ahead)
     out.points(notes)
     out.table(
         ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),
@@ -72,16 +71,14 @@ def update(
         out.line(f'{output}: written')
     else:
         out.line(f'nothing gained: {output} is not written, keep {calibration}')
-    facts: dict[str, Any] = {
-        'output': output if is_better else None,
-        'moved': result.moved,
-        'ageing_m_s2': result.ageing,
-        'changes': result.changes,
-        'judged': result.judged,
-        'is_better': is_better,
-        'notes': [*notes, *what_moved(result)],
-    }
-    out.end(0 if is_better else NOTHING_GAINED, **facts)
+    out.end(
+        0 if is_better else NOTHING_GAINED,
+        output=output if is_better else None,
+        **picked(result, 'moved changes judged'),
+        ageing_m_s2=result.ageing,
+        is_better=is_better,
+        notes=[*notes, *what_moved(result)],
+    )
 
 
 def evaluate_rests(
@@ -117,9 +114,7 @@ def evaluate_rests(
     out.line(str(result))
     out.end(
         result.exit_code,
-        days=result.days,
-        temperatures=result.temperatures,
-        left=result.left,
+        **picked(result, 'days temperatures left'),
         forecast_days=result.forecast,
         interval_days=result.interval,
         ageing_m_s2=result.ageing,

@@ -13,6 +13,7 @@ import typer
 from ..files import CALIBRATION, PAGE, check_output
 from ..text import counted
 from . import shared_options as options
+from .bags import tell_nonlinearity
 from .convert import flags_named, tell_guess
 from .output import Cell, Output, micro_g, millidegrees, picked
 from .shared_options import argument, option
@@ -21,9 +22,13 @@ if TYPE_CHECKING:
     from ..convert.log import ForeignLog
     from ..fitting import FitResult
     from ..fitting.selection import Trial
+    from ..unit.calibration import Calibration
+    from ..unit.rate_bias import Gyroscope
 
 #: Largest width of a model in a table [characters].
 _MODEL_WIDTH = 46
+#: Properties of a gyroscope that are printed.
+_RATES = 'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h'
 Curve = Literal['linear', 'quadratic', 'cubic', 'spline', 'exponential']
 
 
@@ -142,7 +147,8 @@ def prior(
     Make the prior of a type of unit from calibrations of several units.
 
     The prior is the mean and scatter of the calibrations. With `fit --prior`
-    a further unit of the type needs less time in the chamber.
+    a further unit of the type needs less time in the chamber. Nonlinear terms
+    (K2, K3) of the calibrations are left out.
 
     Example:
       thermo_comp prior unit01.yaml unit02.yaml unit03.yaml -o type.yaml
@@ -152,30 +158,13 @@ def prior(
 
     check_output(output, CALIBRATION, overwrite=force, others=calibrations)
     units = [load_calibration(path) for path in calibrations]
-    found = population(units)
-    save_calibration(found, output, overwrite=force)
-    out.line(f'{output}: what {len(units)} units have in common, {len(found.response)} columns')
-    out.end(output=output, units=[one.unit.serial for one in units])
-
-
-def _say_terms(out: Output, calibration: Any) -> None:
-    """Print the nonlinear terms, if the fit had any to look for."""
-    from ..unit.prediction import nonlinear_coefficients
-
-    if calibration.nonlinearity is None:
-        return
-    rows: list[tuple[Cell, ...]] = []
-    for one in nonlinear_coefficients(calibration):
-        pairs = zip(one.value.tolist(), one.sd.tolist(), strict=True)
-        rows.append((one.name, one.unit, *(f'{value:.4g} +- {sd:.2g}' for value, sd in pairs)))
-    terms = calibration.nonlinearity.terms
-    losses = ', '.join(f'{one.kind} {one.log_evidence_change:.1f}' for one in terms) or 'no term'
-    low, high = calibration.nonlinearity.force_range_m_s2
-    out.table(
-        ('coefficient', 'unit', 'x', 'y', 'z'),
-        rows,
-        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; log evidence: {losses}',
-    )
+    common = population(units)
+    save_calibration(common, output, overwrite=force)
+    out.line(f'{output}: what {len(units)} units have in common, {len(common.response)} columns')
+    bent = [unit.unit.serial for unit in units if unit.nonlinearity and unit.nonlinearity.terms]
+    if bent:
+        out.line(f'- the prior leaves out the nonlinear terms (K2, K3) of {", ".join(bent)}')
+    out.end(output=output, units=[unit.unit.serial for unit in units])
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -190,70 +179,17 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
 
     calibration = result.calibration
     gyroscope = calibration.gyroscope if result.rates else None
-    rates = 'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h'
     model, left_out = calibration.provenance.model, result.residuals[-1].left_out
-    if verbose:
-        out.table(
-            ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', 'in sample ug', 'left out ug'),
-            [
-                (
-                    one.source,
-                    time.strftime('%m-%d %H:%M:%S', time.gmtime(one.start_ns // 10**9)),
-                    f'{one.duration_s / 60.0:.1f}',
-                    *(f'{component:+.3f}' for component in one.up),
-                    *(micro_g(one.residual_rms), micro_g(one.left_out_rms)),
-                )
-                for one in result.positions
-            ],
-            title='positions at rest',
-        )
-    _say_models(out, result.selected.trials)
-    if calibration.evidence:
-        out.table(
-            ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
-            [
-                (
-                    *(one.group, one.part, micro_g(one.explains_m_s2)),
-                    *(f'{one.effective_parameters:.1f}', f'{one.log_evidence_change:.1f}'),
-                )
-                for one in calibration.evidence
-            ],
-            title='groups kept; log evidence: its loss if the group is removed',
-        )
-    _say_terms(out, calibration)
-    white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
-    walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
-    out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')
-    steps = {'raw': 'raw', 'one_set': 'one set', 'two_sets': 'two sets', 'fitted': model}
-    out.table(
-        ('section', 'windows', *steps.values(), 'left out'),
-        _steps(result.residuals, (*steps, 'left_out'), micro_g),
-        title='|f| - g at rest, RMS in ug',
-    )
     n_positions = len(distinct_directions(np.array([one.up for one in result.positions])))
-    if not left_out.n:
-        out.line('left out: no error, as the fit needs all of the data')
-    elif n_positions == 1:
-        out.line('left out: drift of an axis in parts of the program that took no part in the fit')
-    else:
-        out.line(
-            'left out: on data that took no part in the fit; drift of an axis where the other '
-            'positions do not determine |f|'
-        )
+    if verbose:
+        _say_positions(out, result)
+    _say_models(out, result.selected.trials)
+    _say_groups(out, calibration)
+    tell_nonlinearity(out, calibration)
+    _say_residuals(out, result, n_positions)
     if gyroscope is not None:
-        out.table(
-            ('section', 'windows', 'raw', 'fitted', 'left out'),
-            _steps(result.rates, ('raw', 'fitted', 'left_out'), millidegrees, axes=3),
-            title='angular rate at rest less the mean of each position, RMS of an axis in mdeg/s',
-        )
-        bias, white, walk = (
-            _of_axes(values, millidegrees) for values in picked(gyroscope, rates).values()
-        )
-        out.line(
-            f'angular rate of x y z: bias {bias} mdeg/s, white {white} mdeg/s/sqrt(Hz), '
-            f'walk {walk} mdeg/s/sqrt(h)'
-        )
-    out.points(one.message for one in result.findings if one.level != 'good')
+        _say_rates(out, result, gyroscope)
+    out.points(finding.message for finding in result.findings if finding.level != 'good')
     headline = counted(n_positions, 'position')
     if len(result.positions) > n_positions:
         headline += f' ({counted(len(result.positions), "rest")})'
@@ -269,10 +205,79 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
         gravity=calibration.gravity_m_s2,
         left_out_rms_m_s2=left_out.rms,
         residuals_m_s2=result.residuals,
-        models=[_model(one) for one in result.selected.trials],
+        models=[_model(trial) for trial in result.selected.trials],
         **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
-        gyroscope=gyroscope and picked(gyroscope, rates) | {'residuals_rad_s': result.rates},
+        gyroscope=gyroscope and picked(gyroscope, _RATES) | {'residuals_rad_s': result.rates},
         **picked(result, 'positions least_known findings'),
+    )
+
+
+def _say_positions(out: Output, result: 'FitResult') -> None:
+    out.table(
+        ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', 'in sample ug', 'left out ug'),
+        [
+            (
+                position.source,
+                time.strftime('%m-%d %H:%M:%S', time.gmtime(position.start_ns // 10**9)),
+                f'{position.duration_s / 60.0:.1f}',
+                *(f'{component:+.3f}' for component in position.up),
+                *(micro_g(position.residual_rms), micro_g(position.left_out_rms)),
+            )
+            for position in result.positions
+        ],
+        title='positions at rest',
+    )
+
+
+def _say_groups(out: Output, calibration: 'Calibration') -> None:
+    if calibration.evidence:
+        out.table(
+            ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
+            [
+                (
+                    *(one.group, one.part, micro_g(one.explains_m_s2)),
+                    *(f'{one.effective_parameters:.1f}', f'{one.log_evidence_change:.1f}'),
+                )
+                for one in calibration.evidence
+            ],
+            title='groups kept; log evidence: its loss if the group is removed',
+        )
+    white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
+    walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
+    out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')
+
+
+def _say_residuals(out: Output, result: 'FitResult', n_positions: int) -> None:
+    steps = {'raw': 'raw', 'one_set': 'one set', 'two_sets': 'two sets'}
+    steps['fitted'] = result.calibration.provenance.model
+    out.table(
+        ('section', 'windows', *steps.values(), 'left out'),
+        _steps(result.residuals, (*steps, 'left_out'), micro_g),
+        title='|f| - g at rest, RMS in ug',
+    )
+    if not result.residuals[-1].left_out.n:
+        out.line('left out: no error, as the fit needs all of the data')
+    elif n_positions == 1:
+        out.line('left out: drift of an axis in parts of the program that took no part in the fit')
+    else:
+        out.line(
+            'left out: on data that took no part in the fit; drift of an axis where the other '
+            'positions do not determine |f|'
+        )
+
+
+def _say_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> None:
+    out.table(
+        ('section', 'windows', 'raw', 'fitted', 'left out'),
+        _steps(result.rates, ('raw', 'fitted', 'left_out'), millidegrees, axes=3),
+        title='angular rate at rest less the mean of each position, RMS of an axis in mdeg/s',
+    )
+    bias, white, walk = (
+        _of_axes(values, millidegrees) for values in picked(gyroscope, _RATES).values()
+    )
+    out.line(
+        f'angular rate of x y z: bias {bias} mdeg/s, white {white} mdeg/s/sqrt(Hz), '
+        f'walk {walk} mdeg/s/sqrt(h)'
     )
 
 
@@ -283,7 +288,7 @@ def _say_models(out: Output, trials: Sequence['Trial']) -> None:
         'sections': 'drift of an axis in a part of the program left out',
         'norm': '|f| - g in a position left out',
     }
-    left = [[micro_g(folds.rms) for folds in one.score.kinds] for one in trials]
+    left = [[micro_g(folds.rms) for folds in trial.score.kinds] for trial in trials]
     kept = [k for k in range(len(columns)) if any(row[k] for row in left)]
     if not kept or len(trials) < 2:
         return
@@ -306,7 +311,7 @@ def _named(groups: tuple[str, ...]) -> str:
     """Name a model by its groups; all but the smallest have the curve."""
     if len(groups) < 2 or groups[0] != 'curve':
         return '+'.join(groups) or 'constants'
-    return ''.join(f'+{one}' for one in groups[1:])
+    return ''.join(f'+{group}' for group in groups[1:])
 
 
 def _wrapped(name: str) -> list[str]:

@@ -3,12 +3,15 @@
 """Owns ``fleet fit``: the calibrations of many units, with their table and statistics."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..text import counted, one_line
 from . import shared_options as options
 from .output import Output, micro, picked
 from .shared_options import argument, option
+
+if TYPE_CHECKING:
+    from ..fleet.run import FleetResult
 
 
 def fleet_fit(
@@ -81,6 +84,16 @@ def fleet_fit(
         except KeyboardInterrupt:
             out.note(f'interrupted: {state}, kept in {output}; the same command does the others')
             raise
+    _tell_result(out, result, with_prior)
+    out.end(
+        int(not result.is_whole),
+        **picked(result, 'rows n_fitted n_done parquet csv page prior'),
+        **picked(result.summary, 'verdicts outliers drifts'),
+    )
+
+
+def _tell_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
+    """Print the tests, their problems, the units that stand out, and the files."""
     summary = result.summary
     out.table(
         ('test', 'serial', 'verdict', 'static ug', 'dynamic ug', 'bags'),
@@ -118,11 +131,6 @@ def fleet_fit(
         f'{result.page}: {result.n_fitted} of {counted(len(result.rows), "test")} calibrated; '
         f'{counted(result.n_done, "test")} done in this run, '
         f'{len(result.rows) - result.n_done} in an earlier one'
-    )
-    out.end(
-        int(not result.is_whole),
-        **picked(result, 'rows n_fitted n_done parquet csv page prior'),
-        **picked(summary, 'verdicts outliers drifts'),
     )
 
 

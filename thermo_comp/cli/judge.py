@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns ``evaluate`` and ``report``: the residuals of a calibration, as table and page."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..files import CSV, PAGE, check_output, shown_name
 from ..unit.gravity import STANDARD_GRAVITY
@@ -13,6 +13,10 @@ from . import shared_options as options
 from .field import evaluate_rests
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
 from .shared_options import argument, option
+
+if TYPE_CHECKING:
+    from ..judging.evaluation import Drift
+    from ..judging.judgement import Judgement
 
 
 def evaluate(
@@ -68,8 +72,34 @@ def evaluate(
     if csv is not None:
         with table_writer(csv, {}, overwrite=force) as write:
             write(columns_of(judged.windows, list(map(shown_name, bags))))
-    drifts = drifts_of(history_of([one for _, one in models]))
+    drifts = drifts_of(history_of([model for _, model in models]))
     tell_sections(out, result.judgements)
+    _tell_axes(out, judged)
+    _tell_levels(out, judged)
+    rates = {name: one.rate for name, one in result.judgements.items() if one.rate is not None}
+    if rows := _sections(rates, millidegrees):
+        out.table(
+            ('section', 'model', 'windows', 'RMS', 'max', 'claimed', 'ratio'),
+            rows,
+            title='angular rate at rest less the mean of each rest, of all axes in mdeg/s',
+        )
+    _tell_drifts(out, drifts)
+    out.points(result.notes)
+    out.line(str(judged))
+    if judged.rate is not None:
+        out.line(str(judged.rate))
+    out.end(
+        judged.exit_code,
+        bags=bags,
+        notes=result.notes,
+        **judged.facts(),
+        history=drifts,
+        calibrations={name: judgement.facts() for name, judgement in result.judgements.items()},
+    )
+
+
+def _tell_axes(out: Output, judged: 'Judgement') -> None:
+    """Print the thermal movement of each axis, and its shift where the positions show it."""
     columns = ['axis', 'static ug', 'dynamic ug']
     title = 'what temperature moves each axis at rest (RMS of its windows)'
     if judged.shifts:
@@ -80,6 +110,10 @@ def evaluate(
         row += [micro_g(one.bias), micro_g(one.bias_sd)]
         row += [micro(1e6 * one.scale), micro(1e6 * one.scale_sd)]
     out.table(columns, axes, title=title)
+
+
+def _tell_levels(out: Output, judged: 'Judgement') -> None:
+    """Print the residuals by |f|, where it was not gravity in all windows."""
     if judged.by_force:
         out.table(
             ('|f| g', 'windows', 'raw ug', 'RMS ug', 'mean ug', 'claimed ug'),
@@ -90,15 +124,12 @@ def evaluate(
                 )
                 for size, one in judged.by_force.items()
             ],
-            title='what is left over |f|: corrected less known magnitude',
+            title='residual by |f|: corrected magnitude less the known one',
         )
-    rates = {name: one.rate for name, one in result.judgements.items() if one.rate is not None}
-    if rows := _sections(rates, millidegrees):
-        out.table(
-            ('section', 'model', 'windows', 'RMS', 'max', 'claimed', 'ratio'),
-            rows,
-            title='angular rate at rest less the mean of each rest, of all axes in mdeg/s',
-        )
+
+
+def _tell_drifts(out: Output, drifts: Sequence['Drift']) -> None:
+    """Print the changes from each calibration to the next."""
     if drifts:
         out.table(
             ('from', 'to', 'constant', 'change', '+-', 'unit', 'sure'),
@@ -111,23 +142,11 @@ def evaluate(
             ],
             title='what drifted between the calibrations, in a soak at the reference temperature',
         )
-    out.points(result.notes)
-    out.line(str(judged))
-    if judged.rate is not None:
-        out.line(str(judged.rate))
-    out.end(
-        judged.exit_code,
-        bags=bags,
-        notes=result.notes,
-        **judged.facts(),
-        history=drifts,
-        calibrations={name: one.facts() for name, one in result.judgements.items()},
-    )
 
 
 def tell_sections(out: Output, judgements: Mapping[str, Any]) -> None:
     """Print the residuals of |f| of each calibration."""
-    (window_s,) = {one.windows.window_s for one in judgements.values()}
+    (window_s,) = {judgement.windows.window_s for judgement in judgements.values()}
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
         _sections(judgements, micro_g),

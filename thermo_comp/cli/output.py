@@ -51,7 +51,7 @@ class Output:
             if chosen:
                 alike.setdefault(chosen, []).append(bag)
             if missing:
-                # It sets the exit code, so it is printed even with --quiet.
+                # A missing part sets the exit code, so it is printed even with --quiet.
                 _print(f'thermo_comp: {bag}: {missing}', sys.stderr)
                 self._is_torn = True
         for said, names in alike.items():
@@ -92,7 +92,7 @@ class Output:
             def show(
                 columns: Sequence[str], rows: Sequence[Sequence[Cell]], lines: Sequence[str]
             ) -> None:
-                # The lines are most important, then the newest rows.
+                # A low terminal shows all lines, and as many of the newest rows as fit.
                 newest = rows[-max(1, console.height - len(lines) - 3) :]
                 shown = [*aligned(columns, newest), '', *lines]
                 view.update(Text('\n'.join(_shown(x, sys.stderr) for x in shown)), refresh=True)

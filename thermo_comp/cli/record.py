@@ -6,7 +6,7 @@ import re
 import shlex
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from math import isnan
 from pathlib import Path
@@ -22,8 +22,9 @@ from .output import Cell, Output, micro, picked
 from .shared_options import argument, option
 
 if TYPE_CHECKING:
+    from ..recording.growing import News, PositionBags
     from ..typing import Floats
-    from .acquisition import Account, Position
+    from .acquisition import Account, Acquisition, Position
 
 _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
 
@@ -59,30 +60,17 @@ def record(
       thermo_comp record held_out.mcap --positions 1 --soak 1h -o bags/unit44
     """
     from ..recording.growing import PositionBags, growing_blocks, numbered_bags
-    from ..recording.reader import open_recording
     from ..ros.process import SignalWatch
     from .acquisition import Acquisition
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)
     _tell_leftovers(out, output, finish)
     known = numbered_bags(output)
-    # Each existing bag is a position, and holds the serial of its unit.
-    with out.progress('reading the existing bags', total=len(known)) as done:
-        for number, path in enumerate(known, 1):
-            with open_recording(path, require=()) as reader:
-                own = reader.info.metadata.get('serial')
-                if serial is not None and own not in (serial, None):
-                    raise ThermoCompError(f'{path} is of unit {own}, not {serial}')
-                serial = serial or own
-                for block in reader.blocks():
-                    test.add(block)
-            test.begin()
-            done(number)
+    serial = _read_earlier(out, known, serial, test)
     bags = PositionBags(output, serial)
     over = threading.Event()
     problems: Callable[[], Sequence[str]] = tuple
     told: dict[str, str] = {}
-    chosen: str | None = None
     # A second signal ends the process at once.
     with SignalWatch() as signals, closing(bags), ExitStack() as stack:
         signals.on_signal(over.set)
@@ -97,48 +85,88 @@ def record(
             out.line('listening; Ctrl-C ends it with complete bags')
             sys.stdout.flush()  # the reader of a pipe waits for this line
         show = stack.enter_context(out.live())
-        for new in news:
-            if new is not None:
-                block, info = new
-                if info is not None and info.chosen != chosen:
-                    chosen = info.chosen
-                    out.told([(info.path, chosen, None)])
-                bags.add(block, info)
-                for begin_ns in test.add(block):
-                    bags.close(begin_ns)
-                bags.release(test.settled_ns)
-                continue
-            account = test.account()
+        for account in _accounts(out, news, test, bags):
             if show is None:
                 _tell(out, account, problems(), told)
             else:
                 lines = [*problems(), _now(account), *_lines(account)]
                 show(_COLUMNS, _rows(account.positions), lines)
-            if account.is_complete:
-                break
     if bag is None and live.n_lost:
         out.note(f'{live.n_lost} messages were lost on the way')
-    account, written = test.account(), [*known, *bags.written]
-    there = [one for one in account.positions if one.n_rests]
+    _end(out, test.account(), output, [*known, *bags.written], offset, over.is_set())
+
+
+def _read_earlier(
+    out: Output, known: Sequence[Path], serial: str | None, test: 'Acquisition'
+) -> str | None:
+    """Read the bags of earlier runs, each a position; return the serial of their unit."""
+    from ..recording.reader import open_recording
+
+    with out.progress('reading the existing bags', total=len(known)) as done:
+        for number, path in enumerate(known, 1):
+            with open_recording(path, require=()) as reader:
+                of_bag = reader.info.metadata.get('serial')
+                if serial is not None and of_bag not in (serial, None):
+                    raise ThermoCompError(f'{path} is of unit {of_bag}, not {serial}')
+                serial = serial or of_bag
+                for block in reader.blocks():
+                    test.add(block)
+            test.begin()
+            done(number)
+    return serial
+
+
+def _accounts(
+    out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
+) -> Iterator['Account']:
+    """Write blocks as they come; yield the state of the test in each pause, until it is whole."""
+    chosen: str | None = None
+    for new in news:
+        if new is not None:
+            block, info = new
+            if info is not None and info.chosen != chosen:
+                chosen = info.chosen
+                out.told([(info.path, chosen, None)])
+            bags.add(block, info)
+            for begin_ns in test.add(block):
+                bags.close(begin_ns)
+            bags.release(test.settled_ns)
+            continue
+        account = test.account()
+        yield account
+        if account.is_complete:
+            return
+
+
+def _end(
+    out: Output,
+    account: 'Account',
+    folder: Path,
+    written: Sequence[Path],
+    offset: float | None,
+    is_stopped: bool,
+) -> None:
+    """Print the result of the test, and the command that fits it."""
+    there = [position for position in account.positions if position.n_rests]
     out.table(_COLUMNS, _rows(there))
     for line in _lines(account):
         out.line(line)
-    command = f'thermo_comp fit {shlex.quote(str(output))}/*.mcap -o unit.yaml --gravity G'
+    command = f'thermo_comp fit {shlex.quote(str(folder))}/*.mcap -o unit.yaml --gravity G'
     if offset is not None:
         command += f' --offset {offset:g}'
-    out.line(f'{counted(len(written), "bag")} in {output}')
+    out.line(f'{counted(len(written), "bag")} in {folder}')
     if written:
         out.line('now fit them, with the local gravity in m/s^2:')
         out.line(f'  {command}')
-    bias, scale, skew = account.constants_sd.reshape(3, 3)
+    bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     out.end(
-        int(not account.is_complete and not over.is_set()),
+        int(not account.is_complete and not is_stopped),
         bags=written,
         command=command if written else None,
         positions=there,
         bias_sd_g=bias,
         scale_sd=scale,
-        misalignment_sd_rad=skew,
+        misalignment_sd_rad=misalignment,
         **picked(account, 'n_good is_complete worst_sd_g thermometers next_up findings'),
     )
 
@@ -161,24 +189,24 @@ def _tell_leftovers(out: Output, folder: Path, is_finishing: bool) -> None:
 
 def _duration(text: str) -> float:
     """Read a duration with its unit, like ``45min``, ``1.5h`` or ``30s`` [s]."""
-    found = re.fullmatch(r'\s*(\d+\.?\d*|\.\d+)\s*(h|min|s)\s*', text)
-    if found is None or not float(found[1]):
+    match = re.fullmatch(r'\s*(\d+\.?\d*|\.\d+)\s*(h|min|s)\s*', text)
+    if match is None or not float(match[1]):
         raise options.usage(f'--soak: expected a duration like 45min, 1.5h or 30s, got {text!r}')
-    return float(found[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[found[2]]
+    return float(match[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[match[2]]
 
 
-def _tell(out: Output, account: 'Account', problems: Sequence[str], told: dict[str, str]) -> None:
+def _tell(out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]) -> None:
     """Print each change since the last call on a line."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
-        told.pop('problem', None)
-    for number, one in enumerate(account.positions, 1):
-        if one.n_rests:
-            news[f'position {number}'] = f'{one.reason or "good"}; {_reading(one.up)}'
+        last.pop('problem', None)
+    for number, position in enumerate(account.positions, 1):
+        if position.n_rests:
+            news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
     # Ignore the reading after the semicolon, which always changes a little.
-    new = {name: said for name, said in news.items() if told.get(name) != said.partition(';')[0]}
+    new = {name: said for name, said in news.items() if last.get(name) != said.partition(';')[0]}
     for name, said in new.items():
-        told[name] = said.partition(';')[0]
+        last[name] = said.partition(';')[0]
         out.note(f'{name}: {said}')
     if any(said.startswith('good') for said in new.values()):
         out.note(_worth(account))
@@ -191,18 +219,18 @@ def _reading(up: 'Floats') -> str:
 
 def _rows(positions: Sequence['Position']) -> list[tuple[Cell, ...]]:
     rows: list[tuple[Cell, ...]] = []
-    for number, one in enumerate(positions, 1):
-        board = one.thermometers.get('board')
+    for number, position in enumerate(positions, 1):
+        board = position.thermometers.get('board')
         spans: tuple[Cell, ...] = ('', '')
         if board is not None:
             spans = (
                 f'{board.lowest:.1f} .. {board.highest:.1f}',
                 f'{board.steepest_cooling_k_min:.2f} .. {board.steepest_heating_k_min:.2f}',
             )
-        up = [f'{value:+.2f}' for value in one.up] if one.n_rests else [''] * 3
-        more = f', {one.n_rests} rests' if one.n_rests > 1 else ''
-        still = f'{one.still_s / 60.0:.1f}'
-        rows.append((number, *up, still, *spans, (one.reason or 'good') + more))
+        up = [f'{value:+.2f}' for value in position.up] if position.n_rests else [''] * 3
+        more = f', {position.n_rests} rests' if position.n_rests > 1 else ''
+        still = f'{position.still_s / 60.0:.1f}'
+        rows.append((number, *up, still, *spans, (position.reason or 'good') + more))
     return rows
 
 
@@ -220,12 +248,12 @@ def _next(account: 'Account') -> str:
 
 
 def _worth(account: 'Account') -> str:
-    bias, scale, skew = account.constants_sd.reshape(3, 3)
+    bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     parts = (
         f'{spoken(account.worst_sd_g * STANDARD_GRAVITY)} in the worst attitude',
         f'bias {" ".join(spoken(value * STANDARD_GRAVITY) for value in bias)}',
         f'scale {" ".join(micro(1e6 * value) for value in scale)} ppm',
-        f'misalignment {" ".join(micro(1e6 * value) for value in skew)} urad',
+        f'misalignment {" ".join(micro(1e6 * value) for value in misalignment)} urad',
     )
     return f'known to {", ".join(parts)}'
 

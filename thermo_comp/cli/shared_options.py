@@ -137,10 +137,10 @@ def names(
     """Collect the topics of `--topic`, and those of the file that it does not name."""
     from ..recording.topics import parse_name, read_names
 
-    found = {} if topics is None else read_names(topics)
+    named = {} if topics is None else read_names(topics)
     with usage_of('--topic: '):
-        found |= map(parse_name, topic or ())
-    return found
+        named |= map(parse_name, topic or ())
+    return named
 
 
 def _reading(
@@ -181,45 +181,36 @@ def place(
     gravity: float | None = option('Local gravity in m/s^2.', metavar='G'),
     latitude: float | None = option('Latitude in degrees, with --height.'),
     height: float | None = option('Height above the ellipsoid in m.'),
-) -> float | None:
-    """Return local gravity, None if not stated; latitude and height go together."""
+) -> tuple[float | None, float]:
+    """Return local gravity, None if not stated, and its usual standard deviation."""
     if gravity is not None or (latitude is None and height is None):
-        return gravity
+        return gravity, 0.0
     if latitude is None or height is None:
         raise usage('give --gravity, or --latitude and --height')
     from ..fitting import normal_gravity
 
     with usage_of():
-        return normal_gravity(latitude, height)
+        return normal_gravity(latitude, height), NORMAL_GRAVITY_SD
 
 
 @expanded
 def site(
-    gravity: float | None = option('Local gravity in m/s^2.', metavar='G'),
-    latitude: float | None = option('Latitude in degrees, with --height.'),
-    height: float | None = option('Height above the ellipsoid in m.'),
+    where: tuple[float | None, float] = place,
     gravity_sd: str | None = option(
         'Standard uncertainty of gravity, as 5ug; default: 0 for --gravity, 50ug for --latitude.'
     ),
 ) -> dict[str, float]:
     """Return local gravity and its standard deviation; a usage error if not stated."""
-    found = gravity
+    gravity, usual_sd = where
     if gravity is None:
-        if latitude is None or height is None:
-            raise usage('give --gravity, or --latitude and --height')
-        from ..fitting import normal_gravity
-
-        with usage_of():
-            found = normal_gravity(latitude, height)
+        raise usage('give --gravity, or --latitude and --height')
     sd = acceleration(gravity_sd, '--gravity-sd')
-    if sd is None:
-        sd = NORMAL_GRAVITY_SD if gravity is None else 0.0
-    return {'gravity': found or 0.0, 'gravity_sd': sd}
+    return {'gravity': gravity, 'gravity_sd': usual_sd if sd is None else sd}
 
 
 @expanded
 def judging(
-    gravity: float | None = place,
+    where: tuple[float | None, float] = place,
     window_s: float = option(
         'Length of a window at rest, in s.', 60.0, '--window', metavar='S', min=1e-3, max=86400.0
     ),
@@ -227,7 +218,12 @@ def judging(
     serial: str | None = SERIAL,
 ) -> dict[str, Any]:
     """Return the keywords of a judgement."""
-    return locals() | {'tolerance': acceleration(tolerance, '--tolerance')}
+    return {
+        'gravity': where[0],
+        'window_s': window_s,
+        'tolerance': acceleration(tolerance, '--tolerance'),
+        'serial': serial,
+    }
 
 
 @expanded
@@ -246,7 +242,7 @@ def force(
         'Its standard deviation, in m: the radius is then estimated.', min=0.0
     ),
 ) -> Any:
-    """Build what the user says of |f|."""
+    """Build the statement of the user about |f|."""
     from ..fitting.known_force import AskedForce
 
     with usage_of():

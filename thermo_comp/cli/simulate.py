@@ -65,7 +65,6 @@ def simulate(
     Example:
       thermo_comp simulate --rate-hz 2 --positions 12 -o bags/sim
     """
-    from .. import __version__
     from ..recording.writer import BagWriter
     from ..simulation import campaign, presets, run
     from ..simulation.spin import Bend
@@ -99,17 +98,9 @@ def simulate(
                 'positions': n,
                 'position_seed': position_seed,
                 **settings,
-                'up': station.up.tolist(),
-                **picked(specimen, 'scale_factor bias_at_reference'),
-                'misalignment': specimen.M.tolist(),
                 **({'k2_ug_g2': k2, 'k3_ug_g3': k3} if k2 or k3 else {}),
             }
-            metadata = {
-                'serial': specimen.serial,
-                'simulated_by': f'thermo_comp {__version__}',
-                'truth': json.dumps(truth),
-                **_said_force(station, gravity, is_known=plan == 'centrifuge'),
-            }
+            metadata = _metadata(specimen, station, truth, gravity, plan == 'centrifuge')
             with options.usage_of():
                 runs = run.simulate_blocks(
                     specimen,
@@ -133,6 +124,22 @@ def simulate(
     out.end(serial=specimen.serial, duration_s=seconds, bags=written)
 
 
+def _metadata(
+    unit: 'UnitModel', station: 'Position', truth: dict[str, Any], gravity: float, is_known: bool
+) -> dict[str, str]:
+    """Return the metadata of a bag: serial, truth, and how a fit learns |f| in a rotation."""
+    from .. import __version__
+
+    of_unit = picked(unit, 'scale_factor bias_at_reference')
+    truth |= {'up': station.up.tolist(), **of_unit, 'misalignment': unit.M.tolist()}
+    return {
+        'serial': unit.serial,
+        'simulated_by': f'thermo_comp {__version__}',
+        'truth': json.dumps(truth),
+        **_said_force(station, gravity, is_known=is_known),
+    }
+
+
 #: Topic of the rotation rate, its interval [s], and sd of the stated radius [m].
 _RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
 
@@ -151,7 +158,7 @@ def _said_force(station: 'Position', gravity: float, *, is_known: bool) -> dict[
             known_force.RADIUS_SD: f'{_RADIUS_SD_M:g}',
         }
     end_s = station.program.duration_s
-    rows = [one for one in spin.sections(gravity) if one[0] < end_s]
+    rows = [section for section in spin.sections(gravity) if section[0] < end_s]
     lines = [f'{begin:g} {min(end, end_s):g} {size:.9g}' for begin, end, size in rows]
     return {known_force.MAGNITUDE: '; '.join(lines)}
 

@@ -20,8 +20,6 @@ https://docs.px4.io/main/en/dev_log/ulog_file_format
 https://ardupilot.org/copter/docs/logmessages.html
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
@@ -43,7 +41,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while the autopilot corrects drift: values from stamps on; advice."""
+    """A parameter that is 1 while drift is corrected: its changes, and advice to the user."""
 
     parameter: str
     since_ns: Sequence[int]
@@ -96,7 +94,7 @@ def read_autopilot(
     heard = {number: _reported(readings) for number, readings in baros.items()}
     if baro is None:
         heard = {number: readings for number, readings in heard.items() if len(readings.celsius)}
-    found = [_reported(one) for one in rows.temperatures.values()]
+    found = [_reported(temperature) for temperature in rows.temperatures.values()]
     if heard or baro is not None:
         found.append(_instance(heard, baro, 'barometer', path))
     thinned = (one.thinned() for one in found if len(one.celsius))
@@ -109,9 +107,9 @@ def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
     name, since_ns, values, advice = correction
     at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
-    told = 'the autopilot has already corrected the thermal drift of these samples'
+    reason = 'the autopilot has already corrected the thermal drift of these samples'
     if is_corrected.all():
-        raise RecordingError(f'{name} was 1: {told}; {advice}', path=rows.path)
+        raise RecordingError(f'{name} was 1: {reason}; {advice}', path=rows.path)
     if not is_corrected.any():
         return rows
     share = 100.0 * float(is_corrected.mean())
@@ -121,7 +119,7 @@ def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
         stamp_ns=rows.stamp_ns[kept],
         accel=rows.accel[kept],
         gyro=None if rows.gyro is None else rows.gyro[kept],
-        chosen=f'{name} was 1 for {share:.0f} % of the samples, which are left out: {told}',
+        chosen=f'{name} was 1 for {share:.0f} % of the samples, which are left out: {reason}',
     )
 
 
@@ -150,7 +148,7 @@ def _ulog(path: Path) -> _Held:
         changes = [one for one in log.changed_parameters if one[1] == name]
         correction = _Correction(
             name,
-            [0, *(int(one[0]) * 1000 for one in changes)],
+            [0, *(int(change[0]) * 1000 for change in changes)],
             [float(log.initial_parameters.get(name, 0)), *(float(one[2]) for one in changes)],
             f'it holds sensor_combined alone: {_PROFILE}',
         )
@@ -230,7 +228,7 @@ def _dataflash(path: Path) -> _Held:
     metadata = {}
     changes: dict[str, list[tuple[int, float]]] = {}
     if any(str(key).startswith('SIM_') for key in reader.params):
-        metadata['ardupilot_simulated'] = 'it has SIM_ parameters: a simulator wrote this log'
+        metadata['ardupilot_simulated'] = 'the log has SIM_ parameters: a simulator wrote it'
     try:
         for name in sorted(reader.name_to_id):
             if not re.fullmatch(r'IMU\d?|BARO|BAR\d|PARM', name):

@@ -8,8 +8,6 @@ type; a thermometer by its namespace: that of the Imu makes it the board's, that
 (sensor_msgs/FluidPressure) the case's. At rest the samples must read gravity in the stated unit.
 """
 
-from __future__ import annotations
-
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -37,14 +35,14 @@ def bag_log(
     """Read a bag; topics that are None are searched; `unit` is that of the Imu topic."""
     present = inspect_recording(path).topics
     with translated(path):
-        found = find_topics(present, imu, board, case)
+        inputs = find_topics(present, imu, board, case)
     chosen = []
-    for (role, name), given in zip(found.items(), (imu, board, case), strict=True):
+    for (role, name), given in zip(inputs.items(), (imu, board, case), strict=True):
         among = 'only' if role == 'imu' else 'nearest'
         usual = given or getattr(Topics(), role)
         chosen.append(said_choice(name, role, usual, among) if name else '')
     # '/none', which no topic has, stands for a missing thermometer.
-    names = {role: name or '/none' for role, name in found.items()}
+    names = {role: name or '/none' for role, name in inputs.items()}
     recording = read_recording(path, Topics.named(names, input='imu'), require=('accel',))
     columns = recording.columns
     return ForeignLog(
@@ -53,16 +51,16 @@ def bag_log(
         columns.accel,
         None if columns.imu is None else columns.imu.angular_velocity,
         {
-            name: one.take(np.isfinite(one.celsius))
-            for name, one in columns.temperatures.items()
-            if name in found
+            name: readings.take(np.isfinite(readings.celsius))
+            for name, readings in columns.temperatures.items()
+            if name in inputs
         },
         unit=unit,
         frame_id=columns.frame_id,
         serial=recording.info.metadata.get('serial', ''),
         missing=recording.info.truncated,
         chosen='; '.join(filter(None, chosen)) or None,
-        metadata={f'topic_{role}': name for role, name in found.items() if name},
+        metadata={f'topic_{role}': name for role, name in inputs.items() if name},
     )
 
 
@@ -89,7 +87,7 @@ def find_topics(
 
 
 def _of_type(present: Present, kind: str) -> list[str]:
-    return sorted(name for name, (found, count) in present.items() if found == kind and count)
+    return sorted(name for name, (type_, count) in present.items() if type_ == kind and count)
 
 
 def _shared(name: str, others: list[str]) -> int:

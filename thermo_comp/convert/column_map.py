@@ -9,10 +9,8 @@ wz]`` as for imu_tk, is guessed: times rise; readings at rest are gravity, which
 degrees per second taken for radians would be faster than any turn by hand.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,12 +18,12 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..plain_yaml import read_plain_yaml
-from ..quantities import Bounds
+from ..quantities import Bounds, Positive
 from ..recording.blocks import Readings
 from ..recording.topics import is_thermometer
 from ..typing import Floats
-from ..unit.schema import Positive, SchemaError, build
-from .headings import read_headings
+from ..unit.schema import SchemaError, build
+from .headings import Headings, read_headings
 from .log import NO_STAMP, ForeignLog, Unit, believed_unit, find_stillness
 from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, read_parquet, read_text
 
@@ -35,8 +33,8 @@ Triple = tuple[Column, Column, Column]
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible sample intervals [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
-#: Longest interval [s] of a table in which the unit turns by at least this angle [rad] between
-#: blocks of this number of still samples (scatter [g]): in ms such a turn would be impossible.
+#: Times of a table in which the unit turns by `_TURN` rad between blocks of `_BLOCK` still samples
+#: (scatter below `_QUIET` g) cannot be in ms: then intervals up to `_SLOW_S` s are plausible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
 _A_MAP = 'a column map: --columns MAP'
@@ -186,66 +184,27 @@ def _read(
 
 
 def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
-    """Tell the columns of a table; `rate_hz` is for one without times."""
+    """Guess the columns of a table, by headings if any; `rate_hz` is for one without times."""
     table = _read(path, None, Stamp(rate_hz=1.0))
-    width = len(table.values)
-    if table.headings:
-        return _by_headings(path, table, rate_hz)
-    if width not in (3, 4, 6, 7):
-        raise RecordingError(
-            f'{width} columns without headings cannot be identified: {_GIVE_MAP}', path=path
-        )
-    first = int(width in (4, 7))
-    x, y, z = first, first + 1, first + 2
-    accel = np.column_stack([table.values[column] for column in (x, y, z)])
-    stamp = _stamp(path, table.values[0] if first else None, rate_hz, accel)
-    # Any time axis will do: finding rests depends on the order of the samples.
-    still = find_stillness(np.arange(len(accel)) * 10**9, accel)
-    believed, reason = believed_unit(still.magnitude)
-    if believed == 'unknown':
-        raise RecordingError(f'{reason}: {_GIVE_MAP}', path=path)
-    gyro = None
-    if width > 4 and believed != 'counts':
-        rates = np.abs([table.values[column + 3] for column in (x, y, z)])
-        is_fast = np.nanquantile(rates, 0.999) > _FASTEST_RAD_S
-        gyro = Gyro((x + 3, y + 3, z + 3), 'deg/s' if is_fast else 'rad/s')
-    accel_map = Accel((x, y, z), believed, 'counts' if believed == 'counts' else 'imu')
-    return ColumnMap(stamp, accel_map, gyro=gyro, format=Format(header=False))
-
-
-def _by_headings(path: Path, table: Table, rate_hz: float | None) -> ColumnMap:
-    """Guess the columns by their headings, and missing units by the numbers."""
-    named = read_headings(table.headings)
-    if named is None or not (named.time or rate_hz):
+    named = read_headings(table.headings) if table.headings else _unnamed(path, len(table.values))
+    if named is None or (named.time is None and rate_hz is None):
+        lacks, instead = ('accelerometer', '') if named is None else ('time', '--rate-hz, or ')
         listed = ', '.join(map(repr, table.headings[:20]))
-        lacks = 'accelerometer' if named is None else 'time'
-        instead = '' if named is None else '--rate-hz, or '
-        raise RecordingError(
-            f'its headings name no {lacks}: {listed}; give {instead}{_A_MAP}', path=path
-        )
-    if named.time and rate_hz is not None:
-        raise RecordingError(f'--rate-hz: its column {named.time!r} has the times', path=path)
+        said = f'its headings name no {lacks}: {listed}' if listed else 'it has no times'
+        raise RecordingError(f'{said}; give {instead}{_A_MAP}', path=path)
     place = {name: number for number, name in reversed(list(enumerate(table.headings)))}
 
-    def values(columns: Sequence[str]) -> Floats:
-        return np.column_stack([table.values[place[one]] for one in columns])
+    def values(columns: Sequence[Column]) -> Floats:
+        return np.column_stack([table.values[place.get(str(one), one)] for one in columns])
 
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
+        # Any time axis will do: finding rests depends on the order of the samples.
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
         unit, reason = believed_unit(still.magnitude)
         if unit == 'unknown':
             raise RecordingError(f'{reason}: {_GIVE_MAP}', path=path)
-    times = table.values[place[named.time]] if named.time else None
-    if times is None:
-        stamp = Stamp(rate_hz=rate_hz)
-    elif not np.isfinite(times).any():
-        stamp = Stamp(named.time, 'iso')
-    elif named.time_unit:
-        stamp = build(Stamp, {'column': named.time, 'unit': named.time_unit})
-    else:
-        stamp = replace(_stamp(path, times, None, accel), column=named.time)
     gyro = None
     if named.gyro is not None and unit != 'counts':
         is_fast = np.nanquantile(np.abs(values(named.gyro)), 0.999) > _FASTEST_RAD_S
@@ -256,14 +215,27 @@ def _by_headings(path: Path, table: Table, rate_hz: float | None) -> ColumnMap:
         name: build(Thermometer, {'column': column, 'unit': degrees})
         for name, (column, degrees) in named.thermometers.items()
     }
+    times = None if named.time is None else values([named.time])[:, 0]
     return ColumnMap(
-        stamp,
+        _stamp(path, named, times, rate_hz, accel),
         build(Accel, {'columns': list(named.accel), 'unit': unit, 'output': output}),
         thermometers.pop('board', None),
         thermometers.pop('case', None),
         tuple(Further(one.column, one.unit, name=name) for name, one in thermometers.items()),
         gyro,
+        None if table.headings else Format(header=False),
     )
+
+
+def _unnamed(path: Path, width: int) -> Headings:
+    """Return the columns ``[t] ax ay az [wx wy wz]``, by their numbers."""
+    if width not in (3, 4, 6, 7):
+        raise RecordingError(
+            f'{width} columns without headings cannot be identified: {_GIVE_MAP}', path=path
+        )
+    x = int(width in (4, 7))
+    gyro = (x + 3, x + 4, x + 5) if width > 4 else None
+    return Headings(0 if x else None, '', (x, x + 1, x + 2), '', gyro, '', {})
 
 
 def spoken_columns(columns: ColumnMap) -> str:
@@ -276,14 +248,18 @@ def spoken_columns(columns: ColumnMap) -> str:
     return ', '.join(said)
 
 
-def _stamp(path: Path, times: Floats | None, rate_hz: float | None, accel: Floats) -> Stamp:
-    """Guess the unit of times by the sample interval."""
+def _stamp(
+    path: Path, named: Headings, times: Floats | None, rate_hz: float | None, accel: Floats
+) -> Stamp:
+    """Guess the unit of the times by their heading, or else by the sample interval."""
     if times is None:
-        if rate_hz is None:
-            raise RecordingError('it has no times: give --rate-hz', path=path)
         return Stamp(rate_hz=rate_hz)
     if rate_hz is not None:
-        raise RecordingError('--rate-hz: its first column has the times', path=path)
+        raise RecordingError(f'--rate-hz: its column {named.time!r} has the times', path=path)
+    if not np.isfinite(times).any():
+        return Stamp(named.time, 'iso')
+    if named.time_unit:
+        return build(Stamp, {'column': named.time, 'unit': named.time_unit})
     steps = np.diff(times[np.isfinite(times)])
     step = float(np.median(steps)) if len(steps) else 0.0
     is_time = len(steps) > 0 and (steps > 0.0).mean() > 0.9
@@ -291,8 +267,8 @@ def _stamp(path: Path, times: Floats | None, rate_hz: float | None, accel: Float
     longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
     for unit, exponent in STAMP_EXPONENTS.items():
         if is_time and _STEPS_S[0] < step * 10.0 ** (exponent - 9) < longest:
-            return Stamp(0, unit)
-    raise RecordingError(f'its first column is not a rising time: {_GIVE_MAP}', path=path)
+            return Stamp(named.time, unit)
+    raise RecordingError(f'its column {named.time!r} is not a rising time: {_GIVE_MAP}', path=path)
 
 
 def _turns_at_once(accel: Floats) -> bool:

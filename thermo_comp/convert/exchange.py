@@ -3,14 +3,13 @@
 """
 Owns the exchange with other tools: calibrations to the content of their files, and back.
 
-All use ``a = A (N - b)`` of a reading N. In autopilots b depends on temperature and A is 1; in
-tools for tumble tests both are constant. The notes of an export name the parts of a calibration
-that are lost, with the resulting error.
+All of these tools correct a reading N by ``a = A (N - b)``. In autopilots b depends on temperature
+and A is 1; in tools for tumble tests both are constant. The notes of an export name the parts of a
+calibration that are lost, with the resulting error.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -64,81 +63,115 @@ def _content(
     calibration: Calibration, tool: Tool, up: tuple[float, float, float] | None
 ) -> Content:
     """Convert a calibration to the content of a tool's file, with notes on lost parts."""
-    sets = calibration.static.axes()
-    K = np.array([axis.scale_factor for axis in calibration.axes])
-    levels = zip(calibration.axes, sets, strict=True)
-    level = np.array([axis.bias + one.delta for axis, one in levels])
-    range_c = calibration.static.temperature_range_c
-    temperature = np.linspace(*range_c, _GRID)
+    curves = _static_curves(calibration)
     own_reference_c = calibration.reference_temperature_c
-    t = temperature - own_reference_c
-    # Counts are divided by K before the tool's correction, readings in m/s^2 are not.
-    gain = K if calibration.unit.input == 'm/s^2' else np.ones(3)
-    bias = np.array([one.bias_function.value(t) for one in sets]) / K[:, None]
-    scale = np.array([one.scale_function.value(t) for one in sets]) - 1.0
-    scale_drift = float(np.max(np.abs(scale)))
     reference_c = own_reference_c if tool.reference_c is None else tool.reference_c
-    matrix, cubics = np.array(calibration.misalignment), np.zeros((3, 4))
-    notes: list[str] = []
-    if calibration.provenance.model == unit.POPULATION:
-        notes.append('it is the mean of a type of unit, without the deviations of this unit')
-    rate_notes, rate_bias = [], None
     if tool.is_thermal:
-        d = temperature - reference_c
-        loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
-        offset = (level / K)[:, None] + bias + loads[:, None] * scale
-        offset = gain[:, None] * offset + ((gain - 1.0) * loads)[:, None]
-        cubics, misfit = _cubics(d, offset)
-        if misfit > 0.01 * MICRO_G:
-            notes.append(f'bias functions replaced by cubics, off by {misfit / MICRO_G:.2g} ug')
-        if scale_drift > 1e-8:
-            rest = 'folded into the offset at one attitude' if up else 'lost'
-            notes.append(f'scale over temperature is {rest}: up to {1e6 * scale_drift:.2g} ppm')
-        constant = float(np.max(np.abs(gain - 1.0)))
-        if constant > 1e-8:
-            rest = (
-                'folded into the offset at one attitude'
-                if up
-                else 'lost, calibrate the six faces in the autopilot afterwards'
-            )
-            notes.append(f'the constant scale is {rest}: up to {1e6 * constant:.4g} ppm')
-        worst = float(np.max(np.abs(matrix - np.eye(3))))
-        if worst:
-            notes.append(f'misalignment is lost: up to {1e6 * worst:.3g} urad')
-        matrix = np.eye(3)
-        if calibration.gyroscope is not None:
-            triad = rate_triad(calibration)
-            rate, _ = bias_and_scale(triad, ramp_states(triad, temperature))
-            rate_bias, misfit = _cubics(d, rate.T)
-            if misfit > 1e-3 * MILLIDEGREE:
-                off = f'{misfit / MILLIDEGREE:.2g} mdeg/s'
-                rate_notes.append(f'replaced by cubics, off by {off}')
-            rate_notes += _losses(triad)
+        content = _thermal(calibration, curves, reference_c, up)
+        of_counts = 'offsets are counts divided by K: the driver must scale by these K'
     else:
-        matrix /= K
-        cubics[:, 0] = level
-        drift = (
-            f'over the calibrated range the bias moves by up to '
-            f'{spoken(float(np.max(np.abs(bias))))}, the scale by {1e6 * scale_drift:.2g} ppm'
-        )
-        if not calibration.needs_temperature:
-            drift = 'it has no correction for temperature'
-        notes.append(f'it holds at {reference_c:g} degC: {drift}')
-        rate_notes = ['is lost'] * (calibration.gyroscope is not None)
-    notes += _losses(calibration)
-    notes += [f'angular rate: {note}' for note in rate_notes]
-    if calibration.unit.input == 'counts':
-        notes.append(
-            'offsets are counts divided by K: the driver must scale by these K'
-            if tool.is_thermal
-            else 'it is for counts, like the calibration'
-        )
+        content = _constant(calibration, curves)
+        of_counts = 'the file is for counts, like the calibration'
+    of_type = 'the calibration is the mean of a type of unit, without the deviations of this unit'
+    notes = [
+        *[of_type] * (calibration.provenance.model == unit.POPULATION),
+        *content.notes,
+        *_losses(calibration),
+        *[of_counts] * (calibration.unit.input == 'counts'),
+    ]
     noise = (
         max(calibration.noise_density_m_s2_sqrt_hz),
         max(calibration.slow_noise_m_s2_sqrt_h),
         1.0 / calibration.unit.cycle_time_s,
     )
-    return Content(matrix, cubics, reference_c, range_c, notes, noise=noise, rate_bias=rate_bias)
+    return replace(content, notes=notes, noise=noise)
+
+
+class _Curves(NamedTuple):
+    """The static set over the calibrated temperatures: per axis a level, and n changes."""
+
+    temperature: Floats
+    K: Floats
+    level: Floats  # in input units
+    bias: Floats  # [m/s^2], shape (3, n)
+    scale: Floats  # relative, shape (3, n)
+
+    @property
+    def scale_drift(self) -> float:
+        """Largest relative change of a scale."""
+        return float(np.max(np.abs(self.scale)))
+
+
+def _static_curves(calibration: Calibration) -> _Curves:
+    sets = calibration.static.axes()
+    K = np.array([axis.scale_factor for axis in calibration.axes])
+    levels = zip(calibration.axes, sets, strict=True)
+    temperature = np.linspace(*calibration.static.temperature_range_c, _GRID)
+    t = temperature - calibration.reference_temperature_c
+    return _Curves(
+        temperature,
+        K,
+        level=np.array([axis.bias + regime.delta for axis, regime in levels]),
+        bias=np.array([one.bias_function.value(t) for one in sets]) / K[:, None],
+        scale=np.array([one.scale_function.value(t) for one in sets]) - 1.0,
+    )
+
+
+def _thermal(
+    calibration: Calibration,
+    curves: _Curves,
+    reference_c: float,
+    up: tuple[float, float, float] | None,
+) -> Content:
+    """Return each axis' offset over temperature as a cubic, for an autopilot."""
+    d, notes = curves.temperature - reference_c, []
+    # Counts are divided by K before the tool's correction, readings in m/s^2 are not.
+    gain = curves.K if calibration.unit.input == 'm/s^2' else np.ones(3)
+    loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
+    offset = (curves.level / curves.K)[:, None] + curves.bias + loads[:, None] * curves.scale
+    offset = gain[:, None] * offset + ((gain - 1.0) * loads)[:, None]
+    cubics, misfit = _cubics(d, offset)
+    if misfit > 0.01 * MICRO_G:
+        notes.append(f'bias functions replaced by cubics, off by {misfit / MICRO_G:.2g} ug')
+    folded = 'folded into the offset at one attitude'
+    if curves.scale_drift > 1e-8:
+        ppm = f'{1e6 * curves.scale_drift:.2g} ppm'
+        notes.append(f'scale over temperature is {folded if up else "lost"}: up to {ppm}')
+    constant = float(np.max(np.abs(gain - 1.0)))
+    if constant > 1e-8:
+        rest = folded if up else 'lost, calibrate the six faces in the autopilot afterwards'
+        notes.append(f'the constant scale is {rest}: up to {1e6 * constant:.4g} ppm')
+    worst = float(np.max(np.abs(np.array(calibration.misalignment) - np.eye(3))))
+    if worst:
+        notes.append(f'misalignment is lost: up to {1e6 * worst:.3g} urad')
+    rate_bias = None
+    if calibration.gyroscope is not None:
+        triad = rate_triad(calibration)
+        rate, _ = bias_and_scale(triad, ramp_states(triad, curves.temperature))
+        rate_bias, misfit = _cubics(d, rate.T)
+        off = f'replaced by cubics, off by {misfit / MILLIDEGREE:.2g} mdeg/s'
+        of_rate = [*[off] * (misfit > 1e-3 * MILLIDEGREE), *_losses(triad)]
+        notes += [f'angular rate: {note}' for note in of_rate]
+    range_c = calibration.static.temperature_range_c
+    return Content(np.eye(3), cubics, reference_c, range_c, notes, rate_bias=rate_bias)
+
+
+def _constant(calibration: Calibration, curves: _Curves) -> Content:
+    """Return bias, scale and misalignment at the reference, for tools of tumble tests."""
+    drift = 'the calibration has no correction for temperature'
+    if calibration.needs_temperature:
+        drift = (
+            f'over the calibrated range the bias moves by up to '
+            f'{spoken(float(np.max(np.abs(curves.bias))))}, the scale by '
+            f'{1e6 * curves.scale_drift:.2g} ppm'
+        )
+    reference_c = calibration.reference_temperature_c
+    notes = [f'the file holds at {reference_c:g} degC: {drift}']
+    notes += ['angular rate: is lost'] * (calibration.gyroscope is not None)
+    cubics = np.pad(curves.level[:, None], ((0, 0), (0, 3)))
+    matrix = np.array(calibration.misalignment) / curves.K
+    range_c = calibration.static.temperature_range_c
+    return Content(matrix, cubics, reference_c, range_c, notes)
 
 
 def _cubics(d: Floats, offset: Floats) -> tuple[Floats, float]:
@@ -164,6 +197,8 @@ def _losses(calibration: Calibration) -> list[str]:
     )
     if static != dynamic:
         notes.append('the dynamic set is lost: the static one is used in ramps, too')
+    if calibration.nonlinearity is not None and calibration.nonlinearity.terms:
+        notes.append('the nonlinear terms over specific force are lost')
     return notes
 
 
@@ -181,8 +216,8 @@ def import_calibration(
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same set.
     `number` chooses a set or IMU, None the only one. `full_scale` is in m/s^2.
     """
-    found = (tool.read(text, number) for tool in TOOLS.values())
-    content = next((one for one in found if one is not None), None)
+    readings = (tool.read(text, number) for tool in TOOLS.values())
+    content = next((one for one in readings if one is not None), None)
     if content is None:
         raise CalibrationError(
             'no TC_A* (PX4) or INS_TCAL* (ArduPilot) parameters in the text, nor the matrices of '

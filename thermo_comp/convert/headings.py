@@ -6,12 +6,12 @@ Owns the recognition of headings: time, triads, thermometers, and their units.
 A guess is printed as a column map, for the user to keep or to edit.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
+
+import yaml
 
 _UNIT = re.compile(r'[\[(]([^\])]*)[\])]')
 _TIME = re.compile(r'(^|_)(time|timestamp|stamp|now|date|datetime|epoch|elapsed|utc|t|ts)(_|$)')
@@ -25,14 +25,15 @@ _ACCELS = {'g': 'g', 'mg': 'mg', 'm/s^2': 'm/s^2', 'm/s2': 'm/s^2', 'm/s²': 'm/
 _RATES = {'deg/s': 'deg/s', '°/s': 'deg/s', 'dps': 'deg/s', 'rad/s': 'rad/s'}
 _DEGREES = {'k': 'K', 'kelvin': 'K', 'f': 'degF', '°f': 'degF', 'degf': 'degF'}
 
-Columns = tuple[str, str, str]
+Column = str | int
+Columns = tuple[Column, Column, Column]
 
 
 @dataclass(frozen=True)
 class Headings:
-    """The recognised columns with their stated units; '' if not stated."""
+    """The recognised columns, by heading or number, with their stated units; '' if not stated."""
 
-    time: str
+    time: Column | None
     time_unit: str
     accel: Columns
     accel_unit: str
@@ -50,7 +51,7 @@ def read_headings(headings: Sequence[str]) -> Headings | None:
     if accel is None:
         return None
     gyro = next((key for key in triads if _GYRO.search(key)), None)
-    time, found = times[-1] if times else '', triads[accel]
+    time = times[-1] if times else ''
     thermometers: dict[str, tuple[str, str]] = {}
     for heading in headings:
         if _TEMPERATURE.search(_plain(heading)):
@@ -59,32 +60,30 @@ def read_headings(headings: Sequence[str]) -> Headings | None:
             name = usual if usual not in thermometers else f't{len(thermometers)}'
             thermometers[name] = heading, _DEGREES.get(_unit(heading), 'degC')
     return Headings(
-        time,
+        time or None,
         _TIMES.get(_unit(time) or _plain(time).rpartition('_')[2], ''),
-        found,
-        _ACCELS.get(_unit(found[0]), ''),
+        triads[accel],
+        _ACCELS.get(_unit(triads[accel][0]), ''),
         triads[gyro] if gyro is not None else None,
         _RATES.get(_unit(triads[gyro][0]), '') if gyro is not None else '',
         thermometers,
     )
 
 
-def map_lines(columns: Any) -> Iterator[str]:
-    """Yield the lines of a column map's file."""
-    stamp, accel, gyro = columns.stamp, columns.accel, columns.gyro
-    is_timed = stamp.column is not None
-    times = f'column: {stamp.column!r}, unit: {stamp.unit}' if is_timed else None
-    yield f'stamp: {{{times or f"rate_hz: {stamp.rate_hz:g}"}}}'
-    yield f'accel: {{columns: {list(accel.columns)}, unit: {accel.unit}, output: {accel.output}}}'
-    if gyro is not None:
-        yield f'gyro: {{columns: {list(gyro.columns)}, unit: {gyro.unit}}}'
-    for name in ('board', 'case'):
-        if (one := getattr(columns, name)) is not None:
-            yield f'{name}: {{column: {one.column!r}, unit: {one.unit}}}'
-    if columns.further:
-        yield 'further:'
-    for one in columns.further:
-        yield f'  - {{name: {one.name}, column: {one.column!r}, unit: {one.unit}}}'
+def map_lines(columns: Any) -> list[str]:
+    """Return the lines of a column map's file."""
+    text: str = yaml.safe_dump(
+        _given(columns), sort_keys=False, default_flow_style=None, allow_unicode=True, width=10_000
+    )
+    return text.splitlines()
+
+
+def _given(value: Any) -> Any:
+    """Turn dataclasses into the keys that differ from their defaults, and the units."""
+    if is_dataclass(value):
+        pairs = ((field, getattr(value, field.name)) for field in fields(value))
+        return {f.name: _given(x) for f, x in pairs if x != f.default or f.name == 'unit'}
+    return list(map(_given, value)) if isinstance(value, tuple) else value
 
 
 def _plain(heading: str) -> str:
@@ -93,11 +92,11 @@ def _plain(heading: str) -> str:
 
 
 def _unit(heading: str) -> str:
-    found = _UNIT.search(heading)
-    return found[1].strip().lower() if found else ''
+    match = _UNIT.search(heading)
+    return match[1].strip().lower() if match else ''
 
 
-def _triads(names: dict[str, str]) -> Iterator[tuple[str, Columns]]:
+def _triads(names: dict[str, str]) -> Iterator[tuple[str, tuple[str, str, str]]]:
     """Find three names that differ only in x, y, z; yield their common part and the columns."""
     for name in reversed(names):
         for at in (match.start() for match in re.finditer('x', name)):

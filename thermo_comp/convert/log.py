@@ -7,8 +7,6 @@ At rest the specific force is gravity in any attitude. A log whose map contradic
 because an unnoticed factor of 9.8 would end in a calibration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
@@ -128,11 +126,7 @@ def write_log(
     progress: Callable[[float], None] = lambda _: None,
 ) -> ConversionReport:
     """Check a log and write it as a bag: a bare file ``*.mcap`` or a rosbag2 directory."""
-    if log.serial:
-        try:
-            valid_serial(log.serial)
-        except ValueError as mistake:
-            raise RecordingError(str(mistake), path=log.path) from mistake
+    _check_serial(log)
     holds_numbers = (log.stamp_ns != NO_STAMP) & np.isfinite(log.accel).all(axis=1)
     if log.gyro is not None:
         holds_numbers &= np.isfinite(log.gyro).all(axis=1)
@@ -165,7 +159,7 @@ def write_log(
     steps = np.diff(newest)
     low, high = log.clip or (-np.inf, np.inf)
     beyond = (log.accel <= low) | (log.accel >= high)
-    counts = {name: len(one.stamp_ns) for name, one in log.temperatures.items()}
+    counts = {name: len(readings.stamp_ns) for name, readings in log.temperatures.items()}
     return ConversionReport(
         log,
         rows=len(usable) + log.n_short,
@@ -185,13 +179,21 @@ def write_log(
     )
 
 
+def _check_serial(log: ForeignLog) -> None:
+    if log.serial:
+        try:
+            valid_serial(log.serial)
+        except ValueError as mistake:
+            raise RecordingError(str(mistake), path=log.path) from mistake
+
+
 def _is_in_range(stamp_ns: Ints) -> Bools:
     return np.asarray((stamp_ns >= 0) & (stamp_ns < STAMP_END_NS))
 
 
 def _finding(rows: Bools, line: Ints) -> Finding:
-    found = np.flatnonzero(rows)
-    return Finding(len(found), tuple(line[found[:_EXAMPLES]].tolist()))
+    indices = np.flatnonzero(rows)
+    return Finding(len(indices), tuple(line[indices[:_EXAMPLES]].tolist()))
 
 
 def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
@@ -236,8 +238,8 @@ def _write(
             until = newest[rows.stop - 1] if rows.stop < n else np.iinfo(np.int64).max
             for topic, readings, log_ns in waiting:
                 run = slice(*np.searchsorted(log_ns, (since, until), side='right'))
-                own = readings.take(run)
-                writer.write_temperature(topic, *own[:2], log_ns[run], log.frame_id)
+                due = readings.take(run)
+                writer.write_temperature(topic, *due[:2], log_ns[run], log.frame_id)
             since = until
             stamp_ns, values = log.stamp_ns[rows], log.accel[rows] * factor
             if log.input == 'counts':

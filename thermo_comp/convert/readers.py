@@ -4,8 +4,6 @@
 Owns the choice of a log's reader by the file name: table, autopilot's log or bag.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -68,7 +66,7 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
 
 @contextmanager
 def as_bags(
-    paths: Sequence[Path], told: Callable[[ForeignLog], None] = lambda _: None, **given: Any
+    paths: Sequence[Path], tell: Callable[[ForeignLog], None] = lambda _: None, **given: Any
 ) -> Iterator[list[Path]]:
     """Convert tables and logs to temporary bags; `told` is called with each log."""
     others = [path for path in paths if path.is_file() and kind_of(path) != 'bag']
@@ -80,6 +78,6 @@ def as_bags(
         for number, path in enumerate(others):
             bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
             log = read_log(path, **given)
-            told(log)
+            tell(log)
             write_log(log, bags[path])
         yield [bags.get(path, path) for path in paths]

@@ -7,8 +7,6 @@ A cell that is not a number becomes NaN, and its row is counted. Stamps are read
 decimal digits, because a float does not resolve nanoseconds since 1970.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 import re
@@ -29,8 +27,8 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..files import open_regular
+from ..quantities import NotNegative, Positive
 from ..typing import Floats, Ints
-from ..unit.schema import NotNegative, Positive
 from .log import NO_STAMP, library
 
 Column = str | int
@@ -125,12 +123,12 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = (lines[:-1] if len(lines) > 2 else lines)[-50:]
-    found: list[tuple[int, str, int]] = []
+    candidates: list[tuple[int, str, int]] = []
     for one in (',', ';', '\t', '|', ' ') if delimiter is None else (delimiter,):
         widths = [_n_cells(row) for _, row in _rows(lines, one)]
         width = max(set(widths), key=widths.count, default=0)
-        found.append((widths.count(width) if width > 1 else 0, one, width))
-    return max(found, key=itemgetter(0))[1:]
+        candidates.append((widths.count(width) if width > 1 else 0, one, width))
+    return max(candidates, key=itemgetter(0))[1:]
 
 
 def _is_comment(cell: str) -> bool:
@@ -248,10 +246,10 @@ def exact_ns(cell: object, unit: TimeUnit | None) -> int:
 
 
 def _iso_ns(text: str) -> int:
-    found = _ISO.fullmatch(text)
-    if found is None:
+    match = _ISO.fullmatch(text)
+    if match is None:
         return NO_STAMP
-    *moment, fraction, _, sign, hours, minutes = found.groups()
+    *moment, fraction, _, sign, hours, minutes = match.groups()
     year, month, day, hour, minute, second = (int(part or 0) for part in moment)
     try:
         seconds = timegm(datetime(year, month, day, hour, minute, second).timetuple())
@@ -266,22 +264,23 @@ def read_parquet(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, _style: Format | None = None
 ) -> Table:
     """
-    Read columns of a Parquet file as of text; its own timestamps state their unit. Of all columns,
-    None, those that hold no numbers are NaN.
+    Read columns of a Parquet file as of text; its own timestamps state their unit.
+
+    If `columns` is None all columns are read; those without numbers become NaN.
     """
     pq = library('pyarrow.parquet', 'parquet', 'a Parquet file', path)
     import pyarrow as pa
 
     try:
         with open_regular(path) as file:
-            found = pq.ParquetFile(file)
-            if found.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
-                raise RecordingError(f'it declares {found.metadata.num_rows} rows', path=path)
-            headings = list(found.schema_arrow.names)
+            parquet = pq.ParquetFile(file)
+            if parquet.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
+                raise RecordingError(f'it declares {parquet.metadata.num_rows} rows', path=path)
+            headings = list(parquet.schema_arrow.names)
             wanted = range(len(headings)) if columns is None else columns
             names = [*wanted] if stamp.column is None else [*wanted, stamp.column]
             places = {name: _place(path, name, headings, len(headings)) for name in names}
-            table = found.read(columns=[headings[i] for i in sorted(set(places.values()))])
+            table = parquet.read(columns=[headings[i] for i in sorted(set(places.values()))])
     except RecordingError:
         raise
     except Exception as failure:  # a damaged file may raise any exception

@@ -20,8 +20,6 @@ triad at one temperature; with the reading N and the specific force a::
 An upper triangle, or a full matrix, belongs to a frame that is rotated relative to ours.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -113,10 +111,10 @@ def _within(number: int | None, lowest: int) -> int:
 def _read_px4(text: str, number: int | None) -> Content | None:
     """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None if there are none."""
     values = _Parameters(text)
-    found = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
-    if not found:
+    numbers = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
+    if not numbers:
         return None
-    number = _choose(found, number, lambda n: values.has(f'TC_A{n}_X'))
+    number = _choose(numbers, number, lambda n: values.has(f'TC_A{n}_X'))
     if values.get('TC_A_ENABLE', 1.0) != 1.0:
         raise CalibrationError('is 0: the set is not in use', key='TC_A_ENABLE')
 
@@ -142,10 +140,10 @@ def _read_px4(text: str, number: int | None) -> Content | None:
 def _read_ardupilot(text: str, number: int | None) -> Content | None:
     """Read ArduPilot parameters (Mission Planner, MAVProxy); None if there are none."""
     values = _Parameters(text)
-    found = {int(name[8]) for name in values if name.startswith('INS_TCAL')}
-    if not found:
+    numbers = {int(name[8]) for name in values if name.startswith('INS_TCAL')}
+    if not numbers:
         return None
-    number = _choose(found, number, lambda n: values.get(f'INS_TCAL{n}_ENABLE') == 1.0)
+    number = _choose(numbers, number, lambda n: values.get(f'INS_TCAL{n}_ENABLE') == 1.0)
     prefix = f'INS_TCAL{number}_'
     if values[f'{prefix}ENABLE'] != 1.0:
         raise CalibrationError('is not 1: the set is not in use', key=f'{prefix}ENABLE')

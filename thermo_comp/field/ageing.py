@@ -192,7 +192,7 @@ class Model:
         steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
         step = max(float(np.median(steps)), centre.rest)
         bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD
-        found = min(
+        best = min(
             (
                 minimize(
                     loss,
@@ -206,7 +206,7 @@ class Model:
             ),
             key=lambda one: one.fun,
         )
-        ageing = Ageing(*np.exp(found.x).tolist())
+        ageing = Ageing(*np.exp(best.x).tolist())
         factor = cho_factor(self.covariance(ageing), lower=True)
         return ageing, cho_solve(factor, np.eye(len(self.rows.y)))
 

@@ -9,8 +9,6 @@ that of the noise and its mean agrees with that of the second before (the thresh
 of the first ten minutes are kept, one per minute up to an hour, then one in five minutes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 

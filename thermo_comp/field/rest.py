@@ -9,8 +9,6 @@ Lines with a wrong checksum are skipped: a killed process, a power failure or a 
 only the line that is being written.
 """
 
-from __future__ import annotations
-
 import json
 import zlib
 from collections.abc import Callable, Iterable
@@ -74,7 +72,7 @@ def encode(one: Start | Rest) -> bytes:
 
 def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
     """Read the rests of a file, each with its start; count the damaged lines."""
-    found: list[tuple[Start, Rest]] = []
+    rests: list[tuple[Start, Rest]] = []
     start: Start | None = None
     n_damaged = 0
     for line in content.splitlines():
@@ -87,11 +85,11 @@ def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
             if isinstance(data, dict):
                 start = _start(data)
             elif start is not None:
-                found.append((start, _rest(data, start.memory)))
+                rests.append((start, _rest(data, start.memory)))
         except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
             # A valid checksum does not imply valid content.
             n_damaged += 1
-    return found, n_damaged
+    return rests, n_damaged
 
 
 def _start(data: dict[str, Any]) -> Start:

@@ -105,10 +105,10 @@ def read_rests(
     """
     files: list[Path] = []
     for path in paths:
-        found = sorted(path.glob(f'*{SUFFIX}')) if path.is_dir() else [path]
-        if not found or not path.exists():
+        matching = sorted(path.glob(f'*{SUFFIX}')) if path.is_dir() else [path]
+        if not matching or not path.exists():
             raise RecordingError(f'no rest log: expected a folder of *{SUFFIX} files', path)
-        files += found
+        files += matching
     others: set[str] = set()
     unit = calibration.unit
 
@@ -172,7 +172,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
         ahead = float(aged.removesuffix(' d') or 0.0)
     except ValueError:
         return -np.inf, -np.inf, False
-    # An ageing of a century or more is an invalid file.
+    # A file that says it was aged by a century or more is invalid.
     if np.isnat(moment) or not 0.0 <= ahead < 36525.0:
         return -np.inf, -np.inf, False
     begin = int(moment.astype(np.int64)) / _DAY_NS
@@ -223,14 +223,10 @@ def series_of(
     noise = (v**2 * white).sum(axis=1) / sizes
     bare = SlowUncertainty(replace(calibration, posterior=None), correction)
     whole = SlowUncertainty(calibration, correction)
-    unexplained = correction.curves.unexplained(states[:, BOARD])[0].T
-    unexplained = np.broadcast_to(unexplained, x.shape)
-    residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
-    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
-    slow, claim = (
-        _along(correction, states, shares, one, v, x) - of_one_sample for one in (bare, whole)
-    )
+    slow, claim = (_along(correction, states, shares, one, v, x) for one in (bare, whole))
+    unexplained = np.broadcast_to(correction.curves.unexplained(states[:, BOARD])[0].T, x.shape)
     slow -= (v**2 * unexplained).sum(axis=1)
+    residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
     return Series(
         time=averaged(stamps / _DAY_NS),
         start=np.unique(beginnings[first], return_inverse=True)[1],
@@ -299,7 +295,7 @@ def _along(
     v: Floats,
     x: Floats,
 ) -> Floats:
-    """Project the error variance of one sample on the direction of the force."""
+    """Project the error variance, less a sample's noise, on the direction of the force."""
     parts = np.array(
         [slow.at(s, p) for s, p in zip(states.tolist(), shares.tolist(), strict=True)]
     )
@@ -310,7 +306,9 @@ def _along(
     if correction.of_force is not None:
         for row in np.moveaxis(line[21:].reshape(3, 7, -1)[:, 3:], 1, 0)[::-1]:
             higher = x.T * (row + higher)
-    return np.asarray((v.T**2 * (a + x.T * (b + x.T * (c + higher)))).sum(axis=0))
+    variance = a + x.T * (b + x.T * (c + higher))
+    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
+    return np.asarray((v.T**2 * variance).sum(axis=0) - of_one_sample)
 
 
 def _by_parameter(

@@ -8,8 +8,6 @@ An axis is updated only if the rests reduce the sd of some reading of it to 0.6 
 the other axes keep their values, with an increased covariance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,7 +22,7 @@ from ..typing import Bools, Floats
 from ..unit.calibration import AXES, Calibration, RegimeSet, parameter_layout
 from ..unit.correction import Correction
 from ..unit.gravity import spoken
-from ..unit.provenance import ResidualSummary, Source
+from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import Series, valid_since
 
@@ -137,33 +135,34 @@ def update(
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
     axis_determined = [change.is_determined for change in moved]
     new = _shifted(calibration, shift, covariance)
-    residuals = ResidualSummary(
-        f'left-out {judged.over}',
-        judged.n,
-        judged.before,
-        judged.after,
-        float(np.abs(series.miss).max()),
-    )
-    provenance = calibration.provenance
-    day = np.datetime64(int(series.time[-1]), 'D')
-    note = (
-        f'updated by {int(series.n_windows.sum())} windows at rest up to {day}; before: '
-        f'{provenance.created or "no date"}. {judged}'
-    )
+    before = calibration.provenance
     new = replace(
         new,
         static=_with_residual(new.static, turn_on, axis_determined),
         dynamic=_with_residual(new.dynamic, turn_on, axis_determined),
         provenance=replace(
-            provenance,
-            created=created or provenance.created,
-            sources=(*provenance.sources, *([source] if source else [])),
-            residuals=(*provenance.residuals, residuals),
-            notes=(*provenance.notes, note),
+            _with_update(before, series, judged),
+            created=created or before.created,
+            sources=(*before.sources, *([source] if source else [])),
         ),
     )
     n_outliers = len(series) - len(used)
     return Update(new, moved, ageing, model.changes, judged, used, n_outliers, model, solution)
+
+
+def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Provenance:
+    """Add the residuals of left-out rests, and a note, to the origin of a calibration."""
+    largest, day = float(np.abs(series.miss).max()), np.datetime64(int(series.time[-1]), 'D')
+    residuals = ResidualSummary(
+        f'left-out {judged.over}', judged.n, judged.before, judged.after, largest
+    )
+    note = (
+        f'updated by {int(series.n_windows.sum())} windows at rest up to {day}; before: '
+        f'{provenance.created or "no date"}. {judged}'
+    )
+    return replace(
+        provenance, residuals=(*provenance.residuals, residuals), notes=(*provenance.notes, note)
+    )
 
 
 def _levels(calibration: Calibration) -> Floats:
@@ -203,7 +202,7 @@ def _moved(
     states = np.array([series.state.mean(axis=0), series.state[coolest], series.state[warmest]]).T
     regressors = correction.curves.regressors(states, correction.table.values(states))
     determined = np.zeros(layout.n_parameters, dtype=np.bool_)
-    gravity, found = calibration.gravity_m_s2, []
+    gravity, shifts = calibration.gravity_m_s2, []
     weights = series.n_windows / series.n_windows.sum()
     for axis, name in enumerate(AXES):
         bias, scale = layout.bias[axis], layout.scale[axis]
@@ -222,9 +221,9 @@ def _moved(
         sd = np.sqrt(np.maximum(np.diag(posterior if is_determined else prior), 0.0))
         of_scale = change[1] / gravity, sd[1] / gravity
         values = (change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3])
-        found.append(Moved(name, is_determined, *map(float, values)))
-    determined[layout.misalignment :] = all(one.is_determined for one in found)
-    return determined, tuple(found)
+        shifts.append(Moved(name, is_determined, *map(float, values)))
+    determined[layout.misalignment :] = all(one.is_determined for one in shifts)
+    return determined, tuple(shifts)
 
 
 def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:

@@ -8,8 +8,6 @@ forecast assumes a random walk of the error from its present estimate, with the 
 from the log: it is the distribution of the first passage of either bound.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -107,15 +105,15 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
     classes = [f'{one:g} .. {one + _CLASS_K:g} degC' for one in lower]
     warmer = [f'{one:g} .. {one + _CLASS_K:g} degC' for one in np.unique(lower)]
     is_out = [not row.is_within for row in days]
-    # Two days in a row are required, because a single day may be a disturbed place.
+    # Two days in a row are required: on a single day the unit may have been disturbed.
     n_out = ([*is_out[::-1], False]).index(False)
     left = days[-n_out].name if n_out >= min(2, len(days)) and n_out else None
     last, ageing = days[-1].name, None
     forecast: tuple[float, ...] = ()
     interval: tuple[float, ...] = ()
     if series.start[-1] >= 2:
-        found = update(series, calibration)
-        ageing, used, solution = found.ageing, found.series, found.solution
+        updated = update(series, calibration)
+        ageing, used, solution = updated.ageing, updated.series, updated.solution
         recent = used.at(used.start == used.start[-1])
         of_parameters, of_levels = (
             one.mean(axis=0) for one in (recent.by_parameter, recent.by_level)

@@ -77,11 +77,7 @@ def fit_fleet(
     `tell` is called with the number of finished tests and of all tests: before the first fit with
     None, and after each fit with its row.
     """
-    for name in ('distributed', 'fsspec', 'pyarrow'):
-        if find_spec(name) is None:
-            raise ThermoCompError(
-                f"a fleet needs Dask: pip install 'thermo_comp[fleet]' ({name} is not installed)"
-            )
+    _require_packages()
     storage = Storage(url)
     units = find_units(storage)
     results = Results(Path(output))
@@ -125,6 +121,14 @@ def fit_fleet(
     return FleetResult(ordered, summary, len(done), parquet, csv, page, prior_path, no_prior)
 
 
+def _require_packages() -> None:
+    for name in ('distributed', 'fsspec', 'pyarrow'):
+        if find_spec(name) is None:
+            raise ThermoCompError(
+                f"a fleet needs Dask: pip install 'thermo_comp[fleet]' ({name} is not installed)"
+            )
+
+
 def _speaks(row: Row) -> bool:
     """Whether a unit may contribute to the prior: data complete, calibration valid."""
     return is_valid(row) and row['is_whole'] == 1
@@ -163,8 +167,8 @@ def render_fleet(
         'residuals',
         'How large are the residuals of |f| in the fleet?',
         'Share of the units whose residual at rest is below the value: raw (constants at the '
-        'reference temperature), and with each unit’s calibration. Steep: the units are alike; '
-        'a tail to the right: units to inspect.',
+        'reference temperature), and with each unit’s calibration. A steep curve: '
+        'the units are alike; a tail to the right: units to inspect.',
         partial(draw_shares, curves),
     )
     distances = ReportFigure(
@@ -174,8 +178,8 @@ def render_fleet(
         'deviations. Diamonds beyond the dashed lines are the units listed above.',
         partial(
             draw_distances,
-            [one.quantity.label for one in summary.spreads],
-            [one.z for one in summary.spreads],
+            [spread.quantity.label for spread in summary.spreads],
+            [spread.z for spread in summary.spreads],
             summary.limit,
         ),
     )
@@ -256,8 +260,8 @@ class Results:
 
 def _key(unit: FoundUnit, options: FleetOptions) -> dict[str, Any]:
     """Return everything that a result depends on, for JSON."""
-    found = [list(file) for bag in unit.bags.values() for file in bag]
-    return {'format': _FORMAT, 'options': options.digest(), 'files': found}
+    files = [list(file) for bag in unit.bags.values() for file in bag]
+    return {'format': _FORMAT, 'options': options.digest(), 'files': files}
 
 
 def _safe(part: str) -> str:

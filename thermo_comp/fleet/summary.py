@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the statistics of a fleet table: robust spreads, outliers, drift."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -148,7 +146,7 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
     ]
     compared = [one for one in QUANTITIES if one.sd]
     limit = norm.isf(0.5 * _FALSE_ALARMS / max(len(pairs) * len(compared), 1))
-    found = []
+    drifts = []
     for (serial, begun, before, old), (_, again, after, new) in pairs:
         changes = []
         for one in compared:
@@ -160,8 +158,8 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
             changes.append(Drift(before, after, one.label, one.unit, change, sd))
         is_significant = any(_sds(one) > limit for one in changes)
         days = _days(begun, again)
-        found.append(Retest(serial, before, after, days, tuple(changes), is_significant))
-    return sorted(found, key=lambda one: -_sds(one.worst))
+        drifts.append(Retest(serial, before, after, days, tuple(changes), is_significant))
+    return sorted(drifts, key=lambda one: -_sds(one.worst))
 
 
 def _sds(drift: Drift) -> float:

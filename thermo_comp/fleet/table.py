@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the table of units: its columns, the cells of a fit, and its files."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -29,7 +27,7 @@ from ..unit.prediction import in_a_soak
 Cell = str | int | float | None
 Row = Mapping[str, Cell]
 
-#: Values of the column `verdict` without a verdict of `judging`.
+#: Values of the column `verdict` for tests that were not judged.
 REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
 # First characters of a spreadsheet formula.
 _FORMULA = ('=', '+', '-', '@')
@@ -67,7 +65,7 @@ _TABLE = (
     ('n_samples', 'whole', 'accelerometer samples'),
     ('n_bytes', 'whole', 'size of the bags'),
     ('model', 'text', 'the model of the fit'),
-    ('is_whole', 'whole', '1 if its bags determine everything: it can contribute to the prior'),
+    ('is_whole', 'whole', '1 if the bags determine every parameter: then the prior may use them'),
     ('prior', 'text', 'SHA-256 of the prior.yaml of its fit'),
     ('start', 'text', 'UTC of the first sample'),
     ('hours', 'number', 'length of the bags together'),
@@ -92,7 +90,7 @@ _TABLE = (
     ('static_ug', 'number', '|f| - g at rest, RMS, static regime'),
     ('dynamic_ug', 'number', '|f| - g at rest, RMS, dynamic regime'),
     ('all_ug', 'number', '|f| - g at rest, RMS'),
-    ('peak_ug', 'number', '|f| - g at rest, largest window'),
+    ('peak_ug', 'number', 'largest |f| - g of a window at rest'),
     ('unseen_ug', 'number', '|f| - g of each position by a fit to the others, RMS'),
     ('claimed_ug', 'number', 'RMS of the claimed standard deviation of these windows'),
     ('cpu_s', 'number', 'processor time of reading and fit'),
@@ -159,8 +157,8 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
     sets = calibration.regime_sets()
     static = sets[0].axes()
     bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
-    up = np.array([one.up for one in result.positions])
-    lacking = {one.name for one in result.findings if one.level != 'good'}
+    up = np.array([position.up for position in result.positions])
+    lacking = {finding.name for finding in result.findings if finding.level != 'good'}
     unseen = next(row.left_out for row in result.residuals if row.section == 'all')
     parts: dict[str, Sequence[float] | Floats] = {
         'scale_{0}': scale,
@@ -199,14 +197,14 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
         'unseen_ug': unseen.rms / MICRO_G,
     }
     if judgement is not None:
-        found = judgement.sections
-        whole = found['all']
+        of = judgement.sections
+        whole = of['all']
         cells |= {
             'verdict': judgement.verdict,
             'reason': judgement.reason,
             'window_s': judgement.windows.window_s,
             'raw_ug': whole.raw_rms / MICRO_G,
-            **{f'{name}_ug': found[name].rms / MICRO_G for name in ('static', 'dynamic', 'all')},
+            **{f'{name}_ug': of[name].rms / MICRO_G for name in ('static', 'dynamic', 'all')},
             'peak_ug': whole.peak / MICRO_G,
             'claimed_ug': whole.claimed_rms / MICRO_G,
         }
@@ -242,14 +240,14 @@ def read_parquet(path: Path) -> list[Row]:
     from pyarrow import ArrowException, parquet
 
     try:
-        found = parquet.read_table(path).to_pylist()
+        rows = parquet.read_table(path).to_pylist()
     except (ArrowException, OSError) as error:
         raise ThermoCompError(
             f'{path}: not a fleet table: {" ".join(str(error).split())}'
         ) from error
     names = {one.name for one in COLUMNS}
-    if not all('serial' in row and 'verdict' in row for row in found):
+    if not all('serial' in row and 'verdict' in row for row in rows):
         raise ThermoCompError(
             f'{path}: not a fleet table: it lacks the columns serial and verdict'
         )
-    return [row_of(**{k: v for k, v in row.items() if k in names}) for row in found]
+    return [row_of(**{k: v for k, v in row.items() if k in names}) for row in rows]

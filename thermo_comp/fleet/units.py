@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the search for a fleet's bags on any file system of fsspec, and their units."""
 
-from __future__ import annotations
-
 import errno
 import os
 import tempfile
@@ -90,7 +88,7 @@ class Storage:
             return
         with tempfile.TemporaryDirectory(prefix='thermo_comp-') as scratch:
             there, copies = (
-                [f'{root}/{one.name}' for one in files] for root in (self._root, scratch)
+                [f'{root}/{file.name}' for file in files] for root in (self._root, scratch)
             )
             try:
                 self._fs.get(there, copies)
@@ -123,15 +121,15 @@ def find_units(storage: Storage) -> list[FoundUnit]:
             'is .mcap, .db3, .bag or a rosbag2 directory'
         )
     folders = {_folder(name) for name in bags}
-    found: dict[tuple[str, str], Bags] = defaultdict(dict)
+    by_unit: dict[tuple[str, str], Bags] = defaultdict(dict)
     for name, files in bags.items():
         unit = _folder(name)
         lot = unit.partition('/')[0] if '/' in unit else ''
         if not unit:
             serial = _serial(storage, name, files)
             unit = f'{serial} (in {storage.name})' if serial in folders else serial
-        found[one_line(unit), one_line(lot)][name] = files
-    return [FoundUnit(unit, lot, found[unit, lot]) for unit, lot in sorted(found)]
+        by_unit[one_line(unit), one_line(lot)][name] = files
+    return [FoundUnit(unit, lot, by_unit[unit, lot]) for unit, lot in sorted(by_unit)]
 
 
 def group_files(files: Sequence[StoredFile]) -> Bags:
@@ -152,9 +150,9 @@ def group_files(files: Sequence[StoredFile]) -> Bags:
 def _is_bag(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
     """Whether a folder is a rosbag2 directory, even without metadata (recorder killed)."""
     stems = [one.name.rpartition('.')[0].rpartition('_') for one in stored]
-    own = f'{folder}/{folder.rpartition("/")[2]}'
+    usual = f'{folder}/{folder.rpartition("/")[2]}'
     return any(one.name == f'{folder}/metadata.yaml' for one in inside) or all(
-        stem == own and number.isdigit() for stem, _, number in stems
+        stem == usual and number.isdigit() for stem, _, number in stems
     )
 
 

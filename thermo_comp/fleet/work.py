@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the work on a unit (reading and fitting its bags), and its distribution by Dask."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging
@@ -60,7 +58,7 @@ class UnitOutcome:
 
     row: dict[str, Cell]
     hashes: dict[str, str]  # of its bags
-    is_final: bool  # the same bags give the same result, unlike after a file system failure
+    is_final: bool  # another attempt would give the same; False if the file system failed
     calibration: str = ''
     certificate: str = ''
 
@@ -166,7 +164,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Keep Ctrl-C, which a terminal sends to all processes, for this one; raise it afterwards."""
+    """Keep Ctrl-C, which a terminal sends to all processes, from workers; raise it afterwards."""
     heard: list[int] = []
     # Processes inherit the ignored signal from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -213,9 +211,9 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
             versions = client.run(version)
         except Exception as error:  # an import on a worker may raise any exception
             raise ThermoCompError(f'{scheduler}: {said}') from error
-        for worker, found in versions.items():
-            if found != __version__:
-                said = f'worker {worker} runs thermo_comp {found}, not {__version__}'
+        for worker, answer in versions.items():
+            if answer != __version__:
+                said = f'worker {worker} runs thermo_comp {answer}, not {__version__}'
                 raise ThermoCompError(f'{scheduler}: {said}')
         yield client
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the evaluation of recordings, each read once, and the history of a unit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -193,7 +191,7 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
             ordered.append(one)
         known.add(sources)
     ordered.sort(key=lambda one: one.provenance.created)
-    found: list[Epoch] = []
+    epochs: list[Epoch] = []
     first = np.ones(3)
     for number, one in enumerate(ordered):
         bias, bias_sd, scale, scale_sd = in_a_soak(one, ordered[0].reference_temperature_c)
@@ -201,8 +199,8 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
         value = np.concatenate((bias / MICRO_G, 1e6 * (scale / first - 1.0)))
         sd = np.concatenate((bias_sd / MICRO_G, 1e6 * scale_sd))
         created = one.provenance.created or f'no. {number + 1}'
-        found.append(Epoch(created, value, sd if one.has_uncertainty else np.full(6, np.nan)))
-    return tuple(found)
+        epochs.append(Epoch(created, value, sd if one.has_uncertainty else np.full(6, np.nan)))
+    return tuple(epochs)
 
 
 def drifts_of(history: Sequence[Epoch]) -> list[Drift]:

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the judgement of a calibration on recordings: a verdict with its numbers and exit code."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -124,14 +122,15 @@ def judge(
 ) -> Judgement:
     """
     Judge a calibration by its windows; windows of the fit's bags (`is_seen`) by the RMS on
-    positions left out. A `tolerance` on the RMS [m/s^2] decides if given.
+    positions left out. If a `tolerance` on the RMS
+    [m/s^2] is given, it decides instead of the claim.
     """
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)
     sections = verdicts.sections_of(windows, windows.raw_residual, windows.residual, claimed)
     at_1_g = windows.select(windows.is_inside & windows.is_usual)
     shifts = axis_shifts(at_1_g, calibration.misalignment_sd)
-    found = Judgement(
+    judgement = Judgement(
         kind=Verdict.OUTSIDE,
         reason='',
         sections=sections,
@@ -145,8 +144,8 @@ def judge(
         rate=verdicts.judge_rates(windows.select(windows.is_usual), calibration),
         by_force=verdicts.by_force(windows, claimed),
     )
-    kind, reason = _verdict(found, claims, calibration.needs_temperature)
-    return replace(found, kind=kind, reason=reason)
+    kind, reason = _verdict(judgement, claims, calibration.needs_temperature)
+    return replace(judgement, kind=kind, reason=reason)
 
 
 def _verdict(found: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict, str]:
@@ -232,12 +231,12 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
         (seen, np.eye(9)[6:] / np.maximum(misalignment_sd, _SMALLEST_MISALIGNMENT_SD)[:, None])
     )
     misses = np.concatenate(((sizes - 1.0) / sd, np.zeros(3)))
-    found = np.linalg.lstsq(seen, misses, rcond=None)[0]
+    shift = np.linalg.lstsq(seen, misses, rcond=None)[0]
     # Residuals in excess of the claimed errors increase the sd of the shifts.
-    freedom, left = len(sd) - 6, float(np.sum((misses - seen @ found) ** 2))
+    freedom, left = len(sd) - 6, float(np.sum((misses - seen @ shift) ** 2))
     excess = max(1.0, left / freedom) if freedom > 0 else 1.0
     spread = np.sqrt(np.diag(np.linalg.pinv(seen.T @ seen)) * excess)
-    bias, scale = (np.stack((found[k], spread[k]), axis=1) for k in (slice(3), slice(3, 6)))
+    bias, scale = (np.stack((shift[k], spread[k]), axis=1) for k in (slice(3), slice(3, 6)))
     return tuple(AxisShift(*row) for row in np.hstack((bias * gravity, scale)).tolist())
 
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the words of a judgement, its sections and limits, and the verdict on a gyroscope."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any
@@ -92,11 +90,11 @@ class Sections(dict[str, Section]):
 def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats) -> Sections:
     """Summarise values of windows, shape (n,) or (n, axes), by section."""
     inside, dynamic = windows.is_inside, windows.is_dynamic
-    found = Sections()
+    sections = Sections()
     rows_of = (inside & ~dynamic, inside & dynamic, inside, ~inside)
     for name, rows in zip(SECTIONS, rows_of, strict=True):
-        found[name] = _section(raw, residual, claimed, rows)
-    return found
+        sections[name] = _section(raw, residual, claimed, rows)
+    return sections
 
 
 def by_force(windows: Windows, claimed: Floats) -> dict[float, Section]:

@@ -31,7 +31,7 @@ from ..unit.metrics import norm_residual
 WINDOW_S = 60.0
 # Distance outside a calibrated range that still counts as inside, in half ranges: noise.
 _EDGE = 0.02
-# |f| that differs from gravity by a smaller part than this is gravity.
+# Largest relative difference of a known |f| from gravity at which the rest counts as one at 1 g.
 _USUAL = 0.01
 # Smallest number of samples of a partial sum / median number.
 _LEAST_FILLED = 0.9
@@ -104,7 +104,7 @@ def sum_length(window_s: float) -> float:
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Choose the window length [s] for a fit's bags: the next multiple of their sums from 60 s."""
+    """Choose the window length [s]: the least multiple of the bags' sums that is 60 s or more."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 
@@ -227,21 +227,21 @@ def _table(
         sums: list[_Table] = [np.zeros(0, kind)]
         for one in bag.intervals:
             n = one.n_whole // per * per
-            own = np.zeros(n, kind)
-            own['bag'], own['position'] = number, n_positions
+            rows = np.zeros(n, kind)
+            rows['bag'], rows['position'] = number, n_positions
             begin_s = one.begin_s + bag.window_s * np.arange(n)
-            own['start_ns'] = bag.start_ns + np.rint(begin_s * 1e9).astype(np.int64)
-            own['count'], own['time'], own['mean'] = one.count[:n], one.time[:n], one.mean[:n]
-            own['gyro'] = np.nan
-            own['size'] = gravity
+            rows['start_ns'] = bag.start_ns + np.rint(begin_s * 1e9).astype(np.int64)
+            rows['count'], rows['time'], rows['mean'] = one.count[:n], one.time[:n], one.mean[:n]
+            rows['gyro'] = np.nan
+            rows['size'] = gravity
             if (known := bag.source.force) is not None:
                 first_ns = bag.start_ns - round(bag.since_s * 1e9)
                 size = known.of(one.start_ns, one.end_ns, first_ns)
-                own['size'] = size.norm(gravity)
-                own['size_sd'] = np.hypot(size.sd, known.radius_part(size, gravity))
+                rows['size'] = size.norm(gravity)
+                rows['size_sd'] = np.hypot(size.sd, known.radius_part(size, gravity))
             if n_gyro and one.angular_rate is not None:
-                own['gyro'][:, :3] = one.angular_rate[:n]
-            sums.append(own)
+                rows['gyro'][:, :3] = one.angular_rate[:n]
+            sums.append(rows)
             n_positions += 1
         whole = np.concatenate(sums)
         if calibration is None:

@@ -7,8 +7,6 @@ The compensator takes the readings one by one. Its segments are collected, evalu
 applied to all samples with the arithmetic of the stream.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from operator import itemgetter
 from typing import Final, TypeAlias
@@ -64,8 +62,8 @@ def process_block(
         if name in block.temperatures:
             stamp_ns, celsius, place = map(np.asarray, block.temperatures[name])
             order, names = np.maximum.accumulate(stamp_ns), np.full(len(place), name)
-            own = (place, order, names, stamp_ns, celsius)
-            arrivals += zip(*(column.tolist() for column in own), strict=True)
+            lists = (place, order, names, stamp_ns, celsius)
+            arrivals += zip(*(column.tolist() for column in lists), strict=True)
     arrivals.sort(key=itemgetter(0, 1))
     arrivals.reverse()
     runs = _runs(compensator, stamps, arrivals)
@@ -82,9 +80,9 @@ def process_block(
     if len(parts) == 1:
         return parts[0]
     columns = {
-        one.name: np.concatenate([getattr(part, one.name) for part in parts])
-        for one in fields(CompensatedBlock)
-        if getattr(parts[0], one.name) is not None
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in fields(CompensatedBlock)
+        if getattr(parts[0], field.name) is not None
     }
     return CompensatedBlock(**columns)
 
@@ -95,7 +93,7 @@ def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list
     steps = np.diff(stamps, prepend=stamps[:1] if before_ns == EVER_NS else before_ns)
     is_plain = compensator.leapt_ns is None and (steps[before_ns == EVER_NS :] > 0).all()
     if is_plain and int(np.max(steps, initial=0)) <= leap_ns:
-        latest_ns = max((one[3] for one in arrivals), default=EVER_NS)
+        latest_ns = max((arrival[3] for arrival in arrivals), default=EVER_NS)
         compensator.reading_ns = max(compensator.reading_ns, latest_ns)
         return [np.arange(len(stamps))]
     runs: list[list[int]] = [[]]

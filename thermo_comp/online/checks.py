@@ -11,8 +11,6 @@ sensor, the mean of the previous window) of a second or longer. A step of |f| fr
 another is no motion: it is judged within a second.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Final
@@ -187,7 +185,7 @@ class GravityCheck:
     def _watch_step(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Refute a step from rest to rest sooner than windows could."""
+        """Refute the calibration by a step of |f| between rests, sooner than by windows."""
         rests = self.result and self.result.is_still and self._last_mean
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False

@@ -28,13 +28,13 @@ from .checks import GravityCheck, StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
 
-#: Backward step of the stamps from which it is a jump of time (a bag that loops) [ns].
+#: Smallest backward step of the stamps that is a jump of time, as of a bag that loops [ns].
 TIME_JUMP_NS: Final = 1_000_000_000
 #: A forward step of the stamps above both limits ([ns], [cycles]) is accepted only if a reading or
 #: a second sample confirms it: a single damaged stamp would erase the memory.
 LEAP_NS: Final = 15_000_000_000
 LEAP_CYCLES: Final = 10.0
-#: Age of the board temperature at which it is stale, in its usual intervals, and at least [s].
+#: Age at which a board temperature is stale, in usual intervals of readings, and at least [s].
 STALE_INTERVALS: Final = 5.0
 SHORTEST_STALE_S: Final = 0.5
 #: Texts about a status, for diagnostics and offline reports.
@@ -266,10 +266,6 @@ class Compensator:
         """Use another calibration from the next sample on."""
         vars(self).update(vars(self.successor(Model(calibration), self.config)))
 
-    def reconfigure(self, config: CompensatorConfig) -> None:
-        """Use other settings from the next sample on."""
-        vars(self).update(vars(self.successor(self.thermal.model, config)))
-
     def successor(self, model: Model, config: CompensatorConfig) -> Compensator:
         """
         Build a compensator that continues from the last sample with another model or settings.
@@ -282,7 +278,7 @@ class Compensator:
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Continue as a successor does; the compensator that this is a copy of does not change."""
+        """Go on with another model or settings; a compensator that was copied does not change."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckCheck(config.stuck_timeout_s)
         self.config, self.thermal = config, copy(self.thermal)

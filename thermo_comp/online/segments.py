@@ -9,8 +9,6 @@ one evaluation per segment. The slow part of the variance is evaluated at the fi
 ten seconds of the stamps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the settings and counters of the compensator."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
-from ..thermal.settings import ThermalConfig, refuse_outside
+from ..quantities import NotNegative
+from ..thermal.settings import ThermalConfig
 
 
 @dataclass(frozen=True)
@@ -16,20 +15,12 @@ class CompensatorConfig(ThermalConfig):
 
     #: Time after which repeated equal samples are dropped [s]; three exact zeros always are; 0
     #: switches both checks off.
-    stuck_timeout_s: float = 2.0
+    stuck_timeout_s: NotNegative = 2.0
     #: Gravity at the place of use [m/s^2]; 0 = that of the calibration.
-    local_gravity_m_s2: float = 0.0
+    local_gravity_m_s2: NotNegative = 0.0
     #: Largest error of |f| at rest [m/s^2]. Beyond it the calibration is that of another unit, or
     #: an axis is reversed, and nothing is published; 0 = no limit.
-    gravity_tolerance_m_s2: float = 0.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        refuse_outside(
-            self,
-            positive=(),
-            not_negative=('stuck_timeout_s', 'local_gravity_m_s2', 'gravity_tolerance_m_s2'),
-        )
+    gravity_tolerance_m_s2: NotNegative = 0.5
 
 
 @dataclass(slots=True)
@@ -47,7 +38,7 @@ class Dropped:
     n_unsound: int = 0  # the corrected sample is not finite
 
 
-DROPPED = tuple(one.name for one in fields(Dropped))
+DROPPED = tuple(field.name for field in fields(Dropped))
 
 
 @dataclass(slots=True)

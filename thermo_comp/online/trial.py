@@ -4,8 +4,6 @@
 Owns the trial of a calibration: a few samples are corrected with it before it is used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final

@@ -124,7 +124,7 @@ class ImuColumns(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Readings of a thermometer, shape (m,); `after`: the block's samples before each."""
+    """Readings of a thermometer, shape (m,); `after`: number of samples before each."""
 
     stamp_ns: Ints
     celsius: Floats
@@ -178,22 +178,22 @@ class Block:
     @property
     def stamp_ns(self) -> dict[Role, Ints]:
         """The stamps of each role."""
-        stamps = {name: one.stamp_ns for name, one in self.temperatures.items()}
+        stamps = {name: readings.stamp_ns for name, readings in self.temperatures.items()}
         return {'accel': self.accel_stamp_ns, **stamps}
 
     def take(self, rows: Mapping[Role, Bools]) -> Block:
         """Select messages of each role."""
-        own = rows['accel']
-        n_before = np.concatenate(([0], np.cumsum(own)))
+        is_taken = rows['accel']
+        n_before = np.concatenate(([0], np.cumsum(is_taken)))
         temperatures = {}
-        for name, one in self.temperatures.items():
-            after = n_before[one.after[rows[name]]]
-            temperatures[name] = one.take(rows[name])._replace(after=after)
+        for name, readings in self.temperatures.items():
+            after = n_before[readings.after[rows[name]]]
+            temperatures[name] = readings.take(rows[name])._replace(after=after)
         return Block(
-            self.accel_stamp_ns[own],
-            self.accel[own],
+            self.accel_stamp_ns[is_taken],
+            self.accel[is_taken],
             self.frame_id,
-            self.imu and self.imu.take(own),
+            self.imu and self.imu.take(is_taken),
             temperatures,
             {role: log_ns[rows[role]] for role, log_ns in self.log_ns.items()},
             {role: one.take(rows[role]).packed() for role, one in self.raw.items()},
@@ -232,8 +232,8 @@ def joined(blocks: Sequence[Block]) -> Block:
     begins = np.cumsum([0, *map(len, blocks)])
     temperatures = {}
     for name in blocks[0].temperatures:
-        own = zip((block.temperatures[name] for block in blocks), begins, strict=False)
-        moved = [one._replace(after=one.after + begin) for one, begin in own]
+        parts = zip((block.temperatures[name] for block in blocks), begins, strict=False)
+        moved = [one._replace(after=one.after + begin) for one, begin in parts]
         temperatures[name] = Readings(*map(np.concatenate, zip(*moved, strict=True)))
     imus = [block.imu for block in blocks if block.imu is not None]
     raws = {role: [b.raw[role] for b in blocks if role in b.raw] for b in blocks for role in b.raw}
@@ -244,7 +244,7 @@ def joined(blocks: Sequence[Block]) -> Block:
         ImuColumns(*map(np.concatenate, zip(*imus, strict=True))) if imus else None,
         temperatures,
         {role: np.concatenate([b.log_ns[role] for b in blocks]) for role in blocks[0].log_ns},
-        {role: join_messages(own) for role, own in raws.items()},
+        {role: join_messages(parts) for role, parts in raws.items()},
     )
 
 
@@ -259,11 +259,11 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
     newest = np.concatenate([np.maximum.accumulate(run) for run in np.split(samples, jumps)])
     temperatures, kept = dict(block.temperatures), {}
-    for name, one in block.temperatures.items():
-        is_bare = one.stamp_ns == NO_STAMP_NS
+    for name, readings in block.temperatures.items():
+        is_bare = readings.stamp_ns == NO_STAMP_NS
         if is_bare.any():
-            stamp_ns = np.where(is_bare, newest[one.after], one.stamp_ns)
-            temperatures[name] = one._replace(stamp_ns=stamp_ns)
+            stamp_ns = np.where(is_bare, newest[readings.after], readings.stamp_ns)
+            temperatures[name] = readings._replace(stamp_ns=stamp_ns)
             kept[name] = stamp_ns != NO_STAMP_NS
             if name in block.raw:
                 _restamp(block.raw[name], stamp_ns)
@@ -274,16 +274,16 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
 
 
 def _restamp(messages: Messages, stamp_ns: Ints) -> None:
-    """Write stamps into serialized messages, little-endian and with a header each."""
+    """Write stamps into the headers of serialized little-endian messages."""
     stamps = np.stack((stamp_ns // 10**9, stamp_ns % 10**9), axis=1).astype('<i4')
     scatter(messages.data, messages.start + 4, stamps.view((np.void, 8))[:, 0])
 
 
 def clocks_apart(block: Block) -> str:
     """Name a thermometer whose stamps are far from those of the samples around it."""
-    for name, one in block.temperatures.items():
-        inside = (one.after > 0) & (one.after < len(block))
-        stamp_ns, after = one.stamp_ns[inside], one.after[inside]
+    for name, readings in block.temperatures.items():
+        inside = (readings.after > 0) & (readings.after < len(block))
+        stamp_ns, after = readings.stamp_ns[inside], readings.after[inside]
         edges = block.accel_stamp_ns[after - 1], block.accel_stamp_ns[after]
         apart_s = (stamp_ns - np.clip(stamp_ns, *edges)) * 1e-9
         if len(apart_s) >= _FEWEST_READINGS and abs(middle := np.median(apart_s)) > _APART_S:
@@ -303,7 +303,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     for block in blocks:
         thermometers = block.temperatures.values()
         # Reading order: a reading precedes the sample for which it counts.
-        places = [*(one.after for one in thermometers), np.arange(len(block))]
+        places = [*(thermometer.after for thermometer in thermometers), np.arange(len(block))]
         stamps = np.concatenate([*(one.stamp_ns for one in thermometers), block.accel_stamp_ns])
         if not len(stamps):
             yield block
@@ -318,9 +318,9 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
         n_messages += len(read)
         span_ns += int(np.sum(np.where(is_jump, LONGEST_PAUSE_NS, np.maximum(steps, 0))))
         if n_jumps > _MOST_JUMPS or span_ns > max(_SPARSE_NS, n_messages * _SPARSEST_NS):
-            told = f'{n_messages} messages stamped over {span_ns / 86400e9:.0f} days, '
-            told += f'{n_jumps} jumps by more than an hour: no recording of a thermal test'
-            raise RecordingError(clocks_apart(block) or told, path)
+            reason = f'{n_messages} messages stamped over {span_ns / 86400e9:.0f} days, '
+            reason += f'{n_jumps} jumps by more than an hour: no recording of a thermal test'
+            raise RecordingError(clocks_apart(block) or reason, path)
         offsets = np.empty_like(moved)
         offsets[order] = moved
         parts = np.split(offsets, np.cumsum([len(one.after) for one in thermometers]))

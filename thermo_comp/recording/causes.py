@@ -4,8 +4,6 @@
 Owns the likely reasons why a recording is not one of an accelerometer at rest, as messages.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..unit.gravity import STANDARD_GRAVITY

@@ -9,8 +9,6 @@ are read one by one.
 https://mcap.dev/spec
 """
 
-from __future__ import annotations
-
 import bz2
 import struct
 import zlib
@@ -86,7 +84,8 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 class Span:
     """
     A part of a file: a chunk, a chunk without end ('torn'), or messages outside chunks ('loose').
-    `position` and `length` [bytes] exclude the message indexes after it; `size` is the content's.
+    `position` and `length` [bytes] exclude the message indexes after it; `size` is that of its
+    decompressed content [bytes].
     """
 
     position: int
@@ -101,8 +100,8 @@ class Span:
 def parse_chunk_head(head: bytes, position: int) -> tuple[Span, str, int, int]:
     """Read the head of a chunk: its span, compression, offset of the data, checksum."""
     try:
-        found = _CHUNK_HEAD.unpack_from(head)
-        opcode, content, start_ns, end_ns, size, checksum, n_name = found
+        fields = _CHUNK_HEAD.unpack_from(head)
+        opcode, content, start_ns, end_ns, size, checksum, n_name = fields
         name, n_packed = struct.unpack_from(f'<{n_name}sQ', head, _CHUNK_HEAD.size)
     except struct.error as error:
         raise DamagedError(f'the chunk at byte {position} has a damaged head') from error

@@ -46,10 +46,11 @@ def spread_of_variances(cells: Cells, believable: Bools, level: Floats) -> Float
 
 def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: float) -> Floats:
     """
-    Say how rough a cell at rest is at most, per axis; of coloured noise, which hides a step from a
-    cell's mean and variance, but not from the changes from sample to sample.
+    Return the largest roughness of a cell at rest, per axis; infinite for white noise.
 
-    How far these spread follows from the tenth percentile and the median, as of a chi-square.
+    Coloured noise hides a step in a cell's mean and variance, but not in the changes from sample
+    to sample. The spread of the roughness follows from its tenth percentile and its median, for a
+    chi-square distribution.
     """
     result = np.full(3, np.inf)
     for axis in np.flatnonzero(is_coloured) if quiet.any() else ():

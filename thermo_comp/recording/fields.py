@@ -8,8 +8,6 @@ at a multiple of its size after the encapsulation; the length of a string or seq
 precedes it. The positions in all messages advance together, field by field.
 """
 
-from __future__ import annotations
-
 import re
 from collections import ChainMap
 from collections.abc import Mapping
@@ -50,17 +48,17 @@ def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitio
     """Find the definition of a type in the bag, or else in ROS 2 Jazzy."""
     from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
-    own: dict[str, Any] = {}
+    defined: dict[str, Any] = {}
     encoding, text = known.get(kind, ('', ''))
     try:
         if encoding == 'ros2msg':
-            own = get_types_from_msg(text, kind)
+            defined = get_types_from_msg(text, kind)
         elif encoding == 'ros2idl':
             for part in filter(None, text.split(_IDL)):
-                own |= get_types_from_idl(part.partition('\n')[2] if _IDL in text else part)
+                defined |= get_types_from_idl(part.partition('\n')[2] if _IDL in text else part)
     except TypesysError as error:
         raise RecordingError(f'the definition of {kind} cannot be read') from error
-    found = ChainMap(own, typestore().fielddefs)
+    found = ChainMap(defined, typestore().fielddefs)
     if kind not in found:
         raise RecordingError(f'the bag does not define its type {kind}')
     return found
@@ -181,8 +179,8 @@ class _Cursor:
         """Advance past a field."""
         node, content = description
         if node == _NAME:
-            for _, one in self._definitions[content][1]:
-                self.skip(one)
+            for _, definition in self._definitions[content][1]:
+                self.skip(definition)
         elif node != _BASE:
             counts = self._count(description)
             kind = _KINDS.get(content[0][1][0]) if content[0][0] == _BASE else None

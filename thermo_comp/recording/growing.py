@@ -8,8 +8,6 @@ The messages are written to a folder of bags, `01.mcap`, ... with the node's top
 of a position is recognised with a delay, so the newest messages are held back.
 """
 
-from __future__ import annotations
-
 import re
 import time
 from collections import Counter
@@ -32,7 +30,7 @@ _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: Hidden name of a bag that is being written: its number and the process number.
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
-_SHARE = 0.2  # largest share of the time spent reading
+_SHARE = 0.2  # largest share of the time in which the growing bag is read
 
 #: A new block with its serialized messages, and the bag that it comes from.
 News = tuple[Block, RecordingInfo | None]
@@ -83,18 +81,18 @@ def _size(path: Path) -> int:
 
 def numbered_bags(folder: Path) -> list[Path]:
     """List the bags of a folder, in the order of their numbers."""
-    found = {int(one.stem): one for one in folder.glob('*.mcap') if one.stem.isdecimal()}
-    return [found[number] for number in sorted(found)]
+    bags = {int(one.stem): one for one in folder.glob('*.mcap') if one.stem.isdecimal()}
+    return [bags[number] for number in sorted(bags)]
 
 
 def leftovers(folder: Path) -> dict[Path, int]:
     """List the unfinished bags left by crashed runs, with their numbers."""
-    found: dict[Path, int] = {}
+    unfinished: dict[Path, int] = {}
     for path in sorted(folder.glob('.*.partial.mcap')):
         named = _LEFT.fullmatch(path.name)
         if named and not Path(f'/proc/{named["process"]}').exists():
-            found[path] = int(named['number'])
-    return found
+            unfinished[path] = int(named['number'])
+    return unfinished
 
 
 def finish(path: Path, number: int) -> Path | None:
@@ -103,7 +101,7 @@ def finish(path: Path, number: int) -> Path | None:
     if it has no message. RecordingError if nothing can be read.
     """
     with open_recording(path, require=()) as reader:
-        numbers = {int(one.stem) for one in numbered_bags(path.parent)}
+        numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}
         number = max(numbers) + 1 if number in numbers else number
         bags = PositionBags(path.parent, None, number)
         try:
@@ -121,7 +119,7 @@ class PositionBags:
 
     def __init__(self, folder: Path, serial: str | None, number: int | None = None) -> None:
         self._folder, self._serial = folder, serial
-        last = max((int(one.stem) for one in numbered_bags(folder)), default=0)
+        last = max((int(bag.stem) for bag in numbered_bags(folder)), default=0)
         self._number = number or last + 1
         check_output(folder / f'{self._number:02d}.mcap', MCAP)
         self._writer: BagWriter | None = None
@@ -140,11 +138,11 @@ class PositionBags:
         try:
             for block in held:
                 is_late = {
-                    role: np.maximum.accumulate(own >= stamp_ns)
-                    for role, own in block.stamp_ns.items()
+                    role: np.maximum.accumulate(stamps >= stamp_ns)
+                    for role, stamps in block.stamp_ns.items()
                 }
-                self._write(block.take({role: ~own for role, own in is_late.items()}))
-                if any(own.any() for own in is_late.values()):
+                self._write(block.take({role: ~late for role, late in is_late.items()}))
+                if any(late.any() for late in is_late.values()):
                     self._held.append(block.take(is_late))
             if self._writer is not None:
                 self._writer.flush()

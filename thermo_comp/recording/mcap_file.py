@@ -8,8 +8,6 @@ or cut off anywhere, is read record by record, and its messages are counted. Rec
 messages are read by the `mcap` library.
 """
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -140,33 +138,33 @@ class McapFile(BagFile):
 
     def _read_summary(self, content: bytes) -> None:
         """Read the summary; ignore it if damaged or incomplete."""
-        found: dict[type, list[Any]] = {}
+        records_of: dict[type, list[Any]] = {}
         try:
             reader = StreamReader(BytesIO(content), skip_magic=True, emit_chunks=True)
             for record in reader.records:
-                found.setdefault(type(record), []).append(record)
-            (said,) = found[Statistics]
+                records_of.setdefault(type(record), []).append(record)
+            (said,) = records_of[Statistics]
         except Exception:  # noqa: BLE001 - damaged bytes surface as nearly any exception type
             return
         counts, n_messages = said.channel_message_counts, said.message_count
-        channels: dict[int, Channel] = {one.id: one for one in found.get(Channel, [])}
-        chunks = sorted(found.get(ChunkIndex, []), key=lambda one: one.chunk_start_offset)
-        spans = [Span(*_SPAN_FIELDS(one)) for one in chunks]
+        channels: dict[int, Channel] = {one.id: one for one in records_of.get(Channel, [])}
+        chunks = sorted(records_of.get(ChunkIndex, []), key=lambda one: one.chunk_start_offset)
+        spans = [Span(*_SPAN_FIELDS(chunk)) for chunk in chunks]
         if (
             sum(counts.values()) != n_messages
             or not counts.keys() <= channels.keys()
-            or not len(spans) == len({one.position for one in spans}) == said.chunk_count
-            or any(one.position + one.length + one.index_length > self._size for one in spans)
+            or not len(spans) == len({span.position for span in spans}) == said.chunk_count
+            or any(span.position + span.length + span.index_length > self._size for span in spans)
         ):
             return
         self._channels = channels
-        self._schemas = {one.id: one for one in found.get(Schema, [])}
-        self.spans = [one for one in spans if one.size]
+        self._schemas = {one.id: one for one in records_of.get(Schema, [])}
+        self.spans = [span for span in spans if span.size]
         if self.spans:
             self._counts.update(counts)
             if n_messages:
                 self.start_ns, self.end_ns = said.message_start_time, said.message_end_time
-        for index in found.get(MetadataIndex, []):
+        for index in records_of.get(MetadataIndex, []):
             is_small = PREFIX.size <= index.length <= _MAX_SMALL_RECORD
             if index.name == METADATA_NAME and is_small and index.offset < self._size:
                 pairs = self._read_at(index.offset, index.length)[PREFIX.size :]

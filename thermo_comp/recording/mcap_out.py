@@ -6,8 +6,6 @@ metadata.yaml of rosbag2 (version 9). Messages and their indexes are numpy bytes
 records use the classes of the `mcap` library.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 import zlib
@@ -150,19 +148,19 @@ class McapOutput:
     def _information(self) -> dict[str, Any]:
         """Build metadata.yaml as in Jazzy."""
         start_ns, end_ns = self._times()
-        kinds = {one.id: kind for kind, one in self._schemas.items()}
+        kinds = {schema.id: kind for kind, schema in self._schemas.items()}
         counted: list[dict[str, Any]] = [
             {
                 'topic_metadata': {
-                    'name': one.topic,
-                    'type': kinds[one.schema_id],
+                    'name': channel.topic,
+                    'type': kinds[channel.schema_id],
                     'serialization_format': 'cdr',
-                    'offered_qos_profiles': [_offered_qos(one.topic)],
-                    'type_description_hash': one.metadata['topic_type_hash'],
+                    'offered_qos_profiles': [_offered_qos(channel.topic)],
+                    'type_description_hash': channel.metadata['topic_type_hash'],
                 },
-                'message_count': self._counts[one.id],
+                'message_count': self._counts[channel.id],
             }
-            for one in self._channels.values()
+            for channel in self._channels.values()
         ]
         times = {
             'duration': {'nanoseconds': end_ns - start_ns},
@@ -184,8 +182,8 @@ class McapOutput:
 
     def _times(self) -> tuple[int, int]:
         """Return the log times of the first and the last message."""
-        start = min((one.message_start_time for one in self._chunks), default=0)
-        return start, max((one.message_end_time for one in self._chunks), default=0)
+        start = min((chunk.message_start_time for chunk in self._chunks), default=0)
+        return start, max((chunk.message_end_time for chunk in self._chunks), default=0)
 
     def _put(self, data: Any) -> None:
         view = memoryview(data)
@@ -229,11 +227,11 @@ class McapOutput:
         rows = np.empty(len(log_ns), _INDEX_ROW)
         rows['log'], rows['offset'] = log_ns, at
         for number in np.unique(channel).tolist():
-            own = rows[channel == number]
-            self._counts[number] += len(own)
+            entries = rows[channel == number]
+            self._counts[number] += len(entries)
             offsets[number] = self._at
-            index_head = (Opcode.MESSAGE_INDEX, 6 + own.nbytes, number, own.nbytes)
-            self._put(struct.pack('<BQHI', *index_head) + own.tobytes())
+            index_head = (Opcode.MESSAGE_INDEX, 6 + entries.nbytes, number, entries.nbytes)
+            self._put(struct.pack('<BQHI', *index_head) + entries.tobytes())
         self._chunks.append(
             records.ChunkIndex(
                 chunk_length=chunk_length,

@@ -4,8 +4,6 @@
 Owns the survey of a recording before a fit: duration, rates, temperatures, rests, losses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +13,7 @@ import numpy as np
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..topics import TEMPERATURE
+from ..typing import Ints
 from .blocks import Readings, RecordingInfo
 from .causes import CauseCounter
 from .fields import temperature_fields
@@ -67,11 +66,11 @@ def thermal_findings(
     thermometers: Mapping[str, ThermometerSurvey], candidates: Sequence[str] = ()
 ) -> list[str]:
     """List missing thermometers, span and ramps; `candidates` are unused topics."""
-    found = []
+    findings = []
     among = f': {", ".join(candidates)}' if candidates else ''
     board = thermometers.get('board')
     if board is None:
-        found.append(
+        findings.append(
             'no board temperature: a thermal fit needs temperature/board, or name yours with '
             f'--topic board=TOPIC{among}'
         )
@@ -79,39 +78,41 @@ def thermal_findings(
         heating, cooling = board.steepest_heating_k_min, -board.steepest_cooling_k_min
         span = board.highest - board.lowest
         if span < ADVISED_SPAN_K:
-            found.append(f'board temperature spans {span:.1f} K: {ADVISED_SPAN_K:g} are advised')
+            findings.append(
+                f'board temperature spans {span:.1f} K: {ADVISED_SPAN_K:g} are advised'
+            )
         for name, rate in (('heating', heating), ('cooling', cooling)):
             if rate < RAMP_K_MIN:
-                found.append(f'no {name} ramp: the dynamic set would be extrapolated to {name}')
-    for name, one in thermometers.items():
-        reads = f'{name} reads {one.lowest:.4g} .. {one.highest:.4g}'
-        if one.lowest < COLDEST or one.highest > HOTTEST:
-            found.append(f'{reads}: that is not degC')
-        elif KELVINS[0] < one.lowest and one.highest < KELVINS[1]:
-            found.append(f'temperature/{reads} degC: that looks like kelvins')
+                findings.append(f'no {name} ramp: the dynamic set would be extrapolated to {name}')
+    for name, thermometer in thermometers.items():
+        reads = f'{name} reads {thermometer.lowest:.4g} .. {thermometer.highest:.4g}'
+        if thermometer.lowest < COLDEST or thermometer.highest > HOTTEST:
+            findings.append(f'{reads}: that is not degC')
+        elif KELVINS[0] < thermometer.lowest and thermometer.highest < KELVINS[1]:
+            findings.append(f'temperature/{reads} degC: that looks like kelvins')
     if 'case' not in thermometers:
-        found.append(
+        findings.append(
             'no case temperature: the regime will follow the slower board sensor; name yours '
             f'with --topic case=TOPIC{among}'
         )
-    return found
+    return findings
 
 
 def unused_thermometers(reader: RecordingReader) -> list[str]:
     """List unused topics that may hold a temperature: a barometer's, the air's, another IMU's."""
-    found = []
+    candidates = []
     paths = {role: one.path for role, one in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}
     for name, (kind, count) in sorted(reader.info.topics.items()):
-        # A bare number is read as its only field.
+        # A message of one bare number needs no name of a field.
         if not count or not used.isdisjoint({(name, None), (name, PLAIN.get(kind))}):
             continue
         if kind == TEMPERATURE or (kind in PLAIN and 'temp' in name.lower()):
-            found.append(shown(name))
+            candidates.append(shown(name))
             continue
         fields = temperature_fields(kind, reader.definitions)
-        found += [shown(f'{name}:{one}') for one in fields if (name, one) not in used]
-    return found
+        candidates += [shown(f'{name}:{field}') for field in fields if (name, field) not in used]
+    return candidates
 
 
 def survey_recording(
@@ -124,37 +125,25 @@ def survey_recording(
         cells, causes = CellAccumulator(_CELL_S, None), CauseCounter()
         # Kept in memory: a thermal test has few readings compared with its samples.
         readings: dict[str, list[Readings]] = {}
-        n = n_gaps = n_backwards = first_ns = last_ns = 0
-        longest_gap = step_ns = 0.0
+        clock = _Clock()
         for block in reader.blocks():
-            for name, one in block.temperatures.items():
-                readings.setdefault(name, []).append(one)
-            stamp_ns = block.accel_stamp_ns
-            if not len(stamp_ns):
+            for name, temperature in block.temperatures.items():
+                readings.setdefault(name, []).append(temperature)
+            if not len(block):
                 continue
-            if not n:
-                first_ns = last_ns = int(stamp_ns[0])
-            steps = np.diff(stamp_ns, prepend=last_ns)[not n :]
-            last_ns = int(stamp_ns[-1])
-            rising = steps[steps > 0]
-            n_backwards += len(steps) - len(rising)
-            if not step_ns and len(rising):
-                step_ns = float(np.median(rising))
-            gaps = rising[rising > _GAP_INTERVALS * step_ns]
-            n_gaps += len(gaps)
-            longest_gap = max(longest_gap, float(np.max(gaps, initial=0)) * 1e-9)
-            n += len(stamp_ns)
+            clock.add(block.accel_stamp_ns)
             rate = None if block.imu is None else block.imu.angular_velocity
-            cells.add(stamp_ns, block.accel, rate)
+            cells.add(block.accel_stamp_ns, block.accel, rate)
             causes.add(block)
             if progress is not None and total:
-                progress(n / total)
+                progress(clock.n / total)
         info, candidates = reader.info, unused_thermometers(reader)
+    n = clock.n
     reduced = cells.finish()
     still = still_intervals(reduced, _MIN_REST_S) if n > 1 else []
     cause = causes.cause(reduced, STILL_SD) if n > 1 else ''
-    found = ((name, survey_thermometer(own)) for name, own in readings.items())
-    thermometers = {name: one for name, one in found if one is not None}
+    surveys = ((name, survey_thermometer(parts)) for name, parts in readings.items())
+    thermometers = {name: one for name, one in surveys if one is not None}
     findings = [
         (info.truncated, f'cut off: {info.truncated}'),
         (reader.apart, 'a fit needs one clock for all'),
@@ -165,17 +154,17 @@ def survey_recording(
             n and not still and not cause,
             f'it never rests for 3 s, and a fit needs rests: {why_restless(reduced)}',
         ),
-        (n_backwards, f'{n_backwards} stamps do not rise: those samples are left out'),
-        (n_gaps, f'{n_gaps} gaps, the longest {longest_gap:.3g} s'),
+        (clock.n_backwards, f'{clock.n_backwards} stamps do not rise: those samples are left out'),
+        (clock.n_gaps, f'{clock.n_gaps} gaps, the longest {clock.longest_gap_s:.3g} s'),
     ]
-    duration_s = (last_ns - first_ns) * 1e-9
+    duration_s = (clock.last_ns - clock.first_ns) * 1e-9
     # The first and the last cell may extend beyond the samples.
     still_s = min(sum((upper - lower) * reduced.cell_s for lower, upper in still), duration_s)
     return Survey(
         info,
         n,
         duration_s,
-        1e9 / step_ns if step_ns else float('nan'),
+        1e9 / clock.step_ns if clock.step_ns else float('nan'),
         len(still),
         still_s,
         thermometers,
@@ -183,12 +172,39 @@ def survey_recording(
     )
 
 
+@dataclass
+class _Clock:
+    """The stamps so far: the usual interval, gaps, and stamps that do not rise."""
+
+    n: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    step_ns: float = 0.0
+    n_backwards: int = 0
+    n_gaps: int = 0
+    longest_gap_s: float = 0.0
+
+    def add(self, stamp_ns: Ints) -> None:
+        """Take the next stamps, at least one."""
+        if not self.n:
+            self.first_ns = self.last_ns = int(stamp_ns[0])
+        steps = np.diff(stamp_ns, prepend=self.last_ns)[not self.n :]
+        self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
+        rising = steps[steps > 0]
+        self.n_backwards += len(steps) - len(rising)
+        if not self.step_ns and len(rising):
+            self.step_ns = float(np.median(rising))
+        gaps = rising[rising > _GAP_INTERVALS * self.step_ns]
+        self.n_gaps += len(gaps)
+        self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
+
+
 def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:
     """Describe a thermometer by pieces of its readings; None without a finite reading."""
     if not readings:
         return None
-    stamp_ns = np.concatenate([one.stamp_ns for one in readings])
-    celsius = np.concatenate([one.celsius for one in readings])
+    stamp_ns = np.concatenate([reading.stamp_ns for reading in readings])
+    celsius = np.concatenate([reading.celsius for reading in readings])
     use = np.isfinite(celsius)
     stamp_ns, celsius = stamp_ns[use], celsius[use]
     if not len(celsius):

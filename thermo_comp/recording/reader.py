@@ -70,15 +70,15 @@ class RecordingReader(ExitStack):
         self.callback(self._files.clear)
         try:
             self.info = self._open(path)
-            self.definitions = {k: d for one in self._files for k, d in one.definitions.items()}
+            self.definitions = {k: d for file in self._files for k, d in file.definitions.items()}
             with translated(path):
-                found = select_topics(self.info.topics, topics, require, self.info.metadata)
-                self.topics: Mapping[Role, str] = found.topics
-                self.fields = dict(self._fields(found))
+                selected = select_topics(self.info.topics, topics, require, self.info.metadata)
+                self.topics: Mapping[Role, str] = selected.topics
+                self.fields = dict(self._fields(selected))
             bare = [role for role, one in self.fields.items() if not one.has_stamp]
             said = f'{", ".join(bare)} without a stamp: counts from the sample before it'
-            chosen = '; '.join(filter(None, (found.chosen, said if bare else '')))
-            self.info = replace(self.info, input=found.input, chosen=chosen or None)
+            chosen = '; '.join(filter(None, (selected.chosen, said if bare else '')))
+            self.info = replace(self.info, input=selected.input, chosen=chosen or None)
         except BaseException as error:
             self.close()
             if isinstance(error, OSError):
@@ -100,27 +100,27 @@ class RecordingReader(ExitStack):
 
     def _open(self, path: Path) -> RecordingInfo:
         """Open the files; files that rosbag2 has compressed are expanded to temporary files."""
-        found = _described(path)
+        described = _described(path)
         folder = ''
-        if found.compression == 'file':
+        if described.compression == 'file':
             folder = self.enter_context(TemporaryDirectory(prefix='thermo_comp-'))
-        notes = [found.note]
-        for name in found.files:
+        notes = [described.note]
+        for name in described.files:
             file = name
             if folder:
                 file = Path(folder, name.stem)
                 with translated(name):
                     notes.append(expand(name, file))
-            is_packed = found.compression == 'message'
+            is_packed = described.compression == 'message'
             one: McapFile | ForeignFile
-            if found.storage == 'mcap' and not is_packed:
+            if described.storage == 'mcap' and not is_packed:
                 one = McapFile(file, name)
             else:
                 one = ForeignFile(file, name, is_packed=is_packed)
             self.callback(one.close)
             self._files.append(one)
             if one.truncated is not None:
-                front = f'{name.name}: ' if len(found.files) > 1 else ''
+                front = f'{name.name}: ' if len(described.files) > 1 else ''
                 notes.append(front + one.truncated)
         channels: dict[str, list[Topic]] = {}
         for topic in (topic for one in self._files for topic in one.topics.values()):
@@ -129,7 +129,7 @@ class RecordingReader(ExitStack):
             name: (' | '.join(dict.fromkeys(o.type for o in own)), sum(o.n_messages for o in own))
             for name, own in channels.items()
         }
-        for wanted, n_promised in found.counts.items():
+        for wanted, n_promised in described.counts.items():
             notes.append(_loss(wanted, topics.get(wanted, ('', 0))[1], n_promised))
         return RecordingInfo(
             path,
@@ -138,7 +138,7 @@ class RecordingReader(ExitStack):
             min((f.start_ns for f in self._files if f.start_ns is not None), default=0),
             max((f.end_ns for f in self._files if f.end_ns is not None), default=0),
             '; '.join(filter(None, notes)) or None,
-            dict(ChainMap(*(f.metadata for f in self._files[::-1]), found.custom)),
+            dict(ChainMap(*(f.metadata for f in self._files[::-1]), described.custom)),
         )
 
     def blocks(self, *, raw: bool = False) -> Iterator[Block]:
@@ -149,14 +149,14 @@ class RecordingReader(ExitStack):
         def decoded() -> Iterator[Block]:
             for path, topics, messages in self._read(set(self.topics.values()), {'cdr', 'ros1'}):
                 feeds = [
-                    Feed(number, role, one, self.fields.get(role))
+                    Feed(number, role, topic, self.fields.get(role))
                     for role, name in self.topics.items()
-                    for number, one in topics.items()
-                    if one.name == name
+                    for number, topic in topics.items()
+                    if topic.name == name
                 ]
                 with translated(path):
-                    found = decode_blocks(messages, feeds, self.topics, keep_raw=raw)
-                yield from found
+                    blocks = decode_blocks(messages, feeds, self.topics, keep_raw=raw)
+                yield from blocks
 
         n_read = dict.fromkeys(self.topics, 0)
         last_ns = NO_STAMP_NS
@@ -172,13 +172,13 @@ class RecordingReader(ExitStack):
         for role, topic in self.topics.items():
             loss = _loss(topic, n_read[role], self.info.topics[topic][1])
             if loss and loss not in (self.info.truncated or ''):
-                told = '; '.join(filter(None, (self.info.truncated, loss)))
-                self.info = replace(self.info, truncated=told)
+                losses = '; '.join(filter(None, (self.info.truncated, loss)))
+                self.info = replace(self.info, truncated=losses)
 
     def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
         """Read serialized messages of topics (the bag's names), roughly in log-time order."""
-        for _, own, messages in self._read(topics, {'cdr'}):
-            for number, topic in own.items():
+        for _, channels, messages in self._read(topics, {'cdr'}):
+            for number, topic in channels.items():
                 if len(one := messages.of_channels([number])):
                     yield topic, one.packed()
 
@@ -189,14 +189,14 @@ class RecordingReader(ExitStack):
         if not self._files:
             raise RecordingError('the recording is closed', self.info.path)
         for file in self._files:
-            own = {number: one for number, one in file.topics.items() if one.name in names}
-            for topic in own.values():
+            channels = {number: one for number, one in file.topics.items() if one.name in names}
+            for topic in channels.values():
                 if topic.encoding not in encodings:
                     reason = f'its messages are encoded as {shown(topic.encoding)!r}, expected cdr'
                     raise RecordingError(reason, file.path, shown(topic.name))
             with translated(file.path, is_foreign=isinstance(file, ForeignFile)):
-                for messages in file.read(own) if own else ():
-                    yield file.path, own, messages
+                for messages in file.read(channels) if channels else ():
+                    yield file.path, channels, messages
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
         """Read the bag without the jumps of its clock, for uses that need a grid over time."""
@@ -217,7 +217,7 @@ class RecordingReader(ExitStack):
                 first_ns = int(block.accel_stamp_ns[0]) if first_ns == inf else first_ns
             begin, end = self._part.limits_ns(first_ns)
             left = block.take(
-                {role: (own >= begin) & (own < end) for role, own in block.stamp_ns.items()}
+                {role: (ns >= begin) & (ns < end) for role, ns in block.stamp_ns.items()}
             )
             if len(left) and not n_kept:
                 self.since_s = (int(left.accel_stamp_ns[0]) - first_ns) * 1e-9
@@ -261,7 +261,7 @@ def _described(path: Path) -> _Description:
         for suffix in ('.mcap', '.db3'):
             files = [one for one in path.iterdir() if one.suffix == suffix and one.is_file()]
             if files:
-                if len({re.sub(r'_[0-9]+$', '', one.stem) for one in files}) > 1:
+                if len({re.sub(r'_[0-9]+$', '', file.stem) for file in files}) > 1:
                     raise RecordingError(
                         f'a folder of {len(files)} bags, not a bag: give *{suffix} in it', path
                     )

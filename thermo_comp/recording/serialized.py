@@ -103,9 +103,9 @@ def join_messages(pieces: Sequence[Messages]) -> Messages:
     """Concatenate pieces of messages, at least one piece."""
     if len(pieces) == 1:
         return pieces[0]
-    begins = np.cumsum([0, *(len(one.data) for one in pieces)])
+    begins = np.cumsum([0, *(len(piece.data) for piece in pieces)])
     return Messages(
-        np.concatenate([one.data for one in pieces]),
+        np.concatenate([piece.data for piece in pieces]),
         np.concatenate([one.start + at for one, at in zip(pieces, begins, strict=False)]),
-        *(np.concatenate([getattr(one, n) for one in pieces]) for n in Messages.__slots__[2:]),
+        *(np.concatenate([getattr(piece, n) for piece in pieces]) for n in Messages.__slots__[2:]),
     )

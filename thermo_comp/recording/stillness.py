@@ -131,8 +131,8 @@ class CellAccumulator:
             self._sums = [np.empty((0, 15 if rate is None else 21))]
         self._last_ns = int(stamp_ns[-1])
         if self._n_looked_at < _QUANTUM_SAMPLES:
-            found = _quantum_of(samples[: _QUANTUM_SAMPLES - self._n_looked_at])
-            self._quantum = np.where(self._quantum > 0.0, self._quantum, found)
+            quantum = _quantum_of(samples[: _QUANTUM_SAMPLES - self._n_looked_at])
+            self._quantum = np.where(self._quantum > 0.0, self._quantum, quantum)
             self._n_looked_at += len(samples)
         if self._is_integer:
             self._is_integer = bool((samples == np.rint(samples)).all())

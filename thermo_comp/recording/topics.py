@@ -44,7 +44,7 @@ Present = Mapping[str, tuple[str, int]]
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """From `begin` to before `end`: seconds since the bag's first sample; from 1e8 stamps."""
+    """From `begin` to before `end`: seconds since the first sample, or stamps, from 1e8 on."""
 
     begin: float | None = None
     end: float | None = None
@@ -64,7 +64,7 @@ class Part:
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
 
     def limits_ns(self, first_ns: float) -> tuple[float, float]:
-        """Return begin and end as stamps; `first_ns` is the first sample's, inf before it."""
+        """Return begin and end as stamps; `first_ns`: stamp of the first sample, inf before it."""
         origin = 0 if self.is_stamped else first_ns
         begin = -inf if self.begin is None else origin + round(self.begin * 1e9)
         return begin, inf if self.end is None else origin + round(self.end * 1e9)
@@ -108,15 +108,15 @@ class Topics:
         for name, topic in names.items():
             if name == 'output':  # of the node
                 continue
-            own = name.removeprefix('temperature/')
+            role = name.removeprefix('temperature/')
             if not topic.strip('/'):
                 raise ValueError(f'`{name}` needs the name of a topic')
-            if ':' in topic and own in ('counts', 'imu'):
+            if ':' in topic and role in ('counts', 'imu'):
                 raise ValueError(f'`{name}` takes whole messages, got the field {topic}')
-            if own in _TYPES and (own == name or _TYPES[own] == TEMPERATURE):
-                roles[own] = topic
-            elif own != name and is_thermometer(own):
-                further[own] = topic
+            if role in _TYPES and (role == name or _TYPES[role] == TEMPERATURE):
+                roles[role] = topic
+            elif role != name and is_thermometer(role):
+                further[role] = topic
             else:
                 raise ValueError(
                     f'`{name}` is not an input; expected {", ".join(_TYPES)} or temperature/NAME'
@@ -141,10 +141,10 @@ class Selected(NamedTuple):
 
 def read_names(path: str | Path) -> dict[str, str]:
     """Read a file of ``INPUT: TOPIC`` lines, as in config/drivers."""
-    found = read_plain_yaml(path)
-    if not isinstance(found, dict) or not all(isinstance(one, str) for one in found.values()):
+    names = read_plain_yaml(path)
+    if not isinstance(names, dict) or not all(isinstance(one, str) for one in names.values()):
         raise ThermoCompError('expected lines of INPUT: TOPIC', path)
-    return found
+    return names
 
 
 def parse_name(text: str) -> tuple[str, str]:
@@ -191,7 +191,7 @@ def select_topics(
     """
     if require and not any(count for _, count in present.values()):
         raise RecordingError('the bag holds no messages')
-    found: dict[Role, str] = {}
+    name_of: dict[Role, str] = {}
     keys: dict[Role, str] = {}
     own = _corrected(present, metadata)
     inputs = ['counts', 'imu'] if topics.input == 'auto' else [topics.input]
@@ -201,7 +201,7 @@ def select_topics(
         if key:
             name = _of_type(present, names[key], _TYPES[key], getattr(topics, key))
             if present[name][1]:
-                found[role], keys[role] = name, key
+                name_of[role], keys[role] = name, key
             elif role in require:
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
@@ -209,20 +209,22 @@ def select_topics(
     among = ["driver's", 'only']  # chosen by the name that drivers use, or as the only one
     chosen = [
         said_choice(
-            found[role], key, getattr(topics, key), among[not is_called(found[role], _RAW)]
+            name_of[role], key, getattr(topics, key), among[not is_called(name_of[role], _RAW)]
         )
         for role, key in keys.items()
     ]
-    if own and 'accel' not in found:
-        chosen.append(_said_own(own))
-    found |= _further(present, topics, found, is_read=bool(require))
+    if own and 'accel' not in name_of:
+        chosen.append(_said_corrected(own))
+    name_of |= _further(present, topics, name_of, is_read=bool(require))
     named = {**topics.further, 'board': topics.board, 'case': topics.case}
-    fields = {role: split_field(named.get(role, ''))[1] for role in found if role != 'accel'}
-    fields = {role: one or PLAIN.get(present[found[role]][0], '') for role, one in fields.items()}
+    fields = {role: split_field(named.get(role, ''))[1] for role in name_of if role != 'accel'}
+    fields = {
+        role: one or PLAIN.get(present[name_of[role]][0], '') for role, one in fields.items()
+    }
     fields = {role: one for role, one in fields.items() if one}
-    _check_twins(found, fields)
+    _check_twins(name_of, fields)
     said = '; '.join(filter(None, chosen)) or None
-    return Selected(found, fields, cast(Any, keys.get('accel')), said)
+    return Selected(name_of, fields, cast(Any, keys.get('accel')), said)
 
 
 def _check_twins(found: Mapping[Role, str], fields: Mapping[Role, str]) -> None:
@@ -234,7 +236,7 @@ def _check_twins(found: Mapping[Role, str], fields: Mapping[Role, str]) -> None:
 
 
 def _candidates(
-    present: Present, topics: Topics, keys: Sequence[str], own: str
+    present: Present, topics: Topics, keys: Sequence[str], corrected: str
 ) -> Iterator[tuple[str, str]]:
     """Yield candidates for an input: by name, by REP 145, by type; an Imu before counts."""
     for key in keys:
@@ -252,7 +254,7 @@ def _candidates(
             for name, (kind, count) in present.items()
             if count
             and kind == _TYPES[key]
-            and name != own
+            and name != corrected
             and not any(is_called(name, other) for other in taken)
         ]
         raw = [name for name in of_type if is_called(name, _RAW)]
@@ -262,7 +264,7 @@ def _candidates(
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
-            return  # several candidates: none is chosen
+            return  # several Imu topics could be meant: none is chosen
 
 
 def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
@@ -275,7 +277,7 @@ def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
     return ''
 
 
-def _said_own(name: str) -> str:
+def _said_corrected(name: str) -> str:
     return f'{shown(name)} is corrected already: thermo_comp wrote it, it is not an input'
 
 
@@ -284,21 +286,21 @@ def _further(
 ) -> dict[str, str]:
     """Find the further thermometers: those named, and those beside the board's or the case's."""
     both = {}
-    for own, wanted in topics.further.items():
-        name = _match(present, wanted, thermometer(own))
+    for sensor, wanted in topics.further.items():
+        name = _match(present, wanted, thermometer(sensor))
         if name is not None:
-            both[own] = _of_type(present, name, TEMPERATURE, wanted)
+            both[sensor] = _of_type(present, name, TEMPERATURE, wanted)
         elif is_read:
-            raise _missing(present, {thermometer(own): wanted})
+            raise _missing(present, {thermometer(sensor): wanted})
     beside = found.get('board') or found.get('case') or ''
     namespace, is_usual, _ = beside.rpartition('temperature/')
     front = f'{namespace}temperature/' if is_usual else '/temperature/'
     taken = {*found.values(), *both.values()}
     for name, (kind, count) in present.items():
-        own = name.removeprefix(front)
-        is_beside = kind == TEMPERATURE and count and own != name and name not in taken
-        if is_beside and is_thermometer(own):
-            both.setdefault(own, name)
+        sensor = name.removeprefix(front)
+        is_beside = kind == TEMPERATURE and count and sensor != name and name not in taken
+        if is_beside and is_thermometer(sensor):
+            both.setdefault(sensor, name)
     return dict(sorted(both.items()))
 
 
@@ -332,13 +334,13 @@ def _match(present: Present, wanted: str, key: str) -> str | None:
     return spaced[0] if spaced else None
 
 
-def _missing(present: Present, wanted: Mapping[str, str], own: str = '') -> RecordingError:
+def _missing(present: Present, wanted: Mapping[str, str], corrected: str = '') -> RecordingError:
     names = sorted(present)[:_MAX_LISTED]
     listed = ', '.join(f'{shown(name)} ({shown(present[name][0])})' for name in names)
     if len(present) > len(names):
         listed += f' and {len(present) - len(names)} more'
-    if own and not {'counts', 'imu'}.isdisjoint(wanted):
-        listed += f'; {_said_own(own)}'
+    if corrected and not {'counts', 'imu'}.isdisjoint(wanted):
+        listed += f'; {_said_corrected(corrected)}'
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
     return RecordingError(
         f'no such topic; the bag has {listed}; name another with {option}',

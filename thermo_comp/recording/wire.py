@@ -14,8 +14,6 @@ Only `frame_id` makes the size vary: messages of equal layout are gathered as ro
 stamps and numbers as views. ROS 1 messages are converted by `rosbags`, one by one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
 from struct import pack
@@ -67,15 +65,15 @@ def decode_blocks(
         kind = TEMPERATURE if role != 'accel' else IMU if is_imu else VECTOR3_STAMPED
         channels = {feed.channel: feed.topic for feed in feeds if feed.role == role}
         rank = messages.places_of(channels)
-        own = messages.take(rank)
+        taken = messages.take(rank)
         try:
             if len({topic[:3] for topic in channels.values()}) > 1:
                 raise RecordingError('its messages have several encodings')
             if role in topics and topics[role].encoding == 'ros1':
-                own = as_cdr(own, topics[role].type)
+                taken = as_cdr(taken, topics[role].type)
             if role in fields:
-                own = _as_temperatures(own, *fields[role].read(own))
-            stamp_ns, numbers, frame = decode_stamped(own, kind)
+                taken = _as_temperatures(taken, *fields[role].read(taken))
+            stamp_ns, numbers, frame = decode_stamped(taken, kind)
         except RecordingError as error:
             raise RecordingError(error.message, key=shown(topics[role].name)) from error
         if role == 'accel':
@@ -91,9 +89,9 @@ def decode_blocks(
         else:
             after = np.searchsorted(accel, rank).astype(np.int64)
             temperatures[role] = Readings(stamp_ns, numbers[:, 0], after)
-        log_ns[role] = own.log_ns
-        if keep_raw and len(own):
-            raw[role] = own.packed()
+        log_ns[role] = taken.log_ns
+        if keep_raw and len(taken):
+            raw[role] = taken.packed()
     return [
         Block(
             samples_ns,
@@ -130,13 +128,13 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
     # Usually all have the same length, byte order and frame length.
     for key in (size, number_at(rows, 0, 'u2'), number_at(rows, 12, 'u4')):
         if (key != key[0]).any():
-            found = np.empty(n, np.int64), np.empty((n, n_numbers)), np.empty(n, object)
+            columns = np.empty(n, np.int64), np.empty((n, n_numbers)), np.empty(n, object)
             order = np.argsort(key, kind='stable')
-            for own in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
-                parts = decode_stamped(messages.take(own), kind)
-                for column, part in zip(found, parts, strict=True):
-                    column[own] = part
-            return found
+            for alike in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+                parts = decode_stamped(messages.take(alike), kind)
+                for column, part in zip(columns, parts, strict=True):
+                    column[alike] = part
+            return columns
     representation = int(number_at(rows, 0, '>u2')[0])
     if representation > 1:
         raise RecordingError(
@@ -192,7 +190,7 @@ def as_cdr(messages: Messages, kind: str) -> Messages:
     """Convert ROS 1 messages to CDR; RecordingError for invalid bytes."""
     convert = typestore().ros1_to_cdr
     try:
-        pieces = [bytes(convert(one, kind)) for one in messages]
+        pieces = [bytes(convert(message, kind)) for message in messages]
     except Exception as error:  # damaged bytes surface there as nearly any exception type
         raise _misfit(kind) from error
     return Messages.of(pieces, messages.channel, messages.log_ns)

@@ -8,8 +8,6 @@ The target's name appears only when `BagWriter.close` has succeeded; if writing 
 output stays.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -224,7 +222,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         if len(messages):
             channel = np.full_like(messages.channel, number)
             self._batches.append(replace(messages, channel=channel))
-            if sum(len(one.data) for one in self._batches) > _AUTO_FLUSH_BYTES:
+            if sum(len(batch.data) for batch in self._batches) > _AUTO_FLUSH_BYTES:
                 self.flush()
 
     @contextmanager

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the parts of a certificate after ISO/IEC 17025: results, budget, conformity."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -145,13 +143,13 @@ def results(
             'µrad',
         ),
     }
-    found = [
+    rows = [
         Result(name.format(part), *rounded(float(value), float(known * sd)), of)
         for name, (parts, values, sds, of) in said.items()
         for part, value, sd in zip(parts, values, sds, strict=True)
     ]
     for term in nonlinear_coefficients(calibration):
-        found += [
+        rows += [
             Result(f'{term.name} {axis}', *rounded(value, known * sd), term.unit)
             for axis, value, sd in zip(AXES, term.value.tolist(), term.sd.tolist(), strict=True)
         ]
@@ -163,8 +161,8 @@ def results(
                 is_known = known > 0.0 and unclaimed_gravity_sd(evidence, info) is not None
                 mean_ug = one.mean / MICRO_G
                 texts = rounded(mean_ug, expanded_ug) if is_known else (number(mean_ug), '–')
-                found.append(Result(f'mean of |f| − g, {name}', *texts, 'µg'))
-    return found
+                rows.append(Result(f'mean of |f| − g, {name}', *texts, 'µg'))
+    return rows
 
 
 def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOverTemperature]:
@@ -175,7 +173,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
     known = COVERAGE if calibration.has_uncertainty else np.nan
     slope = slopes(curves(calibration)[0])
     bias_0, *_ = in_a_soak(calibration)
-    found = [
+    tables = [
         AxisOverTemperature(axis, float(slope[k]), float(slope[k + 3]), [])
         for k, axis in enumerate(AXES)
     ]
@@ -185,7 +183,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        for k, table in enumerate(found):
+        for k, table in enumerate(tables):
             for row in range(len(at)):
                 cells: list[str] = []
                 for column in (k, k + 3):
@@ -198,7 +196,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
                         cells += number(both[0], 4), '–', number(both[1], 4)
                 celsius = minus(f'{at[row]:.1f}')
                 table.rows.append(StateResult(program.name, celsius, *cells))
-    return found
+    return tables
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:

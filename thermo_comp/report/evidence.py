@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the data of a report of a fit, of bags, or of a calibration; nothing is drawn here."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -84,7 +82,7 @@ class Evidence:
 
     @property
     def is_seen(self) -> bool:
-        """Whether the calibration was fitted on one of these bags."""
+        """Whether the calibration was fitted on a bag of this evidence."""
         known = {source.sha256 for source in self.sources if source.sha256}
         return bool(self.steps) or any(bag.source.sha256 in known for bag in self.bags)
 
@@ -245,7 +243,7 @@ def evidence_of_bags(
 
 def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
     """Collect the results of a fit on its bags; `gravity_sd` as given to the fit [m/s^2]."""
-    found = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
+    rests = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
     left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
     against = [f'{one.name}: {one.message}' for one in result.findings if _is_reservation(one)]
     window_s = usual_window(result.bags)
@@ -254,7 +252,7 @@ def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
         judged,
         steps=result.residuals,
         gravity_sd=gravity_sd,
-        left_out={k: left_out[one] for k, one in enumerate(found) if left_out.get(one, 0.0) > 0.0},
+        left_out={k: left_out[one] for k, one in enumerate(rests) if left_out.get(one, 0.0) > 0.0},
         findings=tuple(dict.fromkeys((*judged.findings, *against))),
         checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
     )
@@ -268,7 +266,7 @@ def _is_reservation(finding: Finding) -> bool:
 def _against(calibration: Calibration) -> tuple[str, ...]:
     """List the reservations about a calibration itself, except the advice of more positions."""
     lower, upper = calibration.dynamic.rate_range_k_min
-    found = [
+    notes = [
         f'the bags hold no {name}: the dynamic set is extrapolated there'
         for name, rate in (('heating', upper), ('cooling', -lower))
         if rate < _SLOWEST_RAMP_K_MIN
@@ -276,11 +274,11 @@ def _against(calibration: Calibration) -> tuple[str, ...]:
     for one in calibration.provenance.residuals:
         left_out = one.left_out_rms_m_s2
         if one.section == 'all' and left_out is not None and left_out >= one.raw_rms_m_s2:
-            found.append(
+            notes.append(
                 f'on positions left out {spoken(left_out)} are no better than '
                 f'{spoken(one.raw_rms_m_s2)} raw: the positions do not predict a new attitude'
             )
     if not calibration.has_uncertainty:
-        found.append('the calibration states no uncertainty')
-    found += [note for note in calibration.provenance.notes if not note.startswith('positions: ')]
-    return tuple(dict.fromkeys(found))
+        notes.append('the calibration states no uncertainty')
+    notes += [note for note in calibration.provenance.notes if not note.startswith('positions: ')]
+    return tuple(dict.fromkeys(notes))

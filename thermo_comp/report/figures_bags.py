@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the figures of bags: over time, like the paper's Fig. 3, 4, 6 and 7, and by position."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -88,9 +86,9 @@ def draw_residuals(evidence: Evidence) -> Figure:
         axes.locator_params(axis='y', nbins=5)
         if rung != RAW:
             _symmetric(axes, residual[rows])
-        found = statistics_by_regime(residual[rows], dynamic)
-        del found['all']
-        parts = [f'{name} {number(one.rms / MICRO_G)}' for name, one in found.items() if one.n]
+        stats = statistics_by_regime(residual[rows], dynamic)
+        del stats['all']
+        parts = [f'{name} {number(one.rms / MICRO_G)}' for name, one in stats.items() if one.n]
         title = f'{rung}: RMS {", ".join(parts)} µg'
         if axes is panels[0]:
             style.legend_above(axes, title)
@@ -127,11 +125,11 @@ def _panels(
     figure = style.new_figure(more + sum(heights))
     panels = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)[:, 0]
     spans: list[tuple[float, float]] = []
-    for one in shown.stretches:
-        if one.regime == Regime.DYNAMIC:
+    for stretch in shown.stretches:
+        if stretch.regime == Regime.DYNAMIC:
             # Join heating and cooling that follow each other: no bright line between the spans.
-            start = spans.pop()[0] if spans and spans[-1][1] == one.start else one.start
-            spans.append((start, one.stop))
+            start = spans.pop()[0] if spans and spans[-1][1] == stretch.start else stretch.start
+            spans.append((start, stretch.stop))
     for axes in panels[:-1] if is_flagged else panels:
         for start, stop in spans:
             axes.axvspan(start / unit, stop / unit, color=_SHADE, lw=0, zorder=0)
@@ -171,18 +169,18 @@ def _drift(evidence: Evidence) -> tuple[Floats, str]:
 def _draw_flag(axes: Axes, shown: ShownBag, unit: float) -> None:
     times: list[float] = []
     levels: list[float] = []
-    for one in shown.stretches:
-        span = [one.start / unit, one.stop / unit]
-        if one.regime == Regime.UNKNOWN:
+    for stretch in shown.stretches:
+        span = [stretch.start / unit, stretch.stop / unit]
+        if stretch.regime == Regime.UNKNOWN:
             axes.axvspan(*span, fill=False, hatch='---', edgecolor='#999999', lw=0)
             continue
-        level = float(one.direction if one.regime == Regime.DYNAMIC else 0)
+        level = float(stretch.direction if stretch.regime == Regime.DYNAMIC else 0)
         times += span
         levels += [level, level]
-        if one.regime == Regime.DYNAMIC:
-            hatch = {1: '////', -1: '\\\\\\\\', 0: 'xxxx'}[one.direction]
+        if stretch.regime == Regime.DYNAMIC:
+            hatch = {1: '////', -1: '\\\\\\\\', 0: 'xxxx'}[stretch.direction]
             look: Any = {'facecolor': _SHADE, 'edgecolor': '#777777', 'hatch': hatch, 'lw': 0}
-            axes.fill_between(span, [one.direction or 1.0] * 2, **look)
+            axes.fill_between(span, [stretch.direction or 1.0] * 2, **look)
     axes.plot(times, levels, color='black', linewidth=1.3)
     axes.set_ylim(-1.35, 1.35)
     axes.set_yticks([-1, 0, 1], ['S = 1, cooling', 'S = 0, static', 'S = 1, heating'])

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the typography of pages and figures, and the HTML, which can neither run nor load code."""
 
-from __future__ import annotations
-
 import datetime as dt
 import math
 import re

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the report as files, a page and PNGs, and the list of its figures with their texts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -93,7 +91,7 @@ def render_report(
         is_simulated=evidence.is_simulated,
         info=info,
         evidence=evidence,
-        bags=[(one, *span_of(one), remarks_of(one)) for one in evidence.bags],
+        bags=[(bag, *span_of(bag), remarks_of(bag)) for bag in evidence.bags],
         seen=_seen(evidence),
         tested=info.dates.test or _test_dates(evidence),
         results=results(evidence, info, contributions),
@@ -151,7 +149,7 @@ def _seen(evidence: Evidence) -> list[str]:
             f'{evidence.positions_text} in {which}, {np.min(board):.1f} to {np.max(board):.1f} °C.'
         )
     shown = evidence.shown
-    if shown is not None and all(one.regime == Regime.UNKNOWN for one in shown.stretches):
+    if shown is not None and all(stretch.regime == Regime.UNKNOWN for stretch in shown.stretches):
         said.append('The regime was never known: the bag is too short for the detector.')
     return said
 
@@ -160,7 +158,7 @@ def _programs(evidence: Evidence) -> str:
     """Name the soak and the ramps of the table over temperature."""
     if evidence.calibration is None:
         return ''
-    return ', '.join(one.label for one in programs(evidence.calibration))
+    return ', '.join(program.label for program in programs(evidence.calibration))
 
 
 def _test_dates(evidence: Evidence) -> str:
@@ -175,8 +173,8 @@ def drawn_figures(figures: Sequence[ReportFigure]) -> list[tuple[ReportFigure, s
     """Draw figures for a page, as SVG."""
     with drawing():
         return [
-            (one, svg(one.draw(), f'f{number}', one.question))
-            for number, one in enumerate(figures, 1)
+            (figure, svg(figure.draw(), f'f{number}', figure.question))
+            for number, figure in enumerate(figures, 1)
         ]
 
 

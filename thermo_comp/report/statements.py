@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the statements of a laboratory on a certificate, and the reading of their file."""
 
-from __future__ import annotations
-
 import datetime as dt
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +9,8 @@ from typing import Annotated
 
 from ..errors import ThermoCompError
 from ..plain_yaml import read_plain_yaml
-from ..quantities import Bounds
-from ..unit.schema import NotNegative, SchemaError, build
+from ..quantities import Bounds, NotNegative
+from ..unit.schema import SchemaError, build
 
 Text = Annotated[str, Bounds(longest=500)]
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns bias and scale of a calibration over temperature, in a soak and in ramps, with their sd."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -50,12 +48,12 @@ class Curve(NamedTuple):
 def programs(calibration: Calibration) -> list[Program]:
     """List a soak and, where they differ from it, ramps at half of the fastest rate calibrated."""
     static, dynamic = calibration.regime_sets()
-    found = [Program('soak', static, 0.0)]
+    result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:
         cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
         ramps = (Program('heating', dynamic, heating), Program('cooling', dynamic, cooling))
-        found += [one for one in ramps if one.rate_k_min]
-    return found
+        result += [ramp for ramp in ramps if ramp.rate_k_min]
+    return result
 
 
 def evaluate(calibration: Calibration, program: Program, temperature: Floats) -> Curve:
@@ -75,8 +73,8 @@ def evaluate(calibration: Calibration, program: Program, temperature: Floats) ->
 def curves(calibration: Calibration) -> list[Curve]:
     """Evaluate each program over the whole range of its set."""
     return [
-        evaluate(calibration, one, np.linspace(*one.regime.temperature_range_c, _N_CURVE))
-        for one in programs(calibration)
+        evaluate(calibration, program, np.linspace(*program.regime.temperature_range_c, _N_CURVE))
+        for program in programs(calibration)
     ]
 
 

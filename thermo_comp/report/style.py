@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the look of the figures: lines differ by their dashes, and by colours of Okabe and Ito."""
 
-from __future__ import annotations
-
 import io
 import re
 from contextlib import AbstractContextManager
@@ -86,7 +84,7 @@ def svg(figure: Figure, name: str, label: str) -> str:
     figure.savefig(buffer, format='svg', metadata=nothing)
     text = re.sub(r'>\s+<', '><', buffer.getvalue().replace('xlink:', ''))
     text = re.sub(r'\b(id="|href="#|url\(#)', rf'\g<1>{name}-', text)
-    # Two decimals are a hundredth of a point.
+    # Coordinates with two decimals, a hundredth of a point, keep the file small.
     text = re.sub(r' d="[^"]*"', lambda path: re.sub(r'(\.\d\d)\d+|\n', r'\1', path[0]), text)
     about = f'role="img" aria-label="{escape(label)}"'
     return text[text.index('<svg') :].replace('<svg', f'<svg {about}', 1).strip()
@@ -118,11 +116,11 @@ def broken(time: Floats, value: Floats, position: Ints) -> tuple[Floats, Floats]
     return np.insert(time, at, time[at - 1]), np.insert(value, at, np.nan, axis=0)
 
 
-def legend_above(axes: Axes, title: str | None = None, *, share: float = 1.0) -> None:
-    """Put the legend above axes with a `share` of the width, in as many columns as fit."""
+def legend_above(axes: Axes, title: str | None = None) -> None:
+    """Put the legend above axes, in as many columns as fit."""
     if labels := axes.get_legend_handles_labels()[1]:
         # Width of a legend entry: its label, and a handle as wide as eight letters.
-        n = min(max(1, int(share * 100 / (8 + max(map(len, labels))))), len(labels))
+        n = min(max(1, int(100 / (8 + max(map(len, labels))))), len(labels))
         look: Line = {'ncols': n, 'title': title, 'alignment': 'left'}
         axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.01), **look)
 

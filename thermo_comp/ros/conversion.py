@@ -9,8 +9,6 @@ its final NUL, the string, and, at the next multiple of 8 from the end of the en
 float64 values. A message in any other form is first converted to this form by rclpy.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -58,8 +56,8 @@ class SampleConverter:
     def __init__(self, kind: Any, frame_id: str = '', traffic: Traffic | None = None) -> None:
         self._kind, self._frame_id = kind, frame_id
         self.traffic = traffic or Traffic()
-        # Last layout of input message: frame, struct to unpack it, offset of the bytes passed on.
-        # Imu: frame and struct to pack it.
+        # Layout of the last input message: frame, offset of the bytes passed on, struct to unpack.
+        # Layout of the Imu that is written: frame, struct to pack.
         self._name, self._passed, self._frame = b'', 0, b''
         self._unpack: Callable[[bytes], tuple[Any, ...]] = struct.Struct('').unpack
         self._pack: Callable[..., bytes] = struct.Struct('').pack

@@ -7,8 +7,6 @@ ERROR: no valid output, or samples are saturated. WARN: the output is worse than
 states. The message names every reason, the worst first; the values hold the figures.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterable, Iterator
@@ -180,26 +178,33 @@ class Reporter:
         rate: float | None,
     ) -> dict[str, str]:
         """List the figures, the most important first."""
-        calibration, state, gravity = loaded.calibration, status.state, status.gravity
-        values = {'regime': status.regime.name.lower()}
-        if state:
-            values |= {
-                'direction': _DIRECTIONS[status.direction],
-                'dynamic weight': f'{state[WEIGHT]:.3f}',
-                'board temperature [degC]': f'{state[BOARD]:.4f}',
-                'board temperature sd [K]': f'{math.sqrt(state[VAR_BOARD]):.4f}',
-                'board rate [K/min]': f'{60.0 * state[RATE]:.4f}',
-                'case minus board [K]': f'{state[GRADIENT]:.4f}',
-                'memory settled': str(status.is_settled),
-            }
-        values |= {
-            'board age [s]': f'{status.board_age_s:.3f}',
-            'case age [s]': f'{status.case_age_s:.3f}',
-            **{f'{name} fault': fault.value for name, (fault, _) in status.faults.items()},
-            'gradient excess [K]': f'{status.excess.gradient:.3f}',
-            'temperature excess [K]': f'{status.excess.temperature:.3f}',
-            'rate excess [K/min]': f'{60.0 * status.excess.rate:.3f}',
+        calibration = loaded.calibration
+        return {
+            **_thermal_values(status),
+            **self._force_values(calibration, status),
+            'sample rate [Hz]': 'unknown' if rate is None else f'{rate:.2f}',
+            'calibrated rate [Hz]': f'{1.0 / calibration.unit.cycle_time_s:.2f}',
+            'samples in': str(counts['n_in']),
+            'samples out': str(counts['n_out'] - counts['n_unpublished']),
+            **{
+                name.removeprefix('n_').replace('_', ' '): str(n)
+                for name, n in counts.items()
+                if name not in ('n_in', 'n_out')
+            },
+            **{
+                f'{name} publishers': str(one.count_publishers())
+                for name, one in self._relay.inputs.items()
+            },
+            'sample stamp [ns]': str(status.stamp_ns).lower(),
+            'serial': calibration.unit.serial,
+            'calibration file': loaded.path,
+            'calibration sha256': loaded.sha256,
+            'calibration date': calibration.provenance.created,
         }
+
+    def _force_values(self, calibration: Calibration, status: CompensatorStatus) -> dict[str, str]:
+        """List what concerns the samples: |f|, rests, noise and uncertainty of each axis."""
+        values, gravity = {}, status.gravity
         if calibration.nonlinearity is not None:
             values['force excess [m/s^2]'] = f'{self._force_excess(calibration):.3f}'
         if gravity is not None:
@@ -226,28 +231,30 @@ class Reporter:
         if gyroscope:
             densities = gyroscope.noise_density_rad_s_sqrt_hz
             values |= _of_axes('noise density of rate {} [rad/s/sqrt(Hz)]', densities)
-        values |= _of_axes('bias sd of rate {} [rad/s]', status.rate_bias_sd)
-        return {
-            **values,
-            'sample rate [Hz]': 'unknown' if rate is None else f'{rate:.2f}',
-            'calibrated rate [Hz]': f'{1.0 / calibration.unit.cycle_time_s:.2f}',
-            'samples in': str(counts['n_in']),
-            'samples out': str(counts['n_out'] - counts['n_unpublished']),
-            **{
-                name.removeprefix('n_').replace('_', ' '): str(n)
-                for name, n in counts.items()
-                if name not in ('n_in', 'n_out')
-            },
-            **{
-                f'{name} publishers': str(one.count_publishers())
-                for name, one in self._relay.inputs.items()
-            },
-            'sample stamp [ns]': str(status.stamp_ns).lower(),
-            'serial': calibration.unit.serial,
-            'calibration file': loaded.path,
-            'calibration sha256': loaded.sha256,
-            'calibration date': calibration.provenance.created,
+        return values | _of_axes('bias sd of rate {} [rad/s]', status.rate_bias_sd)
+
+
+def _thermal_values(status: CompensatorStatus) -> dict[str, str]:
+    """List regime, temperatures, their faults, and distances outside the calibrated ranges."""
+    values, state = {'regime': status.regime.name.lower()}, status.state
+    if state:
+        values |= {
+            'direction': _DIRECTIONS[status.direction],
+            'dynamic weight': f'{state[WEIGHT]:.3f}',
+            'board temperature [degC]': f'{state[BOARD]:.4f}',
+            'board temperature sd [K]': f'{math.sqrt(state[VAR_BOARD]):.4f}',
+            'board rate [K/min]': f'{60.0 * state[RATE]:.4f}',
+            'case minus board [K]': f'{state[GRADIENT]:.4f}',
+            'memory settled': str(status.is_settled),
         }
+    return values | {
+        'board age [s]': f'{status.board_age_s:.3f}',
+        'case age [s]': f'{status.case_age_s:.3f}',
+        **{f'{name} fault': fault.value for name, (fault, _) in status.faults.items()},
+        'gradient excess [K]': f'{status.excess.gradient:.3f}',
+        'temperature excess [K]': f'{status.excess.temperature:.3f}',
+        'rate excess [K/min]': f'{60.0 * status.excess.rate:.3f}',
+    }
 
 
 def _of_axes(key: str, values: Iterable[float]) -> dict[str, str]:
@@ -257,10 +264,10 @@ def _of_axes(key: str, values: Iterable[float]) -> dict[str, str]:
 def _mismatch(node: Node, subscription: Subscription) -> str:
     """Return why no publisher on a topic is heard: type or QoS; empty if there is none."""
     topic, expected = subscription.topic_name, type_name(subscription.msg_type)
-    for found in node.get_publishers_info_by_topic(topic):
-        if found.topic_type != expected:
-            return f'its type is {found.topic_type}, not {expected}'
-        fit, reason = qos_check_compatible(found.qos_profile, subscription.qos_profile)
+    for publisher in node.get_publishers_info_by_topic(topic):
+        if publisher.topic_type != expected:
+            return f'its type is {publisher.topic_type}, not {expected}'
+        fit, reason = qos_check_compatible(publisher.qos_profile, subscription.qos_profile)
         if fit == QoSCompatibility.ERROR:
             said = reason.replace('ERROR: ', '').rstrip('; ')
             return f'{said} (qos_overrides.{topic}.subscription)'

@@ -6,8 +6,6 @@ Owns the reading of temperatures from messages of any type; the class is importe
 The package of a driver's messages is therefore no dependency: it is installed with the driver.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Any

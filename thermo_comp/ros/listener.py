@@ -1,22 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns nodes that only listen: the node's output into a bag, its inputs as blocks.
-
-As in a bag written by `replay`, the log time of an Imu is its stamp, and the log time of any other
-output the newest Imu stamp before it. The log time of an input is the time of reception.
-"""
+"""Owns a node that only listens: the inputs of the live topics as blocks, for `record`."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from pathlib import Path
-from struct import Struct
-from typing import Any
 
-import numpy as np
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from ..errors import ThermoCompError
@@ -25,9 +16,7 @@ from ..recording.growing import News
 from ..recording.serialized import Messages
 from ..recording.topics import Topics, is_thermometer, split_field
 from ..recording.wire import Feed, decode_blocks
-from ..recording.writer import BagWriter
-from ..topics import IMU, OUTPUTS, SAMPLES, TEMPERATURE, thermometer
-from ..typing import Ints
+from ..topics import SAMPLES, TEMPERATURE, thermometer
 from .fields import LiveField, live_field
 from .messages import message_class
 from .waitloop import RawSubscription, WaitLoop, own_node
@@ -35,29 +24,33 @@ from .waitloop import RawSubscription, WaitLoop, own_node
 #: Interval of the search for publishers, and of the blocks [s].
 LOOK_S, BLOCK_S = 0.5, 1.0
 
-_ALL = HistoryPolicy.KEEP_ALL
-_RELIABLE = QoSProfile(history=_ALL, reliability=ReliabilityPolicy.RELIABLE)
-_AS_OFFERED = QoSProfile(history=_ALL, reliability=ReliabilityPolicy.BEST_AVAILABLE)
-_STAMP = Struct('<iI')
-#: The node's outputs by name, with their types.
-_RESULTS = {topic.name: topic.type for topic in OUTPUTS}
+NODE_NAME = 'thermo_comp_record'
+_AS_OFFERED = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.BEST_AVAILABLE
+)
 
 
-class _Listener:
-    """A node whose subscriptions a thread reads while the context manager is active."""
+class LiveTopics:
+    """Listens to the node's inputs; it subscribes to a topic once the topic has a publisher."""
 
-    def __init__(self, name: str, ros_args: Sequence[str]) -> None:
-        self._name, self._ros_args = name, ros_args
-        self._heard: dict[str, RawSubscription] = {}
-        #: Received messages: topic, messages, times of reception [ns].
-        self._came: list[tuple[str, list[bytes], list[int]]] = []
+    def __init__(self, topics: Topics, ros_args: Sequence[str] = ()) -> None:
+        self._topics, self._ros_args = topics, ros_args
+        self._heard: dict[Role, RawSubscription] = {}
+        #: Received messages: role, messages, times of reception [ns].
+        self._came: list[tuple[Role, list[bytes], list[int]]] = []
+        self._feeds: dict[Role, Topic] = {}
+        self._fields: dict[Role, LiveField] = {}
+        self._last_ns = NO_STAMP_NS
+        self.problems: tuple[str, ...] = ()  # reasons why a topic has no messages, as sentences
 
-    def __enter__(self) -> Any:
+    def __enter__(self) -> LiveTopics:
         with ExitStack() as stack:
-            self._node = stack.enter_context(own_node(self._name, self._ros_args))
+            self._node = stack.enter_context(own_node(NODE_NAME, self._ros_args))
             self._loop = WaitLoop(self._node)
-            self._open()
-            thread = threading.Thread(target=self._run, name=self._name)
+            self._look()
+            self._loop.call_every(LOOK_S, self._look)
+            stack.callback(self._take)
+            thread = threading.Thread(target=self._loop.run, args=[self._take], name=NODE_NAME)
             thread.start()
             stack.callback(thread.join)
             stack.callback(self._loop.stop)
@@ -68,93 +61,11 @@ class _Listener:
         """Stop, take the last messages, destroy the node; a second call does nothing."""
         self._stack.close()
 
-    def _open(self) -> None:
-        """Subscribe."""
-
-    def _run(self) -> None:
-        self._loop.run(self._take)
-        self._take()
-
     def _take(self) -> None:
-        for name, subscription in self._heard.items():
+        for role, subscription in self._heard.items():
             messages, received_ns = subscription.drain()
             if messages:
-                self._came.append((name, messages, received_ns))
-
-
-class Recorder(_Listener):
-    """Records topics into a rosbag2 bag, which is written at the end."""
-
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        topics: Mapping[str, str] = _RESULTS,
-        ros_args: Sequence[str] = (),
-        overwrite: bool = False,
-    ) -> None:
-        super().__init__('thermo_comp_recorder', ros_args)
-        self._writer, self._topics = BagWriter(path, overwrite=overwrite), topics
-
-    def __exit__(self, *raised: object) -> None:
-        """Stop; write the bag, or drop it after an error."""
-        super().__exit__()
-        if raised[0] is not None:
-            self._writer.abort()
-            return
-        with self._writer as writer:
-            times = [_stamps(data) for name, data, _ in self._came if self._topics[name] == IMU]
-            newest_ns = times[0][:1] if times else np.zeros(1, np.int64)
-            following = iter(times)
-            rows: dict[str, tuple[list[Ints], list[bytes]]] = {}
-            for name, messages, _ in self._came:
-                is_stamped = self._topics[name] == IMU
-                log_ns = next(following) if is_stamped else newest_ns.repeat(len(messages))
-                newest_ns = log_ns[-1:]
-                parts, joined = rows.setdefault(name, ([], []))
-                parts.append(log_ns)
-                joined += messages
-            for name, (parts, joined) in rows.items():
-                writer.write_raw(name, self._topics[name], np.concatenate(parts), joined)
-
-    def _open(self) -> None:
-        for name, kind in self._topics.items():
-            self._heard[name] = self._loop.subscribe(message_class(kind), name, _RELIABLE)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Number of messages received so far, by relative topic name."""
-        counts = dict.fromkeys(self._topics, 0)
-        for name, messages, _ in self._came:
-            counts[name] += len(messages)
-        return counts
-
-    @property
-    def has_publishers(self) -> bool:
-        """Whether every topic has a publisher."""
-        return all(one.count_publishers() for one in self._heard.values())
-
-
-def _stamps(messages: list[bytes]) -> Ints:
-    stamps = np.array([_STAMP.unpack_from(data, 4) for data in messages])
-    log_ns: Ints = stamps[:, 0] * 10**9 + stamps[:, 1]
-    return log_ns
-
-
-class LiveTopics(_Listener):
-    """Listens to the node's inputs; it subscribes to a topic once the topic has a publisher."""
-
-    def __init__(self, topics: Topics, ros_args: Sequence[str] = ()) -> None:
-        super().__init__('thermo_comp_record', ros_args)
-        self._topics = topics
-        self._feeds: dict[Role, Topic] = {}
-        self._fields: dict[Role, LiveField] = {}
-        self._last_ns = NO_STAMP_NS
-        self.problems: tuple[str, ...] = ()  # reasons why a topic has no messages, as sentences
-
-    def _open(self) -> None:
-        self._look()
-        self._loop.call_every(LOOK_S, self._look)
+                self._came.append((role, messages, received_ns))
 
     @property
     def n_lost(self) -> int:
@@ -209,8 +120,8 @@ class LiveTopics(_Listener):
             and name.startswith(front)
             and is_thermometer(name.removeprefix(front))
         }
-        own = {'board': self._topics.board, 'case': self._topics.case}
-        for name, topic in {**own, **further, **self._topics.further}.items():
+        both = {'board': self._topics.board, 'case': self._topics.case}
+        for name, topic in {**both, **further, **self._topics.further}.items():
             self._hear(name, topic, TEMPERATURE, problems)
         self.problems = tuple(problems)
 
@@ -231,7 +142,7 @@ class LiveTopics(_Listener):
         if field is not None:
             self._fields[role], self._feeds[role] = field, Topic(name, TEMPERATURE, 'cdr')
             self._heard[role] = self._loop.subscribe(field.kind, name, _AS_OFFERED, is_hot=False)
-        elif any(one.topic_type != kind for one in offers):
+        elif any(offer.topic_type != kind for offer in offers):
             problems.append(f'{name} has the type {offers[0].topic_type}, expected {kind}')
         elif offers:
             self._feeds[role] = Topic(name, kind, 'cdr')

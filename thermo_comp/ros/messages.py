@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the step from the table of topics to rclpy: message classes, QoS profiles."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

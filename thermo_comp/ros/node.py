@@ -7,14 +7,10 @@ The output equals that of the offline replay of the same messages bit for bit. P
 checked when they are set, and applied between two wake-ups.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 
 import rclpy
@@ -130,7 +126,7 @@ class CompensationNode:
 
     def _prepare(self, changes: list[Parameter]) -> tuple[LoadedCalibration, Model] | None:
         """Read, try and build the calibration of a change, in parallel to the samples."""
-        names = [one.value for one in changes if one.name == 'calibration_file']
+        names = [change.value for change in changes if change.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
         loaded = self._reader.read(names[-1], self._config.calibration_directory)
@@ -144,7 +140,7 @@ class CompensationNode:
         loaded, model = new or (before.loaded, before.compensator.thermal.model)
         config = parameters.updated(before.config, changes)
         self._check(loaded, config, before.compensator.thermal.inputs)
-        known = [one.name for one in changes if self.node.has_parameter(one.name)]
+        known = [change.name for change in changes if self.node.has_parameter(change.name)]
         values = self.node.get_parameters(known)
         try:
             after = self._relay.successor(loaded, model, config)
@@ -198,25 +194,6 @@ class CompensationNode:
         loaded = self._relay.running.loaded
         serial = loaded.calibration.unit.serial
         self._log.info(f'unit {serial}: {loaded.path} ({loaded.sha256[:12]})')
-
-
-@contextmanager
-def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
-    """Run the node in a thread of this process, in a separate context."""
-    context = rclpy.context.Context()
-    rclpy.init(args=['--ros-args', *ros_args], context=context)
-    try:
-        node = CompensationNode(context)
-        thread = threading.Thread(target=node.run, daemon=True)
-        thread.start()
-        try:
-            yield node
-        finally:
-            node.stop()
-            thread.join()
-            node.close()
-    finally:
-        context.try_shutdown()
 
 
 def main(args: list[str] | None = None) -> int:

@@ -8,8 +8,6 @@ or is refused as a whole. A thread waits while a file is read; the loop then rep
 reference. Requests are answered in order of arrival, but a request without a file waits for none.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -129,8 +127,8 @@ class NodeConfig:
     def compensator_config(self) -> CompensatorConfig:
         """Return the settings of the compensator, whose names end in the unit."""
         names = [field.name for field in fields(CompensatorConfig)]
-        own = (getattr(self, name.removesuffix('_m_s2').removesuffix('_s')) for name in names)
-        return CompensatorConfig(**dict(zip(names, own, strict=True)))
+        values = (getattr(self, name.removesuffix('_m_s2').removesuffix('_s')) for name in names)
+        return CompensatorConfig(**dict(zip(names, values, strict=True)))
 
 
 _TABLE: Mapping[str, Field[Any]] = {entry.name: entry for entry in fields(NodeConfig)}
@@ -225,7 +223,7 @@ class ParameterRequests:
     """Answers a node's parameter services."""
 
     # `prepare` does the slow part of a change in parallel to the samples, `apply` sets its result
-    # between two samples. An exception of either refuses the change.
+    # between two samples. An exception of `prepare` or `apply` refuses the change.
     def __init__(
         self,
         loop: WaitLoop,
@@ -248,7 +246,7 @@ class ParameterRequests:
     def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
         is_each, n, reason = kind is srv.SetParameters, len(request.parameters), ''
         groups = [[one] for one in request.parameters] if is_each else [request.parameters]
-        waits = any(one.name == 'calibration_file' for one in request.parameters)
+        waits = any(parameter.name == 'calibration_file' for parameter in request.parameters)
         results: list[SetParametersResult] = []
 
         def respond() -> None:
@@ -274,7 +272,7 @@ class ParameterRequests:
                 future = self._beside.submit(read) if waits else _done(read)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
-        # Limited: to write a result per parameter would take as long as to read them.
+        # The number of results is limited: to write one per parameter takes as long as to read it.
         results += [_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT)
         respond()
 
@@ -286,7 +284,7 @@ class ParameterRequests:
         """Apply one group; an unexpected error refuses it and is logged by the loop."""
         try:
             changes, found = prepared.result()
-            news = [one for one in changes if not self._is_in_force(one)]
+            news = [change for change in changes if not self._is_in_force(change)]
             result = self._apply(news, found) if news else SetParametersResult(successful=True)
             results.append(result if result.successful else _refusal(result.reason))
         except (ThermoCompError, ParameterNotDeclaredException) as error:

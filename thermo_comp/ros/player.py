@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -31,10 +31,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from ..errors import ThermoCompError
-from ..recording.blocks import ROLES, Block, RecordingInfo, Role
+from ..recording.blocks import Block, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics
-from ..topics import FLAGS, IMU_OUT, SAMPLES, TEMPERATURE, thermometer
+from ..topics import SAMPLES, TEMPERATURE, thermometer
 from .messages import message_class
 from .waitloop import own_node, wait_until
 
@@ -125,7 +125,7 @@ class Player:
         """Send the bag; after each window `throttle` gets the number of samples, and may block."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
-        topics = {one.topic_name: role for role, one in self._publishers.items()}
+        topics = {publisher.topic_name: role for role, publisher in self._publishers.items()}
         unheard = self.unheard()
         lossy = [
             name
@@ -164,8 +164,8 @@ class Player:
             left_s = max(0.0, due - now)
             if now >= self._next_clock:
                 self._next_clock = now + CLOCK_PERIOD
-                told, message = log_ns - int(left_s * self._rate * 1e9), Clock()
-                message.clock.sec, message.clock.nanosec = divmod(told, 1_000_000_000)
+                clock_ns, message = log_ns - int(left_s * self._rate * 1e9), Clock()
+                message.clock.sec, message.clock.nanosec = divmod(clock_ns, 1_000_000_000)
                 self._clock.publish(message)
             if not left_s:
                 return
@@ -178,18 +178,6 @@ class Player:
         if not wait_until(is_done, PATIENCE, ACKNOWLEDGEMENT_NAP):
             name = publisher.topic_name
             raise ThermoCompError(f'{name}: a subscriber acknowledged nothing for {PATIENCE:g} s')
-
-
-def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> list[str]:
-    """Return ROS arguments under which a node loses no message, at the price of latency."""
-    inputs = [*(one.name for one in SAMPLES.values()), *map(thermometer, thermometers)]
-    overrides = [
-        *(f'{topic}.subscription.reliability:=reliable' for topic in inputs),
-        *(f'{topic}.subscription.history:=keep_all' for topic in inputs),
-        f'{IMU_OUT.name}.publisher.history:=keep_all',
-        *(f'{flag.name}.publisher.depth:=1000' for flag in FLAGS),
-    ]
-    return [word for one in overrides for word in ('-p', f'qos_overrides.{namespace}/{one}')]
 
 
 def _in_order(block: Block) -> list[tuple[float, int, Role, bytes]]:

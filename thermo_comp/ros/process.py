@@ -32,7 +32,7 @@ def use_profile() -> None:
 
 class SignalWatch:
     """
-    Turns the first signal into a call; the second ends the process. Enter in the main thread.
+    Turns the first signal into a call; the second ends the process. For the main thread only.
 
     If the process has not ended `ending_s` [s] after the call, it is ended.
     """

@@ -7,8 +7,6 @@ A parser holds the interpreter lock for milliseconds at a time, so a thread woul
 If a file makes its reader crash or hang, the node only sees a process that ended or timed out.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import hashlib
@@ -73,7 +71,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
             raise
         raise CalibrationError(error.rule, name) from error
     except Exception as error:
-        # RuntimeError: the home folder of an unknown user. No error of a file may end the node.
+        # No error of a file may end the node; a home folder of an unknown user is a RuntimeError.
         has_reason = isinstance(error, OSError) or type(error) is ValueError
         reason = getattr(error, 'strerror', None) or (has_reason and str(error))
         raise CalibrationError(

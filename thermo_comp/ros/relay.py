@@ -8,8 +8,6 @@ and so is the first batch afterwards, which may still be from the publisher that
 (`waitloop.Sources`).
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -121,14 +119,14 @@ class Relay:
             if field is not None:
                 self._fields[name], topic = field, one.subscription.topic_name
                 self._loop.unsubscribe(self.thermometers.pop(name))
-                # The middleware allows one type per topic: after the loop has released the first.
+                # The middleware allows one type per topic: the loop must release the first before.
                 self._loop.call_soon(partial(self._hear, name, topic, field))
 
     def _hear(self, name: str, topic: str, field: LiveField) -> None:
         one = self._loop.subscribe(field.kind, topic, qos_of(BOARD), is_hot=False)
         everything = {**self.thermometers, name: one}
         names = self.running.compensator.thermal.inputs
-        self.thermometers = {own: everything[own] for own in names if own in everything}
+        self.thermometers = {key: everything[key] for key in names if key in everything}
 
     @property
     def samples(self) -> RawSubscription:

@@ -8,8 +8,6 @@ The samples' way appends references of messages to a list. The sums are done in 
 What cannot be kept is counted and named in the diagnostics.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time
@@ -37,7 +35,8 @@ DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 _FLOOR = 16_000
 #: Largest number of lines that wait for the disk.
 _WAITING = 1000
-#: Stamps before 2000-01-01 [ns] count from a start: such rests get the time of this computer.
+#: Stamps before 2000-01-01 [ns] are times since the start of a driver, no dates: rests with such
+#: stamps get the time of this computer.
 _EPOCH_NS = 946_684_800 * 10**9
 #: Backward step of the stamps [ns] from which a recording has begun anew.
 _JUMP_NS = 10**9
@@ -75,7 +74,7 @@ class RestLog:
             self._lose('the disk does not answer')
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Write what waits, within the time."""
+        """Write the waiting lines, as far as that takes no longer than `timeout_s`."""
         try:
             self._lines.put(None, timeout=timeout_s)
         except Full:
@@ -218,7 +217,7 @@ def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floa
         return np.zeros(0, np.int64), np.zeros((0, 3))
     content = b''.join(messages)
     if len(content) != size * len(messages):
-        content = b''.join([one for one in messages if len(one) == size])
+        content = b''.join([message for message in messages if len(message) == size])
     at = size + (_FORCE if is_imu else _COUNTS)
     # An angular rate and the first element of its covariance, which is -1 where there is none.
     fields = [('plain', 'S4', 0), ('sec', '<i4', 4), ('nanosec', '<u4', 8), ('force', '3<f8', at)]

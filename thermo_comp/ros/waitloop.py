@@ -12,8 +12,6 @@ Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), th
 node's `_parameter_overrides`; `test/test_waitloop.py` fails when any of them changes.
 """
 
-from __future__ import annotations
-
 import time
 import traceback
 from collections import deque
@@ -237,7 +235,7 @@ class WaitLoop:
         node, self._is_stale = self.node, False
         raw = [one.subscription for one in self._raw]
         others = {one: partial(_take_message, one) for one in node.subscriptions if one not in raw}
-        others |= {one: partial(self._take_request, one) for one in node.services}
+        others |= {service: partial(self._take_request, service) for service in node.services}
         hot = next((one for one in self._raw if one.is_hot), None)
         rest_ns = 0
         # Only with best effort is a wake-up more expensive than a short sleep.
@@ -323,7 +321,7 @@ class _WaitSet:
     """A wait set, filled again for each wait."""
 
     def __init__(self, context: rclpy.context.Context, entities: Sequence[Any]) -> None:
-        types = [type(one) for one in entities]
+        types = [type(entity) for entity in entities]
         counts = types.count(Subscription), types.count(GuardCondition), 0, 0, types.count(Service)
         self._set = rclpy_implementation.WaitSet(*counts, 0, context.handle)
         self._content = [

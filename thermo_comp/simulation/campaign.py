@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the plan of a test: the chamber's program, ready-made or typed in, and the attitudes."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass
@@ -61,7 +59,7 @@ PLAN_NAMES = (
     *('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out'),
     *('centrifuge', 'rate-table'),
 )
-# Runs begin so long before the end of each soak [s] and hold each rate; ramps between them [s].
+# Ends of the soaks; lead of a run before such an end, time at each rate, time between rates [s].
 _SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
 # Centrifuge: 1 m, 2 to 10 g beside the vertical 1 g; rate table: 0.25 m, up to 1000 deg/s.
 _CENTRIFUGE = 1.0, tuple(math.sqrt(g * STANDARD_GRAVITY) for g in (2.0, 4.0, 7.0, 10.0))

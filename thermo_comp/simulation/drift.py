@@ -5,8 +5,6 @@ Owns the physics of the errors: each effect belongs to a part, and is zero in th
 which the board's thermometer shows the reference temperature.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass

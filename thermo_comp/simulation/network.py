@@ -9,8 +9,6 @@ of the air the solution is linear plus decaying modes. The nonlinear part of con
 conductance at 1 K, is held constant for a second.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the ready-made units: three instruments, and the unit of the sample bags."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import replace

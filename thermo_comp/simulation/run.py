@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns a run: a unit in a chamber over a program, whole or block by block, and its truth."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -98,14 +96,14 @@ def arrays(
     return [
         simulate(
             unit,
-            one.program,
-            one.up,
+            station.program,
+            station.up,
             rate_hz=rate_hz,
             seed=1000 * seed + k,
             start_ns=0,
-            spin=one.spin,
+            spin=station.spin,
         )
-        for k, one in enumerate(stations)
+        for k, station in enumerate(stations)
     ]
 
 
@@ -153,56 +151,69 @@ def simulate_blocks(
         read.board.read(truth.response, duration, seed, Stream.BOARD_NOISE),
         read.case.read(truth.response, duration, seed, Stream.CASE_NOISE),
     )
+    return _blocks(truth, readings, spin, (n_cycles, block_size, rate_hz), seed, start_ns)
 
-    def blocks() -> Iterator[SimulatedRun]:
-        K = np.array(unit.scale_factor)
-        to_axes = np.linalg.inv(unit.M)
-        # Mean of white noise over a cycle: density times the root of the cycle rate.
-        root = math.sqrt(rate_hz)
-        noise_sd = np.array(unit.noise_density) * MICRO_G * K * root
-        noise, rate_noise = white(seed, Stream.ACCEL_NOISE), white(seed, Stream.GYRO_NOISE)
-        remainder = first_charge(seed)
-        passed = -1
-        for first in range(0, n_cycles, block_size):
-            last = min(first + block_size, n_cycles)
-            cycle = np.arange(first, last)
-            stamp_ns = np.rint((cycle + 1.0) * (_NS / rate_hz)).astype(np.int64)
-            part = replace(truth, cycle_s=(cycle + 0.5).astype(np.float64) / rate_hz)
-            force = truth.specific_force
+
+def _blocks(
+    truth: Truth,
+    readings: Sequence[tuple[Ints, Floats]],
+    spin: Spin | None,
+    cycles: tuple[int, int, float],
+    seed: int,
+    start_ns: int,
+) -> Iterator[SimulatedRun]:
+    """Yield a run by blocks; `cycles`: number, largest number of a block, per second."""
+    unit, (n_cycles, block_size, rate_hz) = truth.unit, cycles
+    K = np.array(unit.scale_factor)
+    to_axes = np.asarray(np.linalg.inv(unit.M), np.float64)
+    # Mean of white noise over a cycle: density times the root of the cycle rate.
+    root = math.sqrt(rate_hz)
+    noise_sd = np.array(unit.noise_density) * MICRO_G * K * root
+    noise, rate_noise = white(seed, Stream.ACCEL_NOISE), white(seed, Stream.GYRO_NOISE)
+    remainder = first_charge(seed)
+    passed = -1
+    for first in range(0, n_cycles, block_size):
+        last = min(first + block_size, n_cycles)
+        cycle = np.arange(first, last)
+        stamp_ns = np.rint((cycle + 1.0) * (_NS / rate_hz)).astype(np.int64)
+        part = replace(truth, cycle_s=(cycle + 0.5).astype(np.float64) / rate_hz)
+        if spin is not None:
+            force = spin.forces(truth.specific_force, part.cycle_s)
+            part = replace(part, specific_force=force)
+        # Eq. (2), (8) and (9)
+        s = _along_axes(part, to_axes)
+        charge = part.bias + K * part.scale * s + noise_sd * noise(len(cycle))
+        counts, remainder = unit.converter(charge, remainder)
+        rate: Floats | None = None
+        gyro = unit.gyro
+        if gyro is not None:
+            rate_sd = np.array(gyro.noise_density) * MILLIDEGREE * root
+            rate = part.on_cycles(part.rate_bias) + gyro.constant(seed)
+            rate += rate_sd * rate_noise(len(cycle))
             if spin is not None:
-                force = spin.forces(force, part.cycle_s)
-                part = replace(part, specific_force=force)
-            s: Floats = np.zeros(3)
-            for j in range(3):
-                s = s + force[..., j, None] * to_axes[:, j]
-            if unit.bend is not None:
-                node = unit.network.nodes.index(unit.board.node)
-                t = truth.temperatures[:, [node]] - REFERENCE_C
-                s = s + unit.bend.added(s, part.on_cycles(t)[:, 0])
-            # Eq. (2), (8) and (9)
-            charge = part.bias + K * part.scale * s + noise_sd * noise(len(cycle))
-            counts, remainder = unit.converter(charge, remainder)
-            rate: Floats | None = None
-            gyro = unit.gyro
-            if gyro is not None:
-                rate_sd = np.array(gyro.noise_density) * MILLIDEGREE * root
-                rate = part.on_cycles(part.rate_bias) + gyro.constant(seed)
-                rate += rate_sd * rate_noise(len(cycle))
-                if spin is not None:
-                    turning = spin.rate_at(part.cycle_s)[:, None]
-                    rate += turning * truth.specific_force / gravity
-            until = sys.maxsize if last == n_cycles else int(stamp_ns[-1])
-            (board_ns, board), (case_ns, case) = (
-                (stamps[rows] + start_ns, values[rows])
-                for stamps, values in readings
-                for rows in [slice(*np.searchsorted(stamps, (passed, until), side='right'))]
-            )
-            passed = until
-            yield SimulatedRun(
-                stamp_ns + start_ns, counts, board_ns, board, case_ns, case, part, rate
-            )
+                turning = spin.rate_at(part.cycle_s)[:, None]
+                rate += turning * truth.specific_force / np.linalg.norm(truth.specific_force)
+        until = sys.maxsize if last == n_cycles else int(stamp_ns[-1])
+        (board_ns, board), (case_ns, case) = (
+            (stamps[rows] + start_ns, values[rows])
+            for stamps, values in readings
+            for rows in [slice(*np.searchsorted(stamps, (passed, until), side='right'))]
+        )
+        passed = until
+        yield SimulatedRun(stamp_ns + start_ns, counts, board_ns, board, case_ns, case, part, rate)
 
-    return blocks()
+
+def _along_axes(part: Truth, to_axes: Floats) -> Floats:
+    """Return the force along the sensitivity axes, with the nonlinear part of their readings."""
+    s: Floats = np.zeros(3)
+    for j in range(3):
+        s = s + part.specific_force[..., j, None] * to_axes[:, j]
+    unit = part.unit
+    if unit.bend is not None:
+        node = unit.network.nodes.index(unit.board.node)
+        t = part.temperatures[:, [node]] - REFERENCE_C
+        s = s + unit.bend.added(s, part.on_cycles(t)[:, 0])
+    return s
 
 
 @lru_cache(maxsize=1)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns forces beyond 1 g in a simulation: a rotation in the chamber, and nonlinear axes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise
@@ -27,7 +25,7 @@ class Bend:
     per_kelvin: float = 0.0
 
     def added(self, force: Floats, t: Floats) -> Floats:
-        """Return what the axes read beside forces, shape (n, 3) [m/s^2], t K off the reference."""
+        """Return the nonlinear part of readings, (n, 3) [m/s^2], at t K from the reference."""
         f = force / STANDARD_GRAVITY
         terms = np.array(self.square) * f**2 + np.array(self.cube) * f**3
         return np.asarray(MICRO_G * (1.0 + self.per_kelvin * t)[:, None] * terms)

@@ -162,7 +162,7 @@ class UnitModel:
     A physical unit with all its constants: the truth that a calibration estimates.
 
     Per axis, ``counts = K * scale(T) * s + bias(T) + noise`` summed into whole counts, where ``s =
-    inverse(M) @ f`` is the specific force along the sensitivity axes, and what `bend` adds to it.
+    inverse(M) @ f`` is the specific force along the sensitivity axes, plus the nonlinear `bend`.
     K [counts/cycle per m/s^2] and bias [counts/cycle] are those at the reference. `noise_density`
     is in ug/sqrt(Hz): the mean over T seconds has the deviation ``noise_density / sqrt(T)``;
     `bias_walk` in ug/sqrt(h).

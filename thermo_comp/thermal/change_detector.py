@@ -18,8 +18,6 @@ References
 
 """
 
-from __future__ import annotations
-
 import math
 from math import acos, inf, isnan, log, nan, pi, sqrt
 from typing import Final
@@ -98,11 +96,11 @@ class ChangeDetector:
         self._edge = nan  # edges crossed before the soak measure the rate of the ramp
 
     def is_following(self, stamp_ns: int) -> bool:
-        """Tell whether `rate` includes the reading with this stamp."""
+        """Whether `rate` includes the reading with this stamp."""
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
-        """Tell whether the rate is within a swing of the baseline."""
+        """Whether the rate is within a swing of the baseline."""
         return abs(self.rate - self._baseline) < self.swing + self._doubt
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:

@@ -8,8 +8,6 @@ linear between two readings (first-order hold) its exact step over dt is
 ``m' = m e + (u' - u) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

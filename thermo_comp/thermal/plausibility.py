@@ -9,8 +9,6 @@ the surroundings than the board, so it leads in a ramp. If a sensor breaks such 
 readings are left out, or their variance grows by the error that they may have.
 """
 
-from __future__ import annotations
-
 from enum import Enum
 from math import erf, exp, isfinite, log, nan, sqrt
 from typing import Final

@@ -17,8 +17,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 from math import sqrt
 from typing import Final
@@ -47,7 +45,8 @@ class RegimeDetector:
     """
     State machine over the estimates of the case and the board.
 
-    `direction` in the dynamic state: -1 cooling, +1 heating, 0 undecided; otherwise 0.
+    `direction` is -1 while cooling and +1 while heating; it is 0 in the dynamic state before the
+    direction is known, and in all other states.
     """
 
     def __init__(self, settings: DetectorSettings) -> None:

@@ -6,13 +6,10 @@ Owns the settings of thermometers, detector and tracker.
 Calibrations hold them, and a fleet's workers receive them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
-from math import inf
 from typing import Annotated, Final, Literal, get_args
 
-from ..quantities import QUANTITIES, refuse_impossible
+from ..quantities import QUANTITIES, NotNegative, Positive, refuse_impossible
 
 CELL_SIGMAS: Final = 2.5  # quantum / noise sd above which a reading is treated as a cell
 WIDE_CELL_SIGMAS: Final = 8.5  # the same for cells that noise never crosses: 6 sd of a difference
@@ -21,17 +18,6 @@ OBVIOUS_SHARE: Final = 1.5  # hysteresis: rate that opens / relaxed rate, below 
 ADVISED_SPAN_K: Final = 25.0
 #: Board temperature rate from which a change counts as a ramp [K/min]; below it is a soak's drift.
 RAMP_K_MIN: Final = 0.1
-
-
-def refuse_outside(
-    settings: object, *, positive: tuple[str, ...], not_negative: tuple[str, ...]
-) -> None:
-    """Raise ValueError for attributes that are not above, or not at least, zero, and finite."""
-    for name in (*positive, *not_negative):
-        value = getattr(settings, name)
-        if not 0.0 <= value < inf or (value == 0.0 and name in positive):
-            least = 'positive' if name in positive else 'zero or positive'
-            raise ValueError(f'`{name}` must be {least} and finite, got {value}')
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +44,6 @@ class ThermometerSettings:
 
     def __post_init__(self) -> None:
         """Refuse values that no sensor has."""
-        refuse_outside(
-            self,
-            positive=('noise_sd_c', 'fastest_ramp_k_min', 'lag_s'),
-            not_negative=('quantum_c',),
-        )
         refuse_impossible(self)
 
     @property
@@ -123,11 +104,6 @@ class DetectorSettings:
 
     def __post_init__(self) -> None:
         """Refuse values that contradict each other."""
-        refuse_outside(
-            self,
-            positive=('smallest_ramp_k_min', 'false_alarms_per_hour', 'relaxed_rate_k_min'),
-            not_negative=('ripple_c', 'dwell_s'),
-        )
         refuse_impossible(self)
         if self.closes not in get_args(Closes):
             raise ValueError(f"`closes` must be 'board' or 'case', got {self.closes!r}")
@@ -144,17 +120,13 @@ class ThermalConfig:
 
     #: Time over which the sets are blended after a switch [s], longer if they differ much
     #: (`Correction.gentle_transition`); 0 = the paper's hard switch.
-    transition_time_s: float = 30.0
+    transition_time_s: NotNegative = 30.0
     #: Age of the board temperature after which nothing is published [s]; a sensor that took an
     #: impossible step starts anew only after the same time.
-    temperature_timeout_s: float = 60.0
+    temperature_timeout_s: Positive = 60.0
     #: Age of the case temperature at which the board decides the regime [s].
-    case_timeout_s: float = 30.0
+    case_timeout_s: Positive = 30.0
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing."""
-        refuse_outside(
-            self,
-            positive=('case_timeout_s', 'temperature_timeout_s'),
-            not_negative=('transition_time_s',),
-        )
+        refuse_impossible(self)

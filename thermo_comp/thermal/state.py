@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the thermal state of a unit at one stamp: by name, and as the flat tuple of a sample."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from .memory import MemorySpec

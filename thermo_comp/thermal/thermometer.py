@@ -20,8 +20,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from math import erf, exp, inf, nan, sqrt
 from typing import Final
 
@@ -143,7 +141,7 @@ class Thermometer:
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
             self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
-        # The cheap test first: the limit is never below OUTLIER_SIGMAS.
+        # The cheap test first: the limit of an outlier is at least OUTLIER_SIGMAS deviations.
         if surprise * surprise > OUTLIER_SIGMAS**2 * spread and abs(surprise) > (
             limit := OUTLIER_SIGMAS * sqrt(spread)
             + 5.0 * self._bend * dt * dt

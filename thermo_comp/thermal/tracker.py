@@ -8,8 +8,6 @@ is fitted and when it is applied. It is causal and has no clock: readings enter 
 state is returned for a stamp.
 """
 
-from __future__ import annotations
-
 from copy import copy
 from math import sqrt
 from typing import Final

@@ -106,7 +106,7 @@ class Axes:
 
 @dataclass(frozen=True)
 class AxisSet:
-    """The curves of one axis in one regime (method section 3: items 2 to 4)."""
+    """The curves of one axis in one regime."""
 
     bias_function: Annotated[TemperatureFunction, 'Fs(t), input units; Fs(0) = 0.']
     scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
@@ -219,7 +219,8 @@ class Calibration:
         Posterior | None, 'Covariance of all parameters; null where it is unknown.'
     ] = None
     nonlinearity: Annotated[
-        Nonlinearity | None, 'Of the axes over specific force; null: only 1 g was seen.'
+        Nonlinearity | None,
+        'Nonlinearity of the axes over specific force; null: only 1 g was seen.',
     ] = None
     gyroscope: Annotated[
         Gyroscope | None, "Bias of the unit's gyroscope; null: the angular rate is not corrected."
@@ -267,8 +268,8 @@ class Calibration:
                 '`sensors` must be different names, at least one, none of them board, '
                 f'got {list(names)}'
             )
-        own = self.gyroscope.response if self.gyroscope else ()
-        for key, response in (('response', self.response), ('gyroscope.response', own)):
+        of_rate = self.gyroscope.response if self.gyroscope else ()
+        for key, response in (('response', self.response), ('gyroscope.response', of_rate)):
             for k, term in enumerate(response):
                 if term.is_of_sensor and term.sensor not in names:
                     raise ValueError(
@@ -361,12 +362,10 @@ class Calibration:
 
     @property
     def needs_case(self) -> bool:
-        """Whether it was fitted with a case thermometer, or has columns computed from it."""
+        """Whether the unit was fitted with a case thermometer, or has columns computed from it."""
         columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
         return self.detector.case != ThermometerSettings() or any(
-            column.kind in {'gradient', 'gradient_lag', 'size', 'gradient_even'}
-            or (column.kind == 'square' and not column.tau_s)
-            for column in columns
+            column.is_of_sensor for column in columns
         )
 
     @property

@@ -7,8 +7,6 @@ Any bytes give a Calibration or a CalibrationError that names file and key: size
 features are limited before anything is built (no aliases, tags or duplicate keys).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -37,11 +37,8 @@ The groups of the bank are its kinds. *product* contains board, and *gradient_x_
 contains gradient and gradient_lag, times a power of temperature: coefficients that change with
 temperature.
 
-Tracker, fit, correction, covariance and file use this table. A new regressor is an entry of `bank`
-and, if its kind is new, of `_FORMS`.
+Tracker, fit, correction, covariance and file use this table.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -146,7 +143,7 @@ class Column:
     def __post_init__(self) -> None:
         check_ranges(self, range=QUANTITIES['span of a column'])
         for key, kinds in (
-            ('tau_s', ('board', 'gradient_lag')),
+            ('tau_s', ('board', 'gradient_lag', 'cube')),
             ('width_k', ('gradient_even', 'play')),
         ):
             if self.kind in kinds and not getattr(self, key) > 0.0:
@@ -393,8 +390,10 @@ def _source(column: Column, layout: Layout) -> tuple[int, str, float, float]:
         place = layout.lags[column.lag]
     elif column.kind == 'bend':
         place = BOARD
-    else:
+    elif column.is_of_sensor:
         place = layout.gradients[column.sensor]
+    else:
+        raise ValueError(f'no number of the state belongs to columns of kind {column.kind}')
     width = column.width_k if form == 'gradient_even' else 1.0
     rest = column.knee_k if form == 'bend' else column.rest_k
     return place, form, width, rest if form != 'line' else 0.0

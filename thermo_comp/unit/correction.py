@@ -10,8 +10,6 @@ in `calibration`; x is an axis' specific force before the misalignment, its erro
 ``v(x) = a + b x + c x^2`` [m^2/s^4].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -32,7 +30,7 @@ from .nonlinearity import ForceCorrection
 GENTLE_RATE = MICRO_G
 #: ... unless blending would then take more than this number of transition times.
 LONGEST_TRANSITION = 10.0
-#: Number of temperatures at which the difference of the sets is evaluated for it.
+#: Number of temperatures at which the difference of the sets is evaluated for that time.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter carries the remainder on.
 ROUNDING_VARIANCE = 1.0 / 6.0
@@ -51,8 +49,8 @@ class Excess(NamedTuple):
     """How far a thermal state lies outside the calibrated ranges; 0 inside."""
 
     temperature: float  # beyond the range of the regime's set, signed [K]
-    rate: float  # the same [K/s]
-    gradient: float  # of the sensor farthest outside, signed [K]
+    rate: float  # rate of the board beyond the range, signed [K/s]
+    gradient: float  # gradient of the sensor farthest outside, signed [K]
     relative: float  # sum of all distances, each in half ranges
 
 
@@ -111,8 +109,8 @@ class Correction:
 
     def _find_felt(self) -> None:
         """Find the columns that depend on each gradient and lag, to propagate its variance."""
-        # In a state each gradient and lag is followed by its variance. A play has none: it is
-        # taken to follow its input.
+        # In a state each gradient and lag is followed by its variance. A play has no variance:
+        # an error of its input v is taken to move the play P(v) along, so that P(v) - v stays.
         pair = (self.table.places - GRADIENT) // 2
         n_pairs = len(self.memory.sensors) + len(self.memory.lags)
         self._felt_variances = slice(VAR_GRADIENT, GRADIENT + 2 * n_pairs, 2)
@@ -269,14 +267,14 @@ class Correction:
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0).max(
                 axis=1, initial=0.0
             )
-            # Outside the range only the curves are extrapolated (the lags will follow). Add the
-            # change of slope as a separate error: for parts still outside, and where the bias and
-            # scale slopes cancel.
+            # Outside the range the curves are extrapolated, while lagging parts are still inside.
+            # Add the change of slope as a separate error: for parts outside, and where the slopes
+            # of bias and scale cancel.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
             v += self._spread(np.concatenate((bent, bent)), bends)
-            # The residual of the fit does not hold far outside: it grows with the distance.
+            # The variance is that of the calibrated ranges: it grows with the distance from them.
             v *= (1.0 + (outside + columns_out) ** 2)[:, np.newaxis]
         doubt = unknown + weight * rest + outside * outside
         if not (is_beyond or doubt.any()):

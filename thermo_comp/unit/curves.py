@@ -6,8 +6,6 @@ Owns the curves of the two sets over the board temperature, within their ranges 
 States and rows are laid out as in `correction`; each state is evaluated alone.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np
@@ -20,12 +18,12 @@ from .functions import TANGENT_SPANS, Functions, basis_slopes, hold
 
 class Curves:
     """
-    What the two sets make of the board temperature alone: in a result, row 0 is the static set's.
+    Bias and scale of both sets as functions of the board temperature; row 0 of a result is static.
 
-    Beyond its own range a set goes on as the other does, as far as that one was calibrated: what
-    the two differ by is held, not what they have in common. Beyond both ranges curves go on along
-    their tangent at the edge for `TANGENT_SPANS` of the span, and are held from there on; a set
-    that followed the other follows its tangent.
+    Beyond the range of one set, within that of the other, the difference of the two is held.
+    Beyond both ranges the curves continue along their tangent at the edge for `TANGENT_SPANS` of
+    the span, and are constant from there on; a set whose range ended earlier takes the other's
+    tangent.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -41,8 +39,8 @@ class Curves:
         ]
         self._functions, self._others = Functions(rows), Functions(rows[::-1])
         # Which set's tangent a set follows at the lower and at the upper end, shape (2, 2).
-        own, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
-        self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - own, own)
+        regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
+        self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - regimes, regimes)
         self._ends = lower.min(), upper.max()
         self._reaches = TANGENT_SPANS * (upper - lower)[self._leads][:, :, np.newaxis]
         biases = [axis.bias for axis in calibration.axes]
@@ -62,8 +60,8 @@ class Curves:
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats]:
         """
-        Say how far outside the sets' ranges states lie, shape (2, n): [K], [K/s], and both in half
-        ranges, added.
+        Return the distances of states outside the sets' ranges, shape (2, n): of temperature [K],
+        of its rate [K/s], and their sum in half ranges.
         """
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
@@ -94,7 +92,7 @@ class Curves:
 
     @cached_property
     def _basis_slopes(self) -> list[list[list[Floats]]]:
-        """What multiplies the parameters of each function in its slope at lower and upper end."""
+        """Derivatives of the slope of each function, at both ends, by its free coefficients."""
         rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
         return [
             [[np.reshape(basis_slopes(one, end), (-1, 1)) for end in ends] for one in row]
@@ -102,7 +100,7 @@ class Curves:
         ]
 
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
-        """How far each set goes along its lower and its upper tangent [K], each (2, n)."""
+        """Return the distances along the lower and the upper tangent of each set [K], (2, n)."""
         (lower, upper), (below, above) = self._ends, self._reaches
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
@@ -123,20 +121,20 @@ class Curves:
         return result
 
     def slopes(self, board: Floats) -> Floats:
-        """Differentiate what `values` gives, by the board temperature [per K], (2, 6, n)."""
+        """Differentiate the result of `values` by the board temperature [per K], (2, 6, n)."""
         held = hold(board - self._reference, *self._t_range)
         return self._functions.evaluate(held, 'slope')
 
     def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
-        """Give what multiplies each parameter of each of the six, in the posterior's order."""
+        """Differentiate biases and scales by their parameters, in the posterior's order."""
         t, weight = states[BOARD] - self._reference, states[WEIGHT]
         held, shares = hold(t, *self._t_range), np.array([1.0 - weight, weight])
         is_outside = bool((held != t).any())
         result = []
         for place, functions in enumerate(zip(*self._functions.rows, strict=True)):
             found = []
-            for regime, one in enumerate(functions):
-                basis = shares[regime] * np.reshape(one.basis(held[regime]), (-1, len(t)))
+            for regime, function in enumerate(functions):
+                basis = shares[regime] * np.reshape(function.basis(held[regime]), (-1, len(t)))
                 if is_outside:
                     basis += self._followed(regime, place, t, shares)
                 found += [shares[regime], *basis]
@@ -145,13 +143,13 @@ class Curves:
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
-        Give what multiplies the parameters of one function beyond the ranges, shape (n_free, n):
-        its tangent in each set that follows it, and itself in the other set as far as it goes.
+        Differentiate the continuations by the free coefficients of one function, (n_free, n): its
+        tangent in each set that takes it, and its curve beyond the range of the other set.
         """
         function = self._functions.rows[regime][place]
-        own, other = (edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]])
+        span, other = (edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]])
         here, edge = (
-            np.reshape(function.basis(hold(one, *own)), (-1, len(t)))
+            np.reshape(function.basis(hold(one, *span)), (-1, len(t)))
             for one in (t, hold(t, *other))
         )
         result = shares[1 - regime] * (here - edge)

@@ -261,7 +261,7 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
 
 
 def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:
-    """Differentiate what `basis` gives by the temperature, at `t` [per K]."""
+    """Differentiate the result of `basis` by the temperature, at `t` [per K]."""
     units = np.eye(function.n_free).tolist()
     return [float(function.with_free(tuple(unit), 0.0).slope(t)) for unit in units]
 

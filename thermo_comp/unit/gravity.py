@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns standard gravity, the unit g, and the formatting and parsing of accelerations."""
 
-from __future__ import annotations
-
 import math
 import re
 

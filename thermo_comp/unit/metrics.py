@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns statistics of residuals: corrected - true, and ``|f| - g``, which needs no attitude."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,8 +30,8 @@ def residual_statistics(residual: Floats) -> ResidualStatistics:
 
 def norm_residual(specific_force: Floats, gravity: float | Floats) -> Floats:
     """
-    Return ``|f| - g`` of forces, shape (..., 3): the residual that needs no attitude. Where |f| is
-    known and not g it takes its place.
+    Return ``|f| - g`` of forces, shape (..., 3): the residual that needs no attitude. If the known
+    |f| of a rest is not g, it is passed as `gravity`.
     """
     square = np.einsum('...i,...i->...', specific_force, specific_force)
     return np.asarray(np.sqrt(square) - gravity)

@@ -75,7 +75,7 @@ class Nonlinearity:
 
     def __post_init__(self) -> None:
         check_ranges(self, force_range_m_s2=QUANTITIES['error'])
-        kinds = [one.kind for one in self.terms]
+        kinds = [term.kind for term in self.terms]
         if kinds != [kind for kind in POWERS if kind in kinds]:
             raise ValueError(f'`terms` must be of {list(POWERS)}, each once, in this order')
 
@@ -93,9 +93,9 @@ class Nonlinearity:
     def coefficients(self, t: Floats) -> Floats:
         """Return K2, Kq [s^2/m], K3 [s^4/m^2] by axis at temperatures t [K], shape (3, 3, n)."""
         result = np.zeros((3, 3, len(t)))
-        for one in self.terms:
-            at, slope = np.array([one.coefficient, one.per_kelvin])[:, :, np.newaxis]
-            result[list(POWERS).index(one.kind)] = (at + slope * t) / unit_of(one.kind)
+        for term in self.terms:
+            at, slope = np.array([term.coefficient, term.per_kelvin])[:, :, np.newaxis]
+            result[list(POWERS).index(term.kind)] = (at + slope * t) / unit_of(term.kind)
         return result
 
 
@@ -188,8 +188,8 @@ class ForceCorrection:
         """Differentiate the readings by the coefficients in the file's order, (n, 3, 2 k)."""
         size = np.abs(force)
         each = {'square': force**2, 'odd_square': size * force, 'cube': force**3}
-        values = [each[one.kind] / unit_of(one.kind) for one in self._of.terms]
-        both = [*values, *(self.held(board)[:, np.newaxis] * one for one in values)]
+        values = [each[term.kind] / unit_of(term.kind) for term in self._of.terms]
+        both = [*values, *(self.held(board)[:, np.newaxis] * value for value in values)]
         return np.stack(both, axis=2) if both else np.zeros((*force.shape, 0))
 
     def rows(self, board: Floats, slow: Floats) -> Floats:
@@ -210,7 +210,7 @@ class ForceCorrection:
         added to it; `on_bias`, `on_scale`: factors of bias and relative scale, (rank,). The
         covariances of |f| f with other parameters are omitted, which overstates the variance.
         """
-        kinds = [one.kind for one in self._of.terms]
+        kinds = [term.kind for term in self._of.terms]
         n = len(kinds)
         units = np.array([unit_of(kind) for kind in kinds])
         along = (rows[:n] + t * rows[n:]) / units[:, np.newaxis]
@@ -226,5 +226,5 @@ class ForceCorrection:
             2.0 * n2 * n3,
             n3 * n3,
         )
-        c, d, e, f, g = (float(one.sum()) for one in products)
+        c, d, e, f, g = (float(product.sum()) for product in products)
         return [c, d, e + (v2 + vq), f, g + v3]

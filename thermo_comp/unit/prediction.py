@@ -10,8 +10,6 @@ stop; in a soak (q = 0) all of them are 0. The static set holds in a soak, the d
 ramp. Noise and the uncertainty of the thermometers are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -59,7 +57,7 @@ class SlowUncertainty:
     def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[float]:
         """
         Evaluate a, b, c of each axis at one state: ``v(x) = a + b x + c x^2`` [m^2/s^4]; with a
-        nonlinearity then what it adds to the coefficients of x^2 to x^6 of each axis.
+        nonlinearity then its contribution to the coefficients of x^2 to x^6 of each axis.
         """
         states = np.array(state)[:, np.newaxis]
         table = self._correction.table
@@ -144,14 +142,14 @@ def nonlinear_coefficients(calibration: Calibration) -> list[Coefficients]:
         sd = np.sqrt(variance).reshape(sd.shape)
     names = {'square': ('K2', 'µg/g²'), 'odd_square': ('Kq', 'µg/g²'), 'cube': ('K3', 'µg/g³')}
     found = []
-    for k, one in enumerate(terms):
-        name, unit = names[one.kind]
+    for k, term in enumerate(terms):
+        name, unit = names[term.kind]
         found += [
-            Coefficients(name, unit, 1e6 * np.array(one.coefficient), 1e6 * sd[:, 0, k]),
+            Coefficients(name, unit, 1e6 * np.array(term.coefficient), 1e6 * sd[:, 0, k]),
             Coefficients(
                 f'{name} per kelvin',
                 f'{unit}/K',
-                1e6 * np.array(one.per_kelvin),
+                1e6 * np.array(term.per_kelvin),
                 1e6 * sd[:, 1, k],
             ),
         ]

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the origin of a calibration: its bags, residuals and the evidence for its columns."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -19,7 +17,7 @@ _WeightSd = Annotated[float, QUANTITIES['deviation of a weight']]
 class GroupEvidence:
     """Contribution of one group of columns to the fit."""
 
-    group: Annotated[str, 'The group, as in `response`.']
+    group: Annotated[str, 'Name of the group, as in the key `response`.']
     part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
     explains_m_s2: Annotated[_Error, "RMS of the group's correction."]
     effective_parameters: Annotated[

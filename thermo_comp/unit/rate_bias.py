@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the gyroscope of a unit: its bias, with the columns of the accelerometer; scale 1."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -14,7 +12,7 @@ from .functions import TemperatureFunction, check_reference
 from .posterior import Posterior, lay_out
 from .schema import Vector
 
-#: A unit of angular rates [rad/s].
+#: One millidegree per second, a unit of gyroscope errors [rad/s].
 MILLIDEGREE = math.radians(1e-3)
 NIL = (0.0, 0.0, 0.0)
 #: The largest angular rate of a gyroscope, and its largest bias [rad/s].

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the gyroscope as an accelerometer triad in memory: scale 1, m/s^2 stands for rad/s."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -8,8 +8,6 @@ largest value of a column, and the uncertainty, stay within a million times that
 instrument, and without overflow.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

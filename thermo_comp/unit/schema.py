@@ -9,8 +9,6 @@ list to tuple. Rules between keys belong to the dataclass: it raises a ValueErro
 the key in backticks.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re
@@ -39,8 +37,6 @@ class SchemaError(ValueError):
         super().__init__(f'{key}: {message}' if key else message)
 
 
-Positive = Annotated[float, Bounds(above=0.0)]
-NotNegative = Annotated[float, Bounds(at_least=0.0)]
 #: Three numbers, for x, y, z.
 Vector = tuple[float, float, float]
 
