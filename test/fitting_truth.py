@@ -8,8 +8,8 @@ import numpy as np
 
 from thermo_comp.fitting.beginning import STEEPEST
 from thermo_comp.fitting.equations import as_vector, moved_by
+from thermo_comp.fitting.growth import Candidates
 from thermo_comp.fitting.regression import Regression
-from thermo_comp.fitting.selection import Candidates
 from thermo_comp.fitting.unknowns import WHITE, Noise, Prior, Windows, tangent_basis
 from thermo_comp.fitting.windows import N_SECTIONS
 from thermo_comp.simulation.campaign import positions

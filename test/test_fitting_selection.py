@@ -25,9 +25,10 @@ from fitting_truth import (
 from thermo_comp.fitting.bayes_factors import group_evidence
 from thermo_comp.fitting.beginning import STEEPEST
 from thermo_comp.fitting.claim import claim_of
+from thermo_comp.fitting.comparison import is_better
 from thermo_comp.fitting.hyperparameters import downweigh, settle
 from thermo_comp.fitting.regression import Regression
-from thermo_comp.fitting.selection import Selected, fit_all, is_better, select
+from thermo_comp.fitting.selection import Selected, fit_all, select
 from thermo_comp.fitting.unknowns import InformativePrior, Noise
 
 Case = tuple[Regression, Selected, Truth]

@@ -21,7 +21,7 @@ from .shared_options import argument, option
 if TYPE_CHECKING:
     from ..convert.log import ForeignLog
     from ..fitting import FitResult
-    from ..fitting.selection import Trial
+    from ..fitting.growth import Trial
     from ..unit.calibration import Calibration
     from ..unit.rate_bias import Gyroscope
 

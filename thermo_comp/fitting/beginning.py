@@ -15,11 +15,12 @@ from ..errors import FitError
 from ..typing import Floats
 from .coverage import distinct_directions
 from .data_checks import POSITIONS_NEEDED
+from .growth import Candidates
 from .nonlinear import starting_sd, with_terms
 from .options import FitOptions
 from .priors import informative_priors, with_calibration
 from .regression import Regression
-from .selection import Candidates, Selected, fit_all, select
+from .selection import Selected, fit_all, select
 from .start import ConstantCalibration, constant_calibration, position_means, within_positions
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior
 from .windows import CURVE, ThermalWindows

@@ -22,9 +22,10 @@ import numpy as np
 
 from ..typing import Floats, Ints
 from .equations import as_vector
+from .growth import LAGS
 from .hyperparameters import STUDENT_NU
 from .regression import Posterior, Regression
-from .selection import LAGS, Selected
+from .selection import Selected
 from .unknowns import Layout, Prior
 
 # Grid of the mounting's standard deviation, relative to the scale of its prior: steps of a quarter

@@ -28,6 +28,7 @@ from . import data_checks
 from .assembly import build_calibration
 from .beginning import first_guess, regress
 from .claim import claim_of
+from .comparison import is_better
 from .coverage import LeastKnown, least_known, rough_centre
 from .data_checks import Finding, enforce
 from .environments import (
@@ -43,7 +44,7 @@ from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
 from .priors import constants_of, prior_columns, prior_sets
 from .reduction import ReducedBag, reduce_source
 from .regression import Regression
-from .selection import Selected, is_better
+from .selection import Selected
 from .sensors import board_span, gradients_at_rest, learn_detector, without_copies
 from .sources import FitSource
 from .start import ConstantCalibration, position_means

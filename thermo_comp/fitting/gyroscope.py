@@ -23,10 +23,11 @@ from ..unit.metrics import ResidualStatistics, statistics_by_regime
 from ..unit.rate_triad import gyroscope_of
 from .assembly import build_calibration
 from .claim import claim_of
+from .growth import Candidates
 from .options import FitOptions
 from .reduction import ReducedBag
 from .regression import Regression
-from .selection import Candidates, Selected, select
+from .selection import Selected, select
 from .start import position_means, within_positions
 from .unknowns import Prior
 from .windows import ThermalWindows

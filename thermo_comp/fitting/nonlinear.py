@@ -23,11 +23,12 @@ from ..unit.nonlinearity import POWERS, Kind, Nonlinearity, NonlinearTerm
 from ..unit.posterior import Posterior as FilePosterior
 from .data_checks import Finding
 from .forces import Forces
+from .growth import LEAST_GAIN, TRIAL_GAIN
 from .left_out import Score, score_of
 from .options import FitOptions
 from .reduction import ReducedBag
 from .regression import Posterior, Regression
-from .selection import LEAST_GAIN, TRIAL_GAIN, Selected
+from .selection import Selected
 from .unknowns import Prior, State
 from .windows import ThermalWindows
 
