@@ -28,9 +28,11 @@ from .windows import CURVE, ThermalWindows
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
-# Smallest typical slope of the bias [m/s^2 per K]: 0.1 ug/K, better than navigation grade; also
-# the smallest scale of mounting offsets [m/s^2].
+# Smallest typical slope of the bias [m/s^2 per K]: 0.1 ug/K, better than navigation grade.
 _FLATTEST = 1e-6
+# Smallest and largest scale of mounting and turn-on offsets [m/s^2]: 30 ug, as of sensors of
+# navigation grade, and 0.5 mg, as of consumer MEMS; the tail of the Student prior allows for more.
+_MOUNTING_SCALES = 3e-4, 5e-3
 # Initial sd of mounting offsets, and smallest initial noise [m/s^2]: 1 ug.
 _INITIAL_SIGMA = 1e-5
 
@@ -110,9 +112,8 @@ def regress(
 
 def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> float:
     """
-    Return the scale of the prior of mounting offsets [m/s^2], three times the noise in 1 Hz.
-
-    This is 20 .. 50 ug for a navigation sensor and some tenths of a mg for MEMS.
+    Return the scale of the prior of mounting offsets [m/s^2]: three times the noise in 1 Hz,
+    within bounds.
     """
     # A linear drift has no second difference, so these show the white noise alone.
     data = windows.data
@@ -122,8 +123,10 @@ def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> floa
     bend = np.diff(data.mean / start.scale, n=2, axis=0)[same]
     sigma = float(np.median(np.abs(bend))) / (0.6745 * np.sqrt(6.0))
     density = sigma * np.sqrt(float(np.median(np.diff(data.time)[same])))
-    # At most 0.5 mg, as of consumer MEMS; the tail of the Student prior allows for more.
-    return float(np.clip(3.0 * density, _FLATTEST, 5e-3))
+    least, most = _MOUNTING_SCALES
+    # Readings that never change have no noise; offsets of 1e6 times it have no posterior.
+    least = max(min(least, 100.0 * density), _FLATTEST)
+    return float(np.clip(3.0 * density, least, most))
 
 
 def _candidates(
