@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import FitError
-from ..typing import Floats
+from ..typing import Bools, Floats
 from .coverage import distinct_directions
 from .data_checks import POSITIONS_NEEDED
 from .growth import Candidates
@@ -105,9 +105,25 @@ def regress(
             for ratio in (off / BIAS_SD, off / options.gravity / SCALE_SD)
         )
         narrow = replace(prior, bias_sd=bias * prior.bias_sd, scale_sd=scale * prior.scale_sd)
-    selected = select(regression, state, narrow, candidates, tell)
+    settling = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
+    selected = select(regression, state, narrow, settling, tell)
     wide = replace(selected.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     return regression, replace(selected, prior=wide), candidates.typical
+
+
+def _is_slow(windows: ThermalWindows) -> Bools:
+    """
+    Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
+
+    They can hardly be told from the curve, and their end would be extrapolated: no model has them,
+    but the covariance does.
+    """
+    data = windows.data
+    begin = np.searchsorted(data.bag, np.arange(data.bag.max() + 1))
+    longest_s = float(np.max(np.maximum.reduceat(data.time, begin) - data.time[begin]))
+    taus = [column.tau_s for column in windows.model.columns]
+    taus = [0.0] * (len(data.groups) - len(taus)) + taus
+    return np.asarray(np.array(taus) > longest_s / np.log(10.0))
 
 
 def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> float:
