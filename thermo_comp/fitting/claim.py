@@ -101,7 +101,7 @@ def _with_unseen(
     Add unseen columns to the prior, so that the covariance does not state that they are 0.
 
     An inactive column is consistent with 0, but the data bound it only to ``1 / sqrt(S)``, S being
-    its information given the active columns. If this bound exceeds the standard deviation of a
+    its information given the active columns. If this bound exceeds two standard deviations of a
     window's noise, the column enters the covariance with this sd and zero weight. A column that
     hardly moved is judged as if it had moved as far as the temperature did.
     """
@@ -120,7 +120,7 @@ def _with_unseen(
     # A column is called still if it moved by less than 1 % of the change of temperature.
     stood = kelvins < 0.01 * float(kelvins[0])
     farther = np.where(stood, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
-    matters = (sd > 0.0) & (sd * farther > float(np.mean(prior.sigma)) * units)
+    matters = (sd > 0.0) & (sd * farther > 2.0 * float(np.mean(prior.sigma)) * units)
     return replace(prior, column_sd=np.where(matters, sd, prior.column_sd))
 
 
