@@ -115,8 +115,8 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     """
     Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
 
-    They can hardly be told from the curve, and their end would be extrapolated: no model has them,
-    but the covariance does.
+    They can hardly be told from the curve, and their end would be extrapolated. No model has them;
+    the covariance has those that are linear, see `claim`.
     """
     data = windows.data
     begin = np.searchsorted(data.bag, np.arange(data.bag.max() + 1))
