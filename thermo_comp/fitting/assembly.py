@@ -271,9 +271,12 @@ def file_parameters(
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)
     rows: list[Floats] = []
     for axis, K in enumerate(regression.nominal_scale):
+        of_bias, of_scale = np.where(
+            regression.windows.share[axis] < 1.0, -1, layout.weights[:, axis]
+        )
         for places, unit, level in (
-            (layout.weights[0, axis], K, K * unknown[layout.bias[axis]]),
-            (layout.weights[1, axis], 1.0, unknown[layout.kappa[axis]] / state.kappa[axis]),
+            (of_bias, K, K * unknown[layout.bias[axis]]),
+            (of_scale, 1.0, unknown[layout.kappa[axis]] / state.kappa[axis]),
         ):
             each = unknown[places] * (unit / regression.rms)[:, None]
             static, (delta,), dynamic, response = np.split(each, [n, n + 1, n + 1 + m])

@@ -61,9 +61,8 @@ def group_evidence(
             if part == 'scale':
                 added = added * force
             places, sd = layout.weights[k][:, used].ravel(), prior.column_sd[k][used]
-            (gain,) = log_bayes_factors(
-                mode, posterior.covariance, places[None], np.tile(sd, 3)[None]
-            )
+            each = regression.weight_sd(prior)[k][:, used].ravel()
+            (gain,) = log_bayes_factors(mode, posterior.covariance, places[None], each[None])
             result.append(
                 GroupEvidence(
                     group,

@@ -21,7 +21,13 @@ from .options import FitOptions
 from .priors import informative_priors, with_calibration
 from .regression import Regression
 from .selection import Selected, fit_all, select
-from .start import ConstantCalibration, constant_calibration, position_means, within_positions
+from .start import (
+    ConstantCalibration,
+    constant_calibration,
+    position_means,
+    white_noise_of,
+    within_positions,
+)
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior
 from .windows import CURVE, ThermalWindows
 
@@ -131,13 +137,11 @@ def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> floa
     Return the scale of the prior of mounting offsets [m/s^2]: three times the noise in 1 Hz,
     within bounds.
     """
-    # A linear drift has no second difference, so these show the white noise alone.
     data = windows.data
     same = (data.position[2:] == data.position[:-2]).nonzero()[0]
     if not len(same):
         return _FLATTEST
-    bend = np.diff(data.mean / start.scale, n=2, axis=0)[same]
-    sigma = float(np.median(np.abs(bend))) / (0.6745 * np.sqrt(6.0))
+    sigma = float(np.median(white_noise_of(data, start.scale)))
     density = sigma * np.sqrt(float(np.median(np.diff(data.time)[same])))
     least, most = _MOUNTING_SCALES
     # Readings that never change have no noise; offsets of 1e6 times it have no posterior.

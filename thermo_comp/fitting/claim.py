@@ -30,7 +30,9 @@ from .unknowns import Layout, Prior
 
 # Grid of the mounting's standard deviation, relative to the scale of its prior: steps of a quarter
 # decade, over which the log evidence is smooth.
-_MOUNTING_GRID = 10.0 ** np.arange(-2.0, 1.51, 0.25)
+_MOUNTING_GRID = 10.0 ** np.arange(-3.0, 1.51, 0.25)
+# Smallest standard deviation that is as likely as larger ones, on a logarithmic scale.
+_LEAST_LIKELY = 0.01
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,8 @@ def _with_unseen(
     """
     groups = np.array(regression.windows.groups)
     inactive = regression.inactive(posterior, prior, np.isin(groups, LAGS) & typical.any(axis=0))
-    seen = np.diag(inactive.S).reshape(-1, 3).mean(axis=1)
+    seen = np.diag(inactive.S).reshape(-1, 3)
+    seen = seen.sum(axis=1) / np.maximum((seen > 0.0).sum(axis=1), 1)
     sd = np.zeros_like(typical)
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(seen, 1e-300))
     for group in LAGS:
@@ -133,8 +136,10 @@ def _over_mountings(
         regression.solve(posterior.state, replace(prior, offset_sd=float(sd)), n_steps=1)
         for sd in tried
     ]
-    # Density per step of the logarithm: flat below the scale, with a Student's tail above it.
+    # Density per step of the logarithm: flat below the scale, with a Student's tail above it, and
+    # falling to 0 below a hundredth of the scale, which few mountings reach.
     density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(_MOUNTING_GRID**2 / STUDENT_NU)
+    density += np.log(np.minimum(_MOUNTING_GRID / _LEAST_LIKELY, 1.0))
     weight = np.array([fit.log_evidence for fit in fits]) + density
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()

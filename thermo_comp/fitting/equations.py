@@ -238,17 +238,22 @@ class Equations(Series):
             along = self.forces.linearise(along, state.nonlinear, rows)
         return np.asarray(along @ np.linalg.inv(state.inverse).T)
 
+    def weight_sd(self, prior: Prior) -> Floats:
+        """Return the prior sd of the weights of each axis, shape (2, 3, m)."""
+        return np.asarray(prior.column_sd[:, None] * self.windows.share)
+
     @last_result_kept
     def precision(self, prior: Prior, layout: Layout) -> Floats:
         """Return inverse prior variances, shape (n,); 0 for those of an informative prior."""
         result = np.zeros(layout.n)
         result[layout.kappa] = prior.scale_sd**-2
         result[layout.bias] = prior.bias_sd**-2.0
-        columns = prior.column_sd[prior.column_sd > 0.0]
-        result[layout.axis[:, 2 : 2 + len(columns)]] = columns**-2.0
+        active = prior.column_sd > 0.0
+        columns = self.weight_sd(prior).transpose(1, 0, 2)[:, active]
+        result[layout.axis[:, 2 : 2 + columns.shape[1]]] = columns**-2.0
         if self.forces is not None:
             bends = prior.nonlinear_sd[prior.nonlinear_sd > 0.0]
-            result[layout.axis[:, 2 + len(columns) :]] = bends**-2.0
+            result[layout.axis[:, 2 + columns.shape[1] :]] = bends**-2.0
             result[layout.stretch] = self.forces.stretch_sd[:, None] ** -2.0
             if layout.radius.size:
                 result[layout.radius] = self.forces.radius_sd**-2.0

@@ -21,14 +21,13 @@ from ..recording.stillness import widened
 from ..text import valid_serial
 from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
-from ..unit.columns import bank
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.nonlinearity import NonlinearTerm
 from . import data_checks
+from .alternatives import model_of, regressed
 from .assembly import build_calibration
-from .beginning import first_guess, regress
+from .beginning import first_guess
 from .claim import claim_of
-from .comparison import is_better
 from .coverage import LeastKnown, least_known, rough_centre
 from .data_checks import Finding, enforce
 from .environments import (
@@ -40,18 +39,16 @@ from .environments import (
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
-from .options import COUNTS_FULL_SCALE, FitOptions, sets_of
-from .priors import constants_of, prior_columns, prior_sets
+from .options import COUNTS_FULL_SCALE, FitOptions
+from .priors import constants_of
 from .reduction import ReducedBag, reduce_source
-from .regression import Regression
 from .selection import Selected
-from .sensors import board_span, gradients_at_rest, learn_detector, without_copies
+from .sensors import without_copies
 from .sources import FitSource
-from .start import ConstantCalibration, position_means
-from .windows import FEWEST_WINDOWS, SET, Model, ThermalWindows, thermal_windows
+from .start import position_means
+from .windows import FEWEST_WINDOWS, ThermalWindows, thermal_windows
 
 Progress = Callable[[float], None]
-Regressed = tuple[Regression, Selected, Floats | None]  # see `regress`
 
 
 @dataclass(frozen=True)
@@ -233,7 +230,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     findings += data_checks.judge_copies(copies)
     known = options.prior
     terms: tuple[NonlinearTerm, ...] = ()
-    model = _model_of(bags, options)
+    model = model_of(bags, options)
     tell(0.55)
     windows = with_forces(thermal_windows(bags, model), bags, options)
     if known is not None and windows.data.forces and known.nonlinearity is None:
@@ -246,7 +243,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(data_checks.judge_windows(windows, up, has_case), options)
     tell(0.7)
-    windows, (regression, selected, typical) = _regressed(windows, bags, start, up, options, tell)
+    windows, (regression, selected, typical) = regressed(windows, bags, start, up, options, tell)
     if known is None:
         selected, terms = choose(regression, selected, options)
     claim = claim_of(regression, selected, typical, options.gravity_sd)
@@ -291,56 +288,6 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> Fit
     )
 
 
-def _model_of(bags: Sequence[ReducedBag], options: FitOptions) -> Model:
-    """Return curves, columns and detector: those of the prior, or else all that the bags allow."""
-    prior, reference = options.prior, options.reference_temperature
-    if prior is not None:
-        sets, columns = prior_sets(prior), prior_columns(prior)
-        detector = options.detector or prior.detector
-        return Model(options.model, sets, columns, prior.sensors, detector, reference)
-    detector, sensors = options.detector or learn_detector(bags), sensors_of(bags)
-    columns = ()
-    if options.model != 'golovach':
-        rests = gradients_at_rest(bags, sensors)
-        columns = bank(sensors, rests, board_span(bags, reference))
-    if not any(len(bag.case.value) for bag in bags):
-        # Without a case thermometer the gradient is estimated from the board's rate, and its
-        # columns are combinations of those of the board.
-        columns = tuple(column for column in columns if not column.is_of_sensor)
-    if options.groups is not None:
-        asked = {*options.groups, *options.forced}
-        columns = tuple(column for column in columns if column.group in asked)
-    return Model(options.model, sets_of(options, bags), columns, sensors, detector, reference)
-
-
-def _regressed(
-    windows: ThermalWindows,
-    bags: Sequence[ReducedBag],
-    start: ConstantCalibration,
-    up: Floats,
-    options: FitOptions,
-    tell: Progress,
-) -> tuple[ThermalWindows, Regressed]:
-    """
-    Fit the windows with the better end condition of the dynamic regime.
-
-    The condition affects only the sets: constant temperatures of case and board, or of the case
-    alone. The second is tried if the bags have a case thermometer and two sets may be chosen.
-    """
-    result = regress(windows, start, up, options, tell)
-    has_case = all(len(bag.case.value) for bag in bags)
-    has_choice = has_case and options.prior is None and options.detector is None
-    if not has_choice or not _may_have_sets(result[1]):
-        return windows, result
-    model = windows.model
-    closed = replace(model, detector=replace(model.detector, closes='case'))
-    others = with_forces(thermal_windows(bags, closed), bags, options)
-    again = regress(others, start, up, options, tell)
-    # Both have the same columns: halves of the program, which limit their number, say nothing.
-    found = is_better(result[1].score, again[1].score, by_halves=False)
-    return (others, again) if found else (windows, result)
-
-
 def _unusable(error: ValueError) -> FitError:
     """Return the error of a calibration with values outside their ranges."""
     if 'misalignment' in str(error):
@@ -350,28 +297,6 @@ def _unusable(error: ValueError) -> FitError:
             'there at least 9 positions?'
         )
     return FitError(f'these data give no calibration that can be used: {error}')
-
-
-def _may_have_sets(selected: Selected) -> bool:
-    """
-    Whether the chosen model has two sets, or a model with two sets is similarly good.
-
-    Similarly good: within one standard error of the chosen model on left-out data, with less than
-    80 % of its noise.
-    """
-    chosen = next(trial for trial in selected.trials if trial.is_chosen)
-    limit = 0.8 * chosen.prior.sigma
-    return any(
-        SET in trial.groups
-        and (trial.is_chosen or (trial.is_near and (trial.prior.sigma < limit).all()))
-        for trial in selected.trials
-    )
-
-
-def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Return the thermometers that all bags have, without the board's; the case is first."""
-    seen = ({name for name, one in bag.temperatures.items() if len(one.value)} for bag in bags)
-    return 'case', *sorted(set.intersection(*seen) - {'board', 'case'})
 
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:

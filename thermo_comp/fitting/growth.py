@@ -23,6 +23,10 @@ from .windows import BEND, CURVE, SET
 TRIAL_GAIN = 4.0
 # Largest number of groups tried in a round.
 _TRIALS = 3
+# Largest number of bend columns: three axes, each with a dozen knees around a bump.
+_MOST_BENDS = 60
+#: Groups of the curve of parts that lag the board: a polynomial in t - m, m the lag.
+PART_CURVE = ('board', 'product', 'square')
 #: Groups that are linear in a temperature difference.
 LAGS = ('gradient', 'board', 'gradient_lag')
 # Groups that are tried together, because one effect has columns in all of them: the curve of a
@@ -91,7 +95,7 @@ def pruned_fit(
 ) -> tuple[Posterior, Prior]:
     """Drop columns with too little gain, as long as the log evidence of the new fit agrees."""
     while True:
-        fewer = pruned(posterior, prior, candidates.kept, LEAST_GAIN)
+        fewer = pruned(regression, posterior, prior, candidates.kept, LEAST_GAIN)
         if np.array_equal(fewer.column_sd, prior.column_sd):
             return posterior, prior
         found = settled(regression, posterior.state, fewer, candidates, rounds)
@@ -144,13 +148,13 @@ class Growth:
                 return chosen, trials
             chosen = simplest_of_the_best(chosen, better)
 
-    def bent(self, begin: Trial, asked: Sequence[str]) -> Trial | None:
-        """Fit a model with all lags and the bends that it lacks; None if it lacks none."""
-        lags = tuple(name for name in LAGS if name in asked)
-        groups = (*begin.groups, *lags)
-        typical = self._typical(begin, lags, self._candidates.typical)
-        lagged = self.fit(groups, begin.posterior.state, begin.prior, typical)
-        return next(iter(self.trials(lagged, [BEND])), None)
+    def bent(self, begin: Trial, asked: Sequence[str], groups: Sequence[str]) -> list[Trial]:
+        """Fit a model with some groups, and then the bends that it lacks."""
+        more = tuple(name for name in groups if name in asked)
+        typical = self._typical(begin, more, self._candidates.typical)
+        first = self.fit((*begin.groups, *more), begin.posterior.state, begin.prior, typical)
+        bent = self.trials(first, [BEND]) if BEND in asked else []
+        return [first, *bent]
 
     def trials(self, chosen: Trial, absent: list[str]) -> list[Trial]:
         """Fit the chosen model plus each group with a large possible gain in log evidence."""
@@ -160,9 +164,9 @@ class Growth:
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self._regression.inactive(chosen.posterior, chosen.prior, columns)
         if BEND in absent:
-            # At most 16 of the many bend columns are tried, chosen by forward selection.
+            # Some of the many bend columns are tried, chosen by forward selection.
             is_bend = self._names == BEND
-            knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, 16)
+            knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, _MOST_BENDS)
             typical = np.where(is_bend & ~knees, 0.0, typical)
         asked: list[tuple[str, ...]] = [(name,) for name in absent]
         together = (tuple(name for name in names if name in absent) for names in _TOGETHER)

@@ -23,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ..typing import Bools, Floats
+from ..typing import Bools, Floats, Ints
 from .bayes_factors import log_bayes_factors
 from .regression import Posterior, Regression
 from .unknowns import Prior, State
@@ -179,7 +179,9 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     return np.asarray(np.maximum(sigma, 1e-8))
 
 
-def pruned(posterior: Posterior, prior: Prior, fixed: Bools, least_gain: float) -> Prior:
+def pruned(
+    regression: Regression, posterior: Posterior, prior: Prior, fixed: Bools, least_gain: float
+) -> Prior:
     """
     Drop columns with a log Bayes factor below `least_gain`, one at a time, the smallest first; the
     factors of the others are then those without it.
@@ -190,11 +192,11 @@ def pruned(posterior: Posterior, prior: Prior, fixed: Bools, least_gain: float) 
     where = layout.weights >= 0
     mode[layout.weights[where]] = state.weights[where]
     asked = np.argwhere((prior.column_sd > 0.0) & ~fixed).tolist()
-    column_sd = prior.column_sd.copy()
+    column_sd, weight_sd = prior.column_sd.copy(), regression.weight_sd(prior)
     while asked:
         part, column = np.array(asked).T
         places = layout.weights[part, :, column]
-        gains = log_bayes_factors(mode, covariance, places, prior.column_sd[part, column])
+        gains = log_bayes_factors(mode, covariance, places, weight_sd[part, :, column])
         least = int(np.argmin(gains))
         if gains[least] >= least_gain:
             break
@@ -212,10 +214,16 @@ def downweigh(regression: Regression, posterior: Posterior, prior: Prior) -> Non
 
     The weight is that at which the window would be 3 sd away.
     """
-    base = regression.windows.weight
-    size = regression.residual(posterior.state, posterior.layout) / prior.sigma
-    size *= np.sqrt(base)[:, None]
-    edges = np.flatnonzero(np.diff(regression.windows.position)) + 1
+    windows = regression.windows
+    if windows.undisturbed is None:
+        size = regression.residual(posterior.state, posterior.layout) / prior.sigma
+        regression.reweigh(windows.weight * undisturbed(size, windows.weight, windows.position))
+
+
+def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
+    """Return the factors, up to 1, of the weights of windows with some residuals, (n, 3)."""
+    size = residual * np.sqrt(weight)[:, None]
+    edges = np.flatnonzero(np.diff(position)) + 1
     for part in np.split(size, edges):
         if len(part) >= 2 * _NEIGHBOURS + 1:
             around = np.pad(part, ((_NEIGHBOURS, _NEIGHBOURS), (0, 0)), mode='reflect')
@@ -226,4 +234,4 @@ def downweigh(regression: Regression, posterior: Posterior, prior: Prior) -> Non
     # median deviation of 0. The 80 % quantile of |x| is robust, too: 1.2816 sd of a normal.
     usual = np.quantile(size, 0.8, axis=0) / 1.2816
     size = np.minimum(size / np.maximum(usual, 1e-300), 1e3).max(axis=1)
-    regression.reweigh(base * (3.0 / np.maximum(size, 3.0)) ** 2)
+    return np.asarray((3.0 / np.maximum(size, 3.0)) ** 2)

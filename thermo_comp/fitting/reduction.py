@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -37,8 +37,11 @@ WINDOW_S = 10.0
 _MIN_RESTS_S = (3.0, 2.0, 1.0)
 # Candidates of the largest ratio of a rest's variance to the quietest one, the strictest first.
 _VARIANCE_RATIOS = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
-# Number of samples in a cell if the samples are slow and rests are short.
-_FEW_SAMPLES = 5
+# Numbers of samples in a cell if the samples are slow: where rests are interrupted, where they are
+# short.
+_FEWER_SAMPLES, _FEW_SAMPLES = 10, 5
+# Part of a bag at rest that is not interrupted, and part that shorter cells must add.
+_MOSTLY_STILL, _MORE_STILL = 0.95, 0.05
 
 
 class Readings(NamedTuple):
@@ -177,23 +180,18 @@ def reduce_source(
         ranges = _rests(found, min_rest_s, still_sd)
     per_window = max(1, round(window_s / found.cell_s)) if found.cell_s else 1
     n_still = sum(upper - lower for lower, upper in ranges)
-    # Cells longer than 3 s, and less than half of the time at rest: try shorter cells, and keep
-    # them if they give six attitudes.
-    if least > _FEW_SAMPLES and found.cell_s > 3.0 and 2 * n_still < len(found.count):
-        closer = reduce_source(
+    if least == stillness.MIN_SAMPLES and found.cell_s > 3.0:
+        closer = _with_shorter_cells(
             source,
+            n_still / len(found.count),
             window_s=window_s,
             cell_s=cell_s,
             min_rest_s=min_rest_s,
             still_sd=still_sd,
             full_scale=full_scale,
             fewest_windows=fewest_windows,
-            least=_FEW_SAMPLES,
         )
-        means = np.array([interval.mean.mean(axis=0) for interval in closer.intervals]).reshape(
-            -1, 3
-        )
-        if len(distinct_directions(directions(means, rough_centre(means)))) >= 6:
+        if closer is not None:
             return closer
     return ReducedBag(
         source=source,
@@ -230,6 +228,26 @@ def reduce_source(
         or ('' if ranges else f'no still interval: {_why_restless(found, n_samples, still_sd)}'),
         angular_rate='whole' if has_rate else 'part' if found.rate.any() else 'none',
     )
+
+
+def _with_shorter_cells(source: FitSource, share: float, **options: Any) -> ReducedBag | None:
+    """
+    Reduce a source of slow samples in shorter cells; None if the usual ones serve.
+
+    `share`: the part of the bag at rest in usual cells. A bias that changes within minutes looks
+    like a motion there, and short rests are lost.
+    """
+    if share < _MOSTLY_STILL and source.force is None:
+        closer = reduce_source(source, least=_FEWER_SAMPLES, **options)
+        if closer.n_still_cells / closer.n_cells > share + _MORE_STILL:
+            return closer
+    if share < 0.5:
+        closer = reduce_source(source, least=_FEW_SAMPLES, **options)
+        means = np.array([interval.mean.mean(axis=0) for interval in closer.intervals])
+        means = means.reshape(-1, 3)
+        if len(distinct_directions(directions(means, rough_centre(means)))) >= 6:
+            return closer
+    return None
 
 
 def _max_abs(cells: Cells) -> float:

@@ -275,7 +275,11 @@ class Regression(Equations):
             S[:, axis, :, axis] += sums[axis, part[:, None], part, at[:, None], at]
         step, factor = self.unit_step(reduced.whole, prior, layout, state)
         S = S.reshape(gone.shape) - cross[:n].T @ solved(factor, cross[:n])
-        return Inactive(part, column, S, cross[n] - cross[:n].T @ step)
+        Q = cross[n] - cross[:n].T @ step
+        if self.windows.acts_on is not None:
+            absent = ~self.windows.acts_on[column].ravel()
+            S[absent], S[:, absent], Q[absent] = 0.0, 0.0, 0.0
+        return Inactive(part, column, S, Q)
 
 
 def _held(normal: Normal, layout: Layout) -> Normal:

@@ -14,7 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .comparison import is_better, is_near, is_undecided
-from .growth import TRIAL_GAIN, Candidates, Growth, Trial, likelier, pruned_fit, settled
+from .growth import (
+    LAGS,
+    PART_CURVE,
+    TRIAL_GAIN,
+    Candidates,
+    Growth,
+    Trial,
+    likelier,
+    pruned_fit,
+    settled,
+)
 from .hyperparameters import downweigh, white_noise
 from .left_out import Score, score_of
 from .regression import Posterior, Regression
@@ -67,19 +77,25 @@ def select(
         chosen = grow.fit(groups, curve.posterior.state, curve.prior, curve.typical)
         trials.append(chosen)
     begin = chosen
+    if regression.windows.has_part_lags:
+        found = grow.bent(begin, asked, PART_CURVE)
+        trials += found
+        for one in found:
+            if is_better(chosen.score, one.score):
+                chosen = one
     chosen, found = grow.added(chosen, asked, progress)
     trials += found
     noise = float(chosen.prior.sigma.mean())
     if BEND in asked and BEND not in chosen.groups and chosen.score.rms > _AT_NOISE * noise:
         # The slopes of a part that lags are seen only beside its lag, not beside a stand-in of
         # products and squares.
-        bent = grow.bent(begin, asked)
-        if bent is not None and bent.score.rms < _PROMISING * chosen.score.rms:
-            trials.append(bent)
-            bent, found = grow.added(bent, asked, progress)
+        _, *bent = grow.bent(begin, asked, LAGS)
+        if bent and bent[0].score.rms < _PROMISING * chosen.score.rms:
+            trials += bent
+            more, found = grow.added(bent[0], asked, progress)
             trials += found
-            if is_better(chosen.score, bent.score):
-                chosen = bent
+            if is_better(chosen.score, more.score):
+                chosen = more
     if chosen is not constants and not is_better(constants.score, chosen.score):
         gain = chosen.posterior.log_evidence - constants.posterior.log_evidence
         if not is_undecided(constants.score, chosen.score) or gain < TRIAL_GAIN:

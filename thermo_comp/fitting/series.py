@@ -130,7 +130,8 @@ class Series:
         new_cell |= np.diff(windows.section, prepend=-1) != 0
         self._cells = np.flatnonzero(new_cell)
         self.whitener = Whitener(windows.position, windows.time)
-        self.reweigh(windows.weight)
+        shares = 1.0 if windows.undisturbed is None else windows.undisturbed
+        self.reweigh(windows.weight * shares)
 
     def reweigh(self, weight: Floats) -> None:
         """Set the weights of the windows, shape (n,)."""

@@ -105,6 +105,18 @@ def position_means(windows: Windows) -> Floats:
     return np.asarray(weighted / total[:, None])
 
 
+def white_noise_of(windows: Windows, scale: Floats) -> Floats:
+    """
+    Return the white noise of the windows of each axis [m/s^2], shape (3,), from their second
+    differences, which a drift does not enter; 0 without three windows in a position.
+    """
+    same = (windows.position[2:] == windows.position[:-2]).nonzero()[0]
+    if not len(same):
+        return np.zeros(3)
+    bend = np.diff(windows.mean / scale, n=2, axis=0)[same]
+    return np.asarray(np.median(np.abs(bend), axis=0) / (0.6745 * np.sqrt(6.0)))
+
+
 def within_positions(measured: Floats, position: Ints) -> Floats:
     """Subtract the mean of each position from the measured vectors of windows, shape (n, 3)."""
     _, where, count = np.unique(position, return_inverse=True, return_counts=True)

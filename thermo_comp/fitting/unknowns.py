@@ -22,6 +22,10 @@ SCALE_SD = 0.05
 MISALIGNMENT_SD = 1e-3
 
 
+# Prior sd of a weight that a column does not have, over that of its other weights.
+_ABSENT = 1e-6
+
+
 @dataclass(frozen=True)
 class Windows:
     """
@@ -43,6 +47,9 @@ class Windows:
     in_scale: columns that the scale may have as well as the bias, shape (m,)
     tilt: temperatures with which a support may tilt, over their RMS, shape (n, k)
     forces: known |f| and nonlinear terms; None if |f| is gravity in all positions
+    undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,); None if the fit
+        shall estimate them
+    acts_on: axes that each column acts on, shape (m, 3); None for all
     """
 
     position: Ints
@@ -60,11 +67,24 @@ class Windows:
     in_scale: Bools
     tilt: Floats
     forces: Forces | None = None
+    undisturbed: Floats | None = None
+    acts_on: Bools | None = None
 
     @property
     def n_positions(self) -> int:
         """Number of positions."""
         return int(self.position[-1]) + 1
+
+    @property
+    def has_part_lags(self) -> bool:
+        """Whether the lags are those of the unit's parts."""
+        return self.acts_on is not None
+
+    @cached_property
+    def share(self) -> Floats:
+        """Prior sd of the weights of each axis over that of their column, shape (3, m)."""
+        every = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
+        return np.where(every.T, 1.0, _ABSENT)
 
     @property
     def n_sections(self) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,6 +74,7 @@ class Model:
     The model of a fit: curves and columns, and the settings of the thermal state.
 
     name: name of the model in the provenance
+    part_taus: time constants of the part of each axis [s], 0 for none; None if not known
     sensors: thermometers other than the board's; the first is the case's
     """
 
@@ -82,6 +84,36 @@ class Model:
     sensors: tuple[str, ...]
     detector: DetectorSettings
     reference_temperature: float
+    part_taus: tuple[float, float, float] | None = None
+
+    @property
+    def acts_on(self) -> Bools | None:
+        """Axes that each column of the response acts on, shape (k, 3); None for all."""
+        if self.part_taus is None:
+            return None
+        return np.array(
+            [
+                [
+                    one.tau_s == tau or not (one.kind == 'bend' or one.lag) or one.kind == 'play'
+                    for tau in self.part_taus
+                ]
+                for one in self.columns
+            ]
+        )
+
+
+class Track(NamedTuple):
+    """
+    The states of the tracker over a bag, without memory.
+
+    start_s, step_s: start and step of the time grid [s]
+    states: shape (n, width); is_known: which of them are known, shape (n,)
+    """
+
+    start_s: float
+    step_s: float
+    states: Floats
+    is_known: Bools
 
 
 @dataclass(frozen=True)
@@ -98,6 +130,7 @@ class ThermalWindows:
     angular_rate: mean angular rate [rad/s], shape (n, 3); (n, 0) if a bag lacks it
     typical_count: number of samples of a typical window
     rests: bag and interval of each position
+    tracks: thermal states of each bag
     """
 
     model: Model
@@ -110,6 +143,7 @@ class ThermalWindows:
     angular_rate: Floats
     typical_count: float
     rests: tuple[tuple[ReducedBag, StillInterval], ...] = ()
+    tracks: tuple[Track, ...] = ()
 
     @property
     def was_measured(self) -> bool:
@@ -122,14 +156,17 @@ class ThermalWindows:
         return bool(np.ptp(self.temperature) > 0.0)
 
 
-def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
+def thermal_windows(
+    bags: Sequence[ReducedBag], model: Model, tracks: Sequence[Track] | None = None
+) -> ThermalWindows:
     """
     Combine the windows of all bags with the columns of their thermal states.
 
     Windows are left out before the board's first reading, while its estimate settles, and while
     readings of a thermometer are missing. A bag without any temperature is taken to be at the
-    reference, where all columns are 0.
+    reference, where all columns are 0. `tracks`: known thermal states of this detector
     """
+    tracks = tracks or [_track(bag, model) for bag in bags]
     sets, columns, reference = model.sets, model.columns, model.reference_temperature
     spec = memory_of(columns, model.sensors)
     table = ColumnTable(columns, spec, reference)
@@ -138,8 +175,8 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
     groups = [group for group, _ in sets.levels()]
     rests: list[tuple[ReducedBag, StillInterval]] = []
     has_rate = all(one.angular_rate is not None for bag in bags for one in bag.intervals)
-    for bag, reduced in enumerate(bags):
-        grid, states, is_known = _states(reduced, spec, model)
+    for bag, (reduced, track) in enumerate(zip(bags, tracks, strict=True)):
+        grid, states, is_known = _with_memory(track, spec)
         for interval in reduced.intervals:
             use = np.interp(interval.time, grid, is_known, left=0.0) == 1.0
             if not use.any():
@@ -197,6 +234,9 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
             + [column.kind not in ('play', 'bend') for column in columns]
         ),
         tilt=tilt[:, is_tilting] / tilt_rms[is_tilting],
+        acts_on=None
+        if model.acts_on is None
+        else np.vstack((np.ones((len(groups), 3), dtype=bool), model.acts_on)),
     )
     return ThermalWindows(
         model,
@@ -209,6 +249,7 @@ def thermal_windows(bags: Sequence[ReducedBag], model: Model) -> ThermalWindows:
         angular_rate=rows[:, end:],
         typical_count=float(np.median(count)),
         rests=tuple(rests),
+        tracks=tuple(tracks),
     )
 
 
@@ -243,29 +284,35 @@ def _kelvins(
     return np.where(slope > 0.0, rms / np.where(slope > 0.0, slope, 1.0), 0.0)
 
 
-def _states(bag: ReducedBag, spec: MemorySpec, model: Model) -> tuple[Floats, Floats, Bools]:
-    """Return a time grid [s], the states of the tracker on it, and which of them are known."""
+def _track(bag: ReducedBag, model: Model) -> Track:
+    """Run the tracker over the readings of a bag."""
+    spec = MemorySpec(model.sensors)
     if not len(bag.board.value):
         # Without a thermometer assume that the unit has been at the reference temperature for
         # 1e9 s, so that all lags are 0.
         still = np.zeros((2, Layout(spec).width))
         still[:, BOARD] = model.reference_temperature
-        ends: Floats = np.array([-1e9, 1.0 + (bag.end_ns - bag.start_ns) * 1e-9])
-        return ends, still, np.ones(2, dtype=bool)
-    tracker = ThermalTracker(model.detector, MemorySpec(spec.sensors), ThermalConfig())
+        end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9
+        return Track(-1e9, 1e9 + end_s, still, np.ones(2, dtype=bool))
+    tracker = ThermalTracker(model.detector, spec, ThermalConfig())
     shortest = min(
         (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1), default=1.0
     )
     step_s = max(shortest / 5.0, 0.1)
     start_s, states, is_known = thermal_states(bag, tracker, step_s)
-    grid = np.asarray(start_s + step_s * np.arange(len(states)), dtype=np.float64)
-    # The lags are evaluated on the whole grid at once, which is much faster than at each reading.
-    gradients = [states[:, GRADIENT + 2 * k] for k in range(len(spec.sensors))]
-    memory = memory_on_grid(spec, step_s, states[:, BOARD], gradients)
-    states = np.hstack((states, memory))
     settled = states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])
     is_known[: int(np.argmax(settled))] = False
-    return grid, states, is_known
+    return Track(start_s, step_s, states, is_known)
+
+
+def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats, Bools]:
+    """Return a time grid [s], the states on it with their lags, and which of them are known."""
+    states = track.states
+    grid = np.asarray(track.start_s + track.step_s * np.arange(len(states)), dtype=np.float64)
+    # The lags are evaluated on the whole grid at once, which is much faster than at each reading.
+    gradients = [states[:, GRADIENT + 2 * k] for k in range(len(spec.sensors))]
+    memory = memory_on_grid(spec, track.step_s, states[:, BOARD], gradients)
+    return grid, np.hstack((states, memory)), track.is_known
 
 
 def _moved(table: ColumnTable, slopes: Floats, age_s: Floats) -> Floats:

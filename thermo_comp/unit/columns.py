@@ -70,7 +70,7 @@ PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final = (0.0, 450.0, 900.0, 1800.0)
 #: Lags of the parts whose slope changes at a knee [s]; distance [K] and number of the knees.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
-LEAST_KNEE_K, MOST_KNEES = 1.0, 20
+LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
 _Value = Annotated[float, QUANTITIES['value of a column']]
@@ -186,20 +186,26 @@ def bank(
     sensors: Sequence[str] = ('case',),
     at_rest: Mapping[str, float] | None = None,
     span_k: tuple[float, float] = (0.0, 0.0),
+    part_taus: Sequence[float] | None = None,
 ) -> tuple[Column, ...]:
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
-    of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K].
+    of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K]. With
+    `part_taus`, the time constants of the three axes' parts [s] (0: none), all lags have these.
     """
+    fine, coarse_taus, bend_taus, most_knees = FINE_TAUS, BANK_TAUS, BEND_TAUS, MOST_KNEES
+    if part_taus is not None:
+        bend_taus, most_knees = tuple(sorted({*part_taus})), MOST_PART_KNEES
+        fine = coarse_taus = tuple(tau for tau in bend_taus if tau)
     gradient = [Column('gradient', 'gradient', sensor, range=UNBOUNDED) for sensor in sensors]
-    board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in FINE_TAUS]
+    board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in fine]
     lagged_gradient = [
         replace(column, group='gradient_lag', kind='gradient_lag', sensor=sensor)
         for sensor in sensors
         for column in board
     ]
-    coarse = [column for column in board if column.tau_s in BANK_TAUS]
-    flow = [*gradient, *(column for column in lagged_gradient if column.tau_s in BANK_TAUS)]
+    coarse = [column for column in board if column.tau_s in coarse_taus]
+    flow = [*gradient, *(column for column in lagged_gradient if column.tau_s in coarse_taus)]
     product = [
         replace(column, group='product', power=power) for power in (1, 2) for column in coarse
     ]
@@ -235,10 +241,11 @@ def bank(
         for tau in PLAY_TAUS
         for width in PLAY_WIDTHS
     ]
-    n_knees = min(int((span_k[1] - span_k[0]) / LEAST_KNEE_K), MOST_KNEES)
+    least_k = LEAST_KNEE_K * MOST_KNEES / most_knees
+    n_knees = min(int((span_k[1] - span_k[0]) / least_k), most_knees)
     bend = [
         Column('bend', 'bend', tau_s=tau, knee_k=knee, range=UNBOUNDED)
-        for tau in BEND_TAUS
+        for tau in bend_taus
         for knee in np.linspace(*span_k, n_knees + 2)[1:-1].round(3).tolist()
     ]
     return (*gradient, *board, *lagged_gradient, *product, *mixed, *square, *even, *play, *bend)

@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the time constants of the parts: one lag per axis.
+
+The bias and the scale factor of an axis are functions of the temperature of its part, which lags
+the board: ``x = t - m``, m the lag of the board by one time constant. The time constant is that at
+which a spline of the bias and a cubic of the scale factor, both over x, leave the smallest
+residuals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline, CubicSpline
+from scipy.optimize import minimize_scalar
+
+from ..typing import Floats
+from .hyperparameters import undisturbed
+from .start import ConstantCalibration, position_means, white_noise_of
+from .windows import ThermalWindows
+
+# Distance [K] and largest number of the nodes of the spline of the bias.
+_NODE_K, _MOST_NODES = 0.6, 60
+# Largest number of windows used to find a time constant.
+_MOST_WINDOWS = 3000
+# Time constants that are shorter than those of the columns [s].
+_SHORT_TAUS = (15.0, 21.0, 30.0, 42.0)
+# Largest RMS residual, relative to the white noise, of a unit whose axes are curves of parts.
+_AT_NOISE = 1.5
+# Smallest relative increase of the RMS residual if a time constant changes by `_STEP`.
+_INCREASE, _STEP = 0.05, 2.0**0.5
+# Time constant in the middle of the interpolation [s].
+_MIDDLE_S = 200.0
+# Ridge of the normal equations, relative to their diagonal.
+_RIDGE = 1e-7
+
+
+@dataclass(frozen=True)
+class Parts:
+    """
+    The parts of a unit.
+
+    taus: the time constant of each axis [s]; 0 without a lag
+    undisturbed: factors of the weights of the windows, see `Windows`, shape (n,)
+    """
+
+    taus: tuple[float, float, float]
+    undisturbed: Floats
+
+
+def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | None:
+    """
+    Find the lag of each axis, and the windows that no curve of its part describes.
+
+    Returns None if the axes are no curves of one part each, or if a lag is not determined.
+    """
+    data, columns = windows.data, windows.model.columns
+    lags = [k for k, one in enumerate(columns) if one.group == 'board']
+    if not lags or not windows.has_temperature:
+        return None
+    curves = _PartCurves(windows, start, lags)
+    found = [curves.time_constant(axis) for axis in range(3)]
+    if not all(curves.is_determined(tau, axis) for axis, tau in enumerate(found)):
+        return None
+    residual = np.column_stack([curves.residual(tau, axis) for axis, tau in enumerate(found)])
+    factors = undisturbed(residual, data.weight, data.position)
+    square = np.average(residual**2, axis=0, weights=data.weight * factors)
+    if (square > (_AT_NOISE * white_noise_of(data, start.scale)) ** 2).any():
+        return None
+    x, y, z = (round(float(tau), 1) for tau in found)
+    return Parts((x, y, z), factors)
+
+
+class _PartCurves:
+    """
+    The curves of each axis over the temperature of its part, for any time constant.
+
+    `lags`: the columns of the board's lags
+    """
+
+    def __init__(
+        self, windows: ThermalWindows, start: ConstantCalibration, lags: list[int]
+    ) -> None:
+        data = windows.data
+        self._position, self._bag = data.position, data.bag
+        self._weight = data.weight[:, None]
+        self._first = np.searchsorted(data.position, np.arange(data.n_positions))
+        self._t = windows.temperature - windows.model.reference_temperature
+        self._taus = np.array([windows.model.columns[k].tau_s for k in lags])
+        # Lags between those of the columns are interpolated: their ratio to the time constant is
+        # smooth, and the rate at 0.
+        ratios = np.column_stack((windows.rate, windows.raw[:, lags] / self._taus))
+        self._ratio = CubicSpline(_even(np.append(0.0, self._taus)), ratios, axis=1)
+        begin = np.searchsorted(data.bag, np.arange(data.bag.max() + 1))
+        self._age = data.time - data.time[begin][data.bag]
+        force = (position_means(data) - start.bias) / start.scale
+        self._force = force[data.position]
+        self._measured = self._centred(data.mean / start.scale)
+        self._some = slice(None, None, max(len(data.time) // _MOST_WINDOWS, 1))
+
+    def time_constant(self, axis: int) -> float:
+        """Return the time constant with the smallest residuals [s]; 0 without a lag."""
+        tried = np.array([*_SHORT_TAUS, *self._taus])
+        squares = [self._square(tau, axis) for tau in tried]
+        best = float(tried[int(np.argmin(squares))])
+        found = minimize_scalar(
+            lambda log_tau: float(np.log(self._square(float(np.exp(log_tau)), axis))),
+            bounds=(float(np.log(best / _STEP)), float(np.log(best * _STEP))),
+            method='bounded',
+            options={'xatol': 1e-3},
+        )
+        tau = float(np.exp(found.x))
+        return tau if self._square(tau, axis) < self._square(0.0, axis) else 0.0
+
+    def is_determined(self, tau_s: float, axis: int) -> bool:
+        """Whether the residuals increase if the time constant of an axis changes."""
+        others = (tau_s / _STEP, tau_s * _STEP) if tau_s else (_SHORT_TAUS[0] * _STEP,)
+        limit = (1.0 + _INCREASE) ** 2 * self._square(tau_s, axis)
+        return all(self._square(other, axis) > limit for other in others)
+
+    def residual(self, tau_s: float, axis: int) -> Floats:
+        """Return the residuals of all windows, shape (n,) [m/s^2]."""
+        series = self._series(tau_s, axis)
+        left = self._measured[:, axis] - series @ _solved(series, self._measured[:, axis])
+        return np.asarray(left / np.sqrt(self._weight[:, 0]))
+
+    def _square(self, tau_s: float, axis: int) -> float:
+        """Return the sum of squares of the residuals of an axis [(m/s^2)^2]."""
+        series = self._series(tau_s, axis)[self._some]
+        measured = self._measured[self._some, axis]
+        left = measured - series @ _solved(series, measured)
+        return max(float(left @ left), 1e-30)
+
+    def _series(self, tau_s: float, axis: int) -> Floats:
+        """Return the series of bias, scale factor and initial temperatures, shape (n, k)."""
+        x: Floats = self._t - tau_s * self._ratio(_even(np.asarray(tau_s)))
+        low, high = float(x.min()), float(x.max())
+        span = (high - low) or 1.0
+        n_nodes = int(np.clip(span / _NODE_K, 4, _MOST_NODES))
+        inner = np.linspace(low, low + span, n_nodes)
+        knots = np.pad(inner, 3, mode='edge')
+        bias = BSpline.design_matrix(np.clip(x, low, low + span), knots, 3).toarray()
+        rows = np.arange(len(x))
+        scale = self._force[:, [axis]] * ((x / span)[:, None] ** np.arange(1, 4))
+        # The part's own temperature at the start of a bag is not known.
+        begin = np.zeros((len(x), int(self._bag[-1]) + 1))
+        begin[rows, self._bag] = np.exp(-self._age / max(tau_s, 1.0))
+        return self._centred(np.hstack((bias, scale, begin)))
+
+    def _centred(self, values: Floats) -> Floats:
+        """Subtract the mean of each position, and multiply by the root of the weight."""
+        every = np.hstack((values, np.ones_like(self._weight))) * self._weight
+        sums = np.add.reduceat(every, self._first, axis=0)
+        level = sums[:, :-1] / sums[:, -1:]
+        return np.asarray((values - level[self._position]) * np.sqrt(self._weight))
+
+
+def _even(tau_s: Floats) -> Floats:
+    """Spread time constants [s] evenly."""
+    return np.asarray(tau_s / (tau_s + _MIDDLE_S))
+
+
+def _solved(series: Floats, measured: Floats) -> Floats:
+    """Return the least-squares weights of series of any size."""
+    normal, right = series.T @ series, series.T @ measured
+    size = np.sqrt(np.diag(normal)) + 1e-12
+    normal = normal / np.outer(size, size)
+    return np.asarray(np.linalg.solve(normal + _RIDGE * np.eye(len(normal)), right / size) / size)
