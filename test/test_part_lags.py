@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Each axis is a curve of its part: time constants, kinks and bumps of units with known truth."""
+
+import numpy as np
+import pytest
+import strangers
+from strangers_baselines import minutes
+from strangers_cases import (
+    FULL_SCALE,
+    HALF,
+    HELD,
+    Study,
+    navigation,
+    one_test,
+    positions,
+    soaks,
+    third_node,
+)
+from strangers_units import rng_of, spread
+
+from thermo_comp.unit.columns import FINE_TAUS
+
+PARTS_S = np.array([520.0, 910.0, 1400.0])
+
+
+def study_of(name, n=9, corners=HALF, **given):
+    """Record a unit of navigation grade in n positions, and two other positions to judge it."""
+    rng = rng_of(name)
+    unit = navigation(rng, **given)
+    bags = positions(unit, corners, spread(n, rng), rng)
+    return unit, Study('', bags, one_test(positions(unit, HELD, spread(2, rng), rng)), FULL_SCALE)
+
+
+def taus_of(calibration):
+    """Return the time constants of the lags, those of an axis without weight apart."""
+    return [
+        sorted({one.tau_s for one in calibration.response if one.kind == 'board' and one.bias[k]})
+        for k in range(3)
+    ]
+
+
+def judged(calibration, study):
+    (bags,) = study.tests.values()
+    outs = [strangers.corrected(calibration, bag) for bag in bags]
+    return strangers.score(outs, [minutes(bag) for bag in bags], is_drift=False)
+
+
+def test_the_lags_are_those_of_the_parts_each_for_its_axis():
+    unit, study = study_of('parts', part_s=PARTS_S)
+    calibration = strangers.fitted(study)
+    # A lag of 10 K that is wrong by 1 % moves a bias of 10 ug/K by 1 ug, twice its noise of a
+    # minute; some hundred minutes of ramps determine it better than that.
+    assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
+    # 0.65 ug is the noise of a mean of a minute.
+    assert judged(calibration, study).norm < 2.0
+
+
+def test_one_thermometer_is_sufficient():
+    unit, study = study_of('parts', n=12, part_s=PARTS_S, sensors=('board',))
+    calibration = strangers.fitted(study)
+    assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
+    assert judged(calibration, study).norm < 2.0
+
+
+def test_a_unit_without_lags_gets_none():
+    unit, study = study_of('no lag', part_s=np.zeros(3))
+    calibration = strangers.fitted(study)
+    assert not any(term.tau_s for term in calibration.response)
+    assert judged(calibration, study).norm < 1.5
+
+
+def test_a_bump_is_no_disturbance_and_no_motion():
+    # At 0.5 Hz a cell of 30 samples is a minute, and the bump passes within two of them.
+    bump = np.array([450.0, -400.0, 500.0])
+    _, study = study_of('bump', n=12, bump=bump, bump_c=17.0)
+    found = judged(strangers.fitted(study), study)
+    # The bends are a polygon with corners every 0.5 K in a bell of 0.85 K sd.
+    assert found.norm < 60.0
+    assert found.norm_ratio < 1.5
+
+
+@pytest.mark.parametrize('case', [soaks, third_node])
+def test_without_parts_or_ramps_the_fit_has_a_bank_of_lags(case):
+    # Soaks do not determine a time constant; with a third node no axis is a curve of one part.
+    study = next(case(0))
+    calibration = strangers.fitted(study)
+    assert {one.tau_s for one in calibration.response if one.kind == 'board'} <= {*FINE_TAUS}
