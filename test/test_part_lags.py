@@ -64,7 +64,7 @@ def test_one_thermometer_is_sufficient():
 
 
 def test_a_unit_without_lags_gets_none():
-    unit, study = study_of('no lag', part_s=np.zeros(3))
+    _, study = study_of('no lag', part_s=np.zeros(3))
     calibration = strangers.fitted(study)
     assert not any(term.tau_s for term in calibration.response)
     assert judged(calibration, study).norm < 1.5
