@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each axis is a curve of its part: time constants, kinks and bumps of units with known truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import strangers
@@ -17,8 +19,9 @@ from strangers_cases import (
     soaks,
     third_node,
 )
-from strangers_units import rng_of, spread
+from strangers_units import UG, rng_of, spread
 
+from thermo_comp.fitting.priors import population
 from thermo_comp.unit.columns import FINE_TAUS
 
 PARTS_S = np.array([520.0, 910.0, 1400.0])
@@ -86,3 +89,22 @@ def test_without_parts_or_ramps_the_fit_has_a_bank_of_lags(case):
     study = next(case(0))
     calibration = strangers.fitted(study)
     assert {one.tau_s for one in calibration.response if one.kind == 'board'} <= {*FINE_TAUS}
+
+
+def test_units_of_a_type_share_the_lags_of_the_bank():
+    _, study = study_of('parts', part_s=PARTS_S)
+    calibration = strangers.fitted(study)
+
+    def sibling(k, ratio):
+        terms = tuple(replace(one, tau_s=ratio * one.tau_s) for one in calibration.response)
+        unit = replace(calibration.unit, serial=f'u{k}')
+        return replace(calibration, unit=unit, response=terms)
+
+    units = [sibling(k, ratio) for k, ratio in enumerate((0.93, 0.98, 1.02, 1.07))]
+    mean = population(units)
+    assert {term.tau_s for term in mean.response if term.tau_s} <= {*FINE_TAUS}
+    (bags,) = study.tests.values()
+    for bag in bags:
+        off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
+        # The lags of 10 K at 20 ug/K differ by some percent from one unit to the next.
+        assert np.sqrt(np.mean(off**2)) < 5.0 * UG

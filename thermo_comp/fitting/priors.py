@@ -11,6 +11,8 @@ which then has the columns of that file.
 
 from __future__ import annotations
 
+import math
+from bisect import bisect
 from collections.abc import Sequence
 from dataclasses import fields, replace
 
@@ -21,7 +23,7 @@ from .. import __version__
 from ..errors import FitError
 from ..typing import Floats
 from ..unit.calibration import POPULATION, Calibration, RegimeSet, parameter_layout
-from ..unit.columns import Column
+from ..unit.columns import FINE_TAUS, Column
 from ..unit.provenance import Provenance, Source
 from .assembly import blank_terms, file_parameters, parameters_of, union, with_parameters
 from .equations import as_vector
@@ -171,8 +173,9 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
             )
     keys: dict[Column, list[Column]] = {}
     for one in calibrations:
-        for column, key in zip(prior_columns(one), _alike(prior_columns(one)), strict=True):
-            keys.setdefault(key, []).append(column)
+        for column in prior_columns(one):
+            for common, _ in _on_common_lags(column):
+                keys.setdefault(_alike(common), []).append(common)
     columns = [
         replace(
             key,
@@ -197,9 +200,32 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     return with_parameters(like, mean_K, mean, scatter)
 
 
-def _alike(columns: Sequence[Column]) -> list[Column]:
-    """Return columns without the fields that differ between units of a type: range and rest."""
-    return [replace(column, range=(0.0, 1.0), rest_k=0.0) for column in columns]
+def _alike(column: Column) -> Column:
+    """Return a column without the fields that differ between units of a type: range and rest."""
+    return replace(column, range=(0.0, 1.0), rest_k=0.0)
+
+
+def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
+    """
+    Return the columns of the bank whose sum is a column, each with its share.
+
+    The parts of two units of a type differ in their time constants. A lag is interpolated between
+    those of the bank, which all units have; a lag of 0 s has the value 0.
+    """
+    if not column.lag or column.kind == 'play' or column.tau_s in FINE_TAUS:
+        return [(column, 1.0)]
+    at = bisect(FINE_TAUS, column.tau_s)
+    if not at:
+        share = column.tau_s / FINE_TAUS[0]
+        shortest = replace(column, tau_s=FINE_TAUS[0])
+        if column.kind == 'bend':
+            return [(replace(column, tau_s=0.0), 1.0 - share), (shortest, share)]
+        return [(shortest, share**column.order)]
+    if at == len(FINE_TAUS):
+        return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
+    below, above = FINE_TAUS[at - 1 : at + 1]
+    share = math.log(column.tau_s / below) / math.log(above / below)
+    return [(replace(column, tau_s=below), 1.0 - share), (replace(column, tau_s=above), share)]
 
 
 def _relative_to(
@@ -211,21 +237,27 @@ def _relative_to(
             f'{calibration.unit.serial} has no covariance: an imported calibration cannot be part '
             'of a population'
         )
-    everything = _alike(prior_columns(like))
-    terms = [everything.index(column) for column in _alike(prior_columns(calibration))]
+    everything = [_alike(column) for column in prior_columns(like)]
+    own_columns = prior_columns(calibration)
+    terms = np.zeros((len(everything), len(own_columns)))
+    for k, column in enumerate(own_columns):
+        for common, share in _on_common_lags(column):
+            terms[everything.index(_alike(common)), k] += share
     scale = constants_of(calibration).scale
     values, factor = parameters_of(calibration), np.ones(calibration.posterior.n_parameters)
     layout, into = parameter_layout(calibration), parameter_layout(like)
     for axis, (bias, relative) in enumerate(zip(layout.bias, layout.scale, strict=True)):
         factor[bias.static : bias.end] = mean_K[axis] / scale[axis]
         values[[relative.static, relative.dynamic]] = np.log(scale[axis] / mean_K[axis])
-    places = np.arange(into.n_parameters - len(values), into.n_parameters)
+    placed = np.zeros((into.n_parameters, len(values)))
+    others = np.arange(layout.nonlinear, len(values))
+    placed[others - len(values) + into.n_parameters, others] = 1.0
     blocks = zip((*layout.bias, *layout.scale), (*into.bias, *into.scale), strict=True)
     for own, block in blocks:
-        response = [block.response + k for k in terms]
-        places[own.static : own.end] = [*range(block.static, block.response), *response]
-    placed = np.zeros((into.n_parameters, len(values)))
-    placed[places, np.arange(len(values))] = factor
+        n = own.response - own.static
+        placed[block.static : block.response, own.static : own.response] = np.eye(n)
+        placed[block.response : block.end, own.response : own.end] = terms
+    placed = placed * factor
     return placed @ values, placed @ calibration.posterior.covariance() @ placed.T
 
 
