@@ -23,8 +23,9 @@ from .windows import BEND, CURVE, SET
 TRIAL_GAIN = 4.0
 # Largest number of groups tried in a round.
 _TRIALS = 3
-# Largest number of bend columns: three axes, each with a dozen knees around a bump.
-_MOST_BENDS = 60
+# Largest number of bend columns: for all axes with a bank of lags; with the lags of their parts a
+# score for each axis, as around a bump.
+_MOST_BENDS = 16, 60
 #: Groups of the curve of parts that lag the board: a polynomial in t - m, m the lag.
 PART_CURVE = ('board', 'product', 'square')
 #: Groups that are linear in a temperature difference.
@@ -166,7 +167,8 @@ class Growth:
         if BEND in absent:
             # Some of the many bend columns are tried, chosen by forward selection.
             is_bend = self._names == BEND
-            knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, _MOST_BENDS)
+            most = _MOST_BENDS[self._regression.windows.has_part_lags]
+            knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, most)
             typical = np.where(is_bend & ~knees, 0.0, typical)
         asked: list[tuple[str, ...]] = [(name,) for name in absent]
         together = (tuple(name for name in names if name in absent) for names in _TOGETHER)

@@ -30,6 +30,9 @@ _MOST_WINDOWS = 3000
 _SHORT_TAUS = (15.0, 21.0, 30.0, 42.0)
 # Largest RMS residual, relative to the white noise, of a unit whose axes are curves of parts.
 _AT_NOISE = 1.5
+# Smallest ratio of the RMS residual without lags to that with them if it is larger: the lags
+# explain most, but slow noise or another effect remains.
+_MOST_EXPLAINED = 8.0
 # Smallest relative increase of the RMS residual if a time constant changes by `_STEP`.
 _INCREASE, _STEP = 0.05, 2.0**0.5
 # Time constant in the middle of the interpolation [s].
@@ -45,17 +48,19 @@ class Parts:
 
     taus: the time constant of each axis [s]; 0 without a lag
     undisturbed: factors of the weights of the windows, see `Windows`, shape (n,)
+    is_complete: whether the curves leave no more than the noise
     """
 
     taus: tuple[float, float, float]
     undisturbed: Floats
+    is_complete: bool
 
 
 def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | None:
     """
     Find the lag of each axis, and the windows that no curve of its part describes.
 
-    Returns None if the axes are no curves of one part each, or if a lag is not determined.
+    Returns None if curves of one part per axis do not explain the drift or do not determine a lag.
     """
     data, columns = windows.data, windows.model.columns
     lags = [k for k, one in enumerate(columns) if one.group == 'board']
@@ -68,10 +73,11 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     residual = np.column_stack([curves.residual(tau, axis) for axis, tau in enumerate(found)])
     factors = undisturbed(residual, data.weight, data.position)
     square = np.average(residual**2, axis=0, weights=data.weight * factors)
-    if (square > (_AT_NOISE * white_noise_of(data, start.scale)) ** 2).any():
+    is_complete = bool((square <= (_AT_NOISE * white_noise_of(data, start.scale)) ** 2).all())
+    if not is_complete and min(map(curves.reduction, found, range(3))) < _MOST_EXPLAINED:
         return None
     x, y, z = (round(float(tau), 1) for tau in found)
-    return Parts((x, y, z), factors)
+    return Parts((x, y, z), factors, is_complete)
 
 
 class _PartCurves:
@@ -120,6 +126,10 @@ class _PartCurves:
         others = (tau_s / _STEP, tau_s * _STEP) if tau_s else (_SHORT_TAUS[0] * _STEP,)
         limit = (1.0 + _INCREASE) ** 2 * self._square(tau_s, axis)
         return all(self._square(other, axis) > limit for other in others)
+
+    def reduction(self, tau_s: float, axis: int) -> float:
+        """Return the RMS residual of an axis without a lag over that with it."""
+        return float(np.sqrt(self._square(0.0, axis) / self._square(tau_s, axis)))
 
     def residual(self, tau_s: float, axis: int) -> Floats:
         """Return the residuals of all windows, shape (n,) [m/s^2]."""

@@ -94,7 +94,7 @@ class Model:
         return np.array(
             [
                 [
-                    one.tau_s == tau or not (one.kind == 'bend' or one.lag) or one.kind == 'play'
+                    one.tau_s == tau or not (one.kind in ('bend', 'play') or one.lag)
                     for tau in self.part_taus
                 ]
                 for one in self.columns

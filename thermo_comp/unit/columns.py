@@ -194,9 +194,11 @@ def bank(
     `part_taus`, the time constants of the three axes' parts [s] (0: none), all lags have these.
     """
     fine, coarse_taus, bend_taus, most_knees = FINE_TAUS, BANK_TAUS, BEND_TAUS, MOST_KNEES
+    play_taus: tuple[float, ...] = PLAY_TAUS
     if part_taus is not None:
         bend_taus, most_knees = tuple(sorted({*part_taus})), MOST_PART_KNEES
         fine = coarse_taus = tuple(tau for tau in bend_taus if tau)
+        play_taus = bend_taus
     gradient = [Column('gradient', 'gradient', sensor, range=UNBOUNDED) for sensor in sensors]
     board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in fine]
     lagged_gradient = [
@@ -238,7 +240,7 @@ def bank(
     ]
     play = [
         Column('play', 'play', tau_s=tau, width_k=width, range=UNBOUNDED)
-        for tau in PLAY_TAUS
+        for tau in play_taus
         for width in PLAY_WIDTHS
     ]
     least_k = LEAST_KNEE_K * MOST_KNEES / most_knees
