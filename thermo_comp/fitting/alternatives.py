@@ -102,8 +102,7 @@ def _with_lags(
     Fit the windows with the lags of the parts, if the axes are curves of one part each.
 
     A bank of lags is used if there are no such parts. It is tried as well if the model of the
-    parts is not at the noise. Left-out data then choose; the bank has the advantage if curves of
-    the parts do not explain everything.
+    parts is not at the noise, and taken if it is better on left-out data.
     """
     is_free = options.prior is None and options.model != 'golovach'
     parts = find_parts(windows, start) if is_free else None
@@ -114,14 +113,11 @@ def _with_lags(
     own = replace(own, data=replace(own.data, undisturbed=parts.undisturbed))
     result = regress(own, start, up, options, tell)
     selected = result[1]
-    if parts.is_complete and selected.score.rms < _AT_NOISE * float(selected.prior.sigma.mean()):
-        return own, result
-    other = regress(windows, start, up, options, tell)
-    if parts.is_complete:
-        is_bank = is_better(selected.score, other[1].score)
-    else:
-        is_bank = not is_better(other[1].score, selected.score)
-    return (windows, other) if is_bank else (own, result)
+    if selected.score.rms > _AT_NOISE * float(selected.prior.sigma.mean()):
+        other = regress(windows, start, up, options, tell)
+        if is_better(selected.score, other[1].score):
+            return windows, other
+    return own, result
 
 
 def _may_have_sets(selected: Selected) -> bool:

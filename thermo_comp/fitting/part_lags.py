@@ -48,12 +48,10 @@ class Parts:
 
     taus: the time constant of each axis [s]; 0 without a lag
     undisturbed: factors of the weights of the windows, see `Windows`, shape (n,)
-    is_complete: whether the curves leave no more than the noise
     """
 
     taus: tuple[float, float, float]
     undisturbed: Floats
-    is_complete: bool
 
 
 def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | None:
@@ -73,11 +71,11 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     residual = np.column_stack([curves.residual(tau, axis) for axis, tau in enumerate(found)])
     factors = undisturbed(residual, data.weight, data.position)
     square = np.average(residual**2, axis=0, weights=data.weight * factors)
-    is_complete = bool((square <= (_AT_NOISE * white_noise_of(data, start.scale)) ** 2).all())
-    if not is_complete and min(map(curves.reduction, found, range(3))) < _MOST_EXPLAINED:
+    is_at_noise = (square <= (_AT_NOISE * white_noise_of(data, start.scale)) ** 2).all()
+    if not is_at_noise and min(map(curves.reduction, found, range(3))) < _MOST_EXPLAINED:
         return None
     x, y, z = (round(float(tau), 1) for tau in found)
-    return Parts((x, y, z), factors, is_complete)
+    return Parts((x, y, z), factors)
 
 
 class _PartCurves:

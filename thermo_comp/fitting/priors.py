@@ -223,9 +223,20 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         return [(shortest, share**column.order)]
     if at == len(FINE_TAUS):
         return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
-    below, above = FINE_TAUS[at - 1 : at + 1]
-    share = math.log(column.tau_s / below) / math.log(above / below)
-    return [(replace(column, tau_s=below), 1.0 - share), (replace(column, tau_s=above), share)]
+    # Cubic interpolation over the logarithm of the time constant, by Lagrange's polynomials.
+    first = min(max(at - 2, 0), len(FINE_TAUS) - 4)
+    near = FINE_TAUS[first : first + 4]
+    return [
+        (
+            replace(column, tau_s=tau),
+            math.prod(
+                math.log(column.tau_s / other) / math.log(tau / other)
+                for other in near
+                if other != tau
+            ),
+        )
+        for tau in near
+    ]
 
 
 def _relative_to(
