@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each axis is a curve of its part: time constants, kinks and bumps of units with known truth."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -19,11 +20,12 @@ from strangers_cases import (
     soaks,
     third_node,
 )
-from strangers_units import UG, rng_of, spread
+from strangers_units import GRAVITY, UG, rng_of, spread
 
 from thermo_comp.fitting.priors import population
 from thermo_comp.unit.columns import FINE_TAUS
 
+HEADER = 'time_s,accel_x,accel_y,accel_z,temperature_board,temperature_case'
 PARTS_S = np.array([520.0, 910.0, 1400.0])
 
 
@@ -108,3 +110,21 @@ def test_units_of_a_type_share_the_lags_of_the_bank():
         off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
         # The lags of 10 K at 20 ug/K differ by some percent from one unit to the next.
         assert np.sqrt(np.mean(off**2)) < 5.0 * UG
+
+
+def test_fit_says_how_far_the_parts_lag(tmp_path, cli):
+    unit, study = study_of('parts', part_s=PARTS_S)
+    tables = []
+    for bag in study.bags:
+        celsius = [np.interp(bag.time_s, *bag.temperatures[name]) for name in ('board', 'case')]
+        tables.append(tmp_path / f'{bag.name}.csv')
+        np.savetxt(
+            tables[-1], np.column_stack((bag.time_s, bag.samples, *celsius)), '%.4f', ',',
+            header=HEADER, comments='',
+        )  # fmt: skip
+    asked = ('fit', *tables, '--gravity', GRAVITY, '-o', tmp_path / 'unit.yaml', '--force')
+    (line,) = (one for one in cli(*asked).stdout.splitlines() if 'its part' in one)
+    spoken = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
+    told = json.loads(cli(*asked, '--json').stdout)['part_lags_s']
+    assert told == pytest.approx(unit.part_s, rel=0.01)
+    assert spoken == pytest.approx(told, abs=0.5)

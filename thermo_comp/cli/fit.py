@@ -184,6 +184,12 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     if verbose:
         _say_positions(out, result)
     _say_models(out, result.selected.trials)
+    taus = result.windows.model.part_taus
+    if taus is not None:
+        out.line(
+            'each axis is a curve of the temperature of its part, which lags the board by '
+            f'{", ".join(f"{tau:.0f}" for tau in taus)} s (x, y, z)'
+        )
     _say_groups(out, calibration)
     tell_nonlinearity(out, calibration)
     _say_residuals(out, result, n_positions)
@@ -206,6 +212,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
         left_out_rms_m_s2=left_out.rms,
         residuals_m_s2=result.residuals,
         models=[_model(trial) for trial in result.selected.trials],
+        part_lags_s=taus,
         **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
         gyroscope=gyroscope and picked(gyroscope, _RATES) | {'residuals_rad_s': result.rates},
         **picked(result, 'positions least_known findings'),
