@@ -15,12 +15,19 @@ from thermo_comp.cli.convert import Tool
 from thermo_comp.convert.exchange import export_calibration, import_calibration
 from thermo_comp.convert.tools import TOOLS
 from thermo_comp.errors import CalibrationError
-from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Calibration, RegimeSet, Unit
+from thermo_comp.unit.calibration import (
+    Axes,
+    AxisReference,
+    AxisSet,
+    Calibration,
+    RegimeSet,
+    Unit,
+    rate_triad,
+)
 from thermo_comp.unit.functions import CubicSpline, Polynomial
 from thermo_comp.unit.nonlinearity import Nonlinearity, NonlinearTerm
 from thermo_comp.unit.prediction import bias_and_scale, ramp_states
 from thermo_comp.unit.rate_bias import Gyroscope, RateCurve, RateSet
-from thermo_comp.unit.rate_triad import rate_triad
 
 ONE = Polynomial((1.0,))
 

@@ -22,12 +22,12 @@ from thermo_comp.recording.blocks import Block, ImuColumns, Readings
 from thermo_comp.simulation.campaign import parse_cyclogram, plan
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import arrays
+from thermo_comp.unit.calibration import gyroscope_of, rate_triad
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.functions import Polynomial
 from thermo_comp.unit.gravity import EARTH_RATE, STANDARD_GRAVITY
 from thermo_comp.unit.prediction import bias_and_scale, ramp_states, sd_of_states
 from thermo_comp.unit.rate_bias import MILLIDEGREE, RateCurve
-from thermo_comp.unit.rate_triad import gyroscope_of, rate_triad
 
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
 START_NS = 1_767_225_600_000_000_000

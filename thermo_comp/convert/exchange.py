@@ -18,13 +18,12 @@ from ..errors import CalibrationError
 from ..text import one_line
 from ..typing import Floats
 from ..unit import calibration as unit
-from ..unit.calibration import Calibration
+from ..unit.calibration import Calibration, rate_triad
 from ..unit.functions import Polynomial
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
 from ..unit.prediction import bias_and_scale, ramp_states
 from ..unit.provenance import Provenance
 from ..unit.rate_bias import MILLIDEGREE, Gyroscope, RateCurve, RateSet
-from ..unit.rate_triad import rate_triad
 from .tools import TOOLS, Content, Tool, ql, turned
 
 _GRID = 257

@@ -17,10 +17,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..unit.calibration import Calibration
+from ..unit.calibration import Calibration, gyroscope_of
 from ..unit.gravity import EARTH_RATE
 from ..unit.metrics import ResidualStatistics, statistics_by_regime
-from ..unit.rate_triad import gyroscope_of
 from .assembly import build_calibration
 from .claim import claim_of
 from .growth import Candidates

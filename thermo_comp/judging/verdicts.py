@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
-from ..unit.calibration import Calibration
+from ..unit.calibration import Calibration, rate_triad
 from ..unit.correction import Correction
 from ..unit.metrics import residual_statistics
 from ..unit.prediction import SlowUncertainty
 from ..unit.rate_bias import MILLIDEGREE
-from ..unit.rate_triad import rate_triad
 from .windows import Windows, means_by
 
 #: Largest ratio of RMS error to claimed RMS at which a calibration holds.

@@ -21,10 +21,9 @@ from ..thermal.regime import Regime
 from ..thermal.settings import ThermalConfig
 from ..thermal.state import BOARD
 from ..thermal.tracker import ThermalTracker
-from ..unit.calibration import Calibration
+from ..unit.calibration import Calibration, rate_triad
 from ..unit.correction import Correction
 from ..unit.prediction import SlowUncertainty
-from ..unit.rate_triad import rate_triad
 from .checks import RateCheck
 from .status import CompensatorConfig, Counters
 

@@ -10,10 +10,9 @@ from matplotlib.figure import Figure
 
 from ..judging.windows import means_by
 from ..typing import Floats
-from ..unit.calibration import AXES, Calibration
+from ..unit.calibration import AXES, Calibration, rate_triad
 from ..unit.gravity import MICRO_G
 from ..unit.rate_bias import MILLIDEGREE
-from ..unit.rate_triad import rate_triad
 from . import style
 from .evidence import CHOSEN, Evidence, given
 from .html import minus, number

@@ -19,7 +19,7 @@ Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -29,12 +29,12 @@ from ..quantities import QUANTITIES, Bounds
 from ..text import LONGEST_SERIAL, valid_serial
 from ..thermal.settings import DetectorSettings, ThermometerSettings
 from .columns import Column
-from .functions import TemperatureFunction, check_reference
+from .functions import Polynomial, TemperatureFunction, check_reference
 from .nonlinearity import Nonlinearity
 from .posterior import ParameterLayout, Posterior, lay_out
 from .provenance import GroupEvidence, Provenance
-from .rate_bias import LARGEST_RATE, Gyroscope
-from .reach import FULL_SCALES, LARGEST_RELATIVE_SCALE, Reach, Term, check_posterior
+from .rate_bias import LARGEST_RATE, NIL, Gyroscope, RateCurve, RateSet, RateTerm
+from .reach import check_reach
 from .schema import Vector, check_ranges
 
 if TYPE_CHECKING:
@@ -229,27 +229,11 @@ class Calibration:
     def __post_init__(self) -> None:
         if (version := self.format_version) != FORMAT_VERSION:
             raise ValueError(f'`format_version` must be {FORMAT_VERSION}, got {version}')
-        self._check_axes()
         self._check_misalignment()
         self._check_sensors()
-        self._check_reach()
-
-    def _check_axes(self) -> None:
-        # Samples in an offset code have a bias of half their range.
-        farthest = FULL_SCALES * self.unit.full_scale
-        force = QUANTITIES['full-scale force']
-        for name, axis in zip(AXES, self.axes, strict=True):
-            if abs(axis.bias) > farthest:
-                raise ValueError(
-                    f'`axes.{name}.bias` must be within twice unit.full_scale, {farthest:g}, '
-                    f'got {axis.bias:g}'
-                )
-            reached = self.unit.full_scale / abs(axis.scale_factor)
-            if fault := force.fault(reached):
-                raise ValueError(
-                    f'`axes.{name}.scale_factor` makes unit.full_scale a force that {fault}, '
-                    f'got {reached:g}'
-                )
+        check_reach(self, parameter_layout(self))
+        if self.gyroscope is not None:
+            self._check_gyroscope()
 
     def _check_misalignment(self) -> None:
         for (row, column), value in np.ndenumerate(np.array(self.misalignment)):
@@ -268,73 +252,19 @@ class Calibration:
                 '`sensors` must be different names, at least one, none of them board, '
                 f'got {list(names)}'
             )
-        of_rate = self.gyroscope.response if self.gyroscope else ()
-        for key, response in (('response', self.response), ('gyroscope.response', of_rate)):
-            for k, term in enumerate(response):
-                if term.is_of_sensor and term.sensor not in names:
-                    raise ValueError(
-                        f'`{key}[{k}].sensor` must be one of sensors {list(names)}, '
-                        f'got {term.sensor!r}'
-                    )
+        for k, term in enumerate(self.response):
+            if term.is_of_sensor and term.sensor not in names:
+                raise ValueError(
+                    f'`response[{k}].sensor` must be one of sensors {list(names)}, '
+                    f'got {term.sensor!r}'
+                )
 
-    def _check_reach(self) -> None:
-        """Check curves, columns and posterior against full scale and temperature ranges."""
-        gyroscope, full_scale = self.gyroscope, self.unit.full_scale
-        terms = [Term(term, term.bias, term.scale) for term in self.response]
-        of_rate = (
-            [Term(term, term.bias, (0.0,) * 3) for term in gyroscope.response] if gyroscope else []
-        )
-        reference = self.reference_temperature_c
-        all_edges = [edge for part in self.regime_sets() for edge in part.temperature_range_c]
-        if self.nonlinearity is not None:
-            largest = full_scale / min(abs(axis.scale_factor) for axis in self.axes)
-            edges_t = min(all_edges) - reference, max(all_edges) - reference
-            self.nonlinearity.check_slope(largest, edges_t)
-        for regime, part in zip(('static', 'dynamic'), self.regime_sets(), strict=True):
-            edges = part.temperature_range_c
-            reach = Reach(edges, all_edges, reference, FULL_SCALES * full_scale)
-            lost = reach.losses(terms, regime)
-            for name, axis, loss in zip(AXES, part.axes(), lost, strict=True):
-                reach.check_scale(f'{regime}.{name}', axis.scale_function, loss)
-            for name, at, axis in zip(AXES, self.axes, part.axes(), strict=True):
-                level = at.bias + axis.delta
-                reach.check_bias(f'{regime}.{name}', level, axis.bias_function)
-            reach.check_terms('response', terms)
-            if gyroscope:
-                reach = Reach(edges, all_edges, reference, FULL_SCALES * LARGEST_RATE)
-                curves = gyroscope.static if regime == 'static' else gyroscope.dynamic
-                for name, at_rest, curve in zip(
-                    AXES, gyroscope.bias_rad_s, curves.axes(), strict=True
-                ):
-                    key = f'gyroscope.{regime}.{name}'
-                    reach.check_bias(key, at_rest + curve.delta, curve.bias_function)
-                reach.check_terms('gyroscope.response', of_rate)
-        self._check_posteriors(terms, of_rate)
-
-    def _check_posteriors(self, terms: list[Term], of_rate: list[Term]) -> None:
-        reference = self.reference_temperature_c
-        static, dynamic = (
-            [edge - reference for edge in part.temperature_range_c] for part in self.regime_sets()
-        )
-        if self.posterior is not None:
-            layout = parameter_layout(self)
-            self.posterior.check_size(layout.n_parameters)
-            axes = zip(self.static.axes(), self.dynamic.axes(), strict=True)
-            blocks = []
-            for bias, scale, (a, b) in zip(layout.bias, layout.scale, axes, strict=True):
-                most = FULL_SCALES * self.unit.full_scale
-                blocks.append((bias, (a.bias_function, b.bias_function), most))
-                most = LARGEST_RELATIVE_SCALE
-                blocks.append((scale, (a.scale_function, b.scale_function), most))
-            check_posterior('posterior.factor', self.posterior, blocks, (static, dynamic), terms)
-        gyroscope = self.gyroscope
-        if gyroscope is not None and gyroscope.posterior is not None:
-            axes_of_rate = zip(gyroscope.static.axes(), gyroscope.dynamic.axes(), strict=True)
-            pairs = [(a.bias_function, b.bias_function) for a, b in axes_of_rate]
-            laid_out = zip(lay_out(pairs, len(gyroscope.response)), pairs, strict=True)
-            of_bias = [(block, pair, FULL_SCALES * LARGEST_RATE) for block, pair in laid_out]
-            key = 'gyroscope.posterior.factor'
-            check_posterior(key, gyroscope.posterior, of_bias, (static, dynamic), of_rate)
+    def _check_gyroscope(self) -> None:
+        """Apply the rules of an accelerometer's triad to the gyroscope."""
+        try:
+            rate_triad(self)
+        except ValueError as error:
+            raise ValueError(str(error).replace('`', '`gyroscope.', 1)) from error
 
     def correct(
         self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any
@@ -390,3 +320,75 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
     end, nonlinearity = blocks[-1].end, calibration.nonlinearity
     after = end + (6 * len(nonlinearity.terms) if nonlinearity else 0)
     return ParameterLayout(blocks[0::2], blocks[1::2], end, after, after + 3)
+
+
+def rate_triad(calibration: Calibration) -> Calibration:
+    """Return the gyroscope of a unit, which must have one, as a triad."""
+    gyroscope = calibration.gyroscope
+    if gyroscope is None:
+        raise ValueError('`calibration` must have a gyroscope')
+
+    def regime(shared: RegimeSet, curves: RateSet) -> RegimeSet:
+        x, y, z = (
+            AxisSet(curve.bias_function, Polynomial((1.0,)), curve.delta, sd)
+            for curve, sd in zip(curves.axes(), gyroscope.residual_sd_rad_s, strict=True)
+        )
+        # Its lack of fit is that of the specific force.
+        return replace(shared, x=x, y=y, z=z, lack_of_fit=())
+
+    triad = replace(
+        calibration,
+        # The full scale of the accelerometer does not limit an angular rate.
+        unit=replace(calibration.unit, input='m/s^2', full_scale=LARGEST_RATE),
+        axes=Axes(*(AxisReference(1.0, bias) for bias in gyroscope.bias_rad_s)),
+        static=regime(calibration.static, gyroscope.static),
+        dynamic=regime(calibration.dynamic, gyroscope.dynamic),
+        noise_density_m_s2_sqrt_hz=gyroscope.noise_density_rad_s_sqrt_hz,
+        slow_noise_m_s2_sqrt_h=gyroscope.slow_noise_rad_s_sqrt_h,
+        misalignment=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        misalignment_sd=NIL,
+        response=tuple(ResponseTerm(**vars(term), scale=NIL) for term in gyroscope.response),
+        provenance=Provenance(),
+        evidence=(),
+        posterior=None,
+        nonlinearity=None,
+        gyroscope=None,
+    )
+    if gyroscope.posterior is None:
+        return triad
+    rows, n = _bias_rows(triad), parameter_layout(triad).n_parameters
+    matrix, variances = np.zeros((n, gyroscope.posterior.rank)), np.zeros(n)
+    matrix[rows], variances[rows] = gyroscope.posterior.matrix, gyroscope.posterior.variances
+    return replace(triad, posterior=Posterior.of(matrix, variances))
+
+
+def gyroscope_of(triad: Calibration) -> Gyroscope:
+    """Take the gyroscope out of a triad whose scale is 1."""
+    x, y, z = (axis.bias for axis in triad.axes)
+    static, dynamic = (
+        RateSet(*(RateCurve(axis.bias_function, axis.delta) for axis in regime_set.axes()))
+        for regime_set in triad.regime_sets()
+    )
+    sx, sy, sz = (axis.residual_sd_m_s2 for axis in triad.static.axes())
+    terms = [vars(term).copy() for term in triad.response]
+    for keys in terms:
+        del keys['scale']
+    posterior = triad.posterior
+    if posterior is not None:
+        rows = _bias_rows(triad)
+        posterior = Posterior.of(posterior.matrix[rows], posterior.variances[rows])
+    return Gyroscope(
+        bias_rad_s=(x, y, z),
+        static=static,
+        dynamic=dynamic,
+        noise_density_rad_s_sqrt_hz=triad.noise_density_m_s2_sqrt_hz,
+        slow_noise_rad_s_sqrt_h=triad.slow_noise_m_s2_sqrt_h,
+        residual_sd_rad_s=(sx, sy, sz),
+        response=tuple(RateTerm(**keys) for keys in terms),
+        posterior=posterior,
+    )
+
+
+def _bias_rows(triad: Calibration) -> list[int]:
+    blocks = parameter_layout(triad).bias
+    return [row for block in blocks for row in range(block.static, block.end)]

@@ -8,17 +8,22 @@ largest value of a column, and the uncertainty, stay within a million times that
 instrument, and without overflow.
 """
 
+from __future__ import annotations
+
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import operator
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..quantities import QUANTITIES
-from ..typing import Floats
 from .columns import Column
 from .functions import TANGENT_SPANS, TemperatureFunction
-from .posterior import Block, Posterior
+from .posterior import ParameterLayout
+
+if TYPE_CHECKING:
+    from .calibration import Calibration
 
 #: Limits of a relative scale function, with every term at its largest.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
@@ -34,128 +39,122 @@ _DIFFERENCE_K = QUANTITIES['temperature span'].at_most or 0.0
 _RATE_K_S = (QUANTITIES['temperature rate'].at_most or 0.0) / 60.0
 
 
-@dataclass(frozen=True)
-class Term:
-    """A column with its weights on the bias and on the relative scale of the three axes."""
-
-    column: Column
-    bias: Sequence[float]
-    scale: Sequence[float]
-
-    def largest(self, farthest_k: float) -> float:
-        """Return the largest value of the column within `farthest_k` [K] of the reference."""
-        column = self.column
-        physical = {'gradient_even': 1.0, 'rate': _RATE_K_S}.get(
-            column.kind, (_DIFFERENCE_K + abs(column.rest_k)) ** column.order
-        )
-        return min(max(map(abs, column.range)), physical) * float(farthest_k) ** column.power
-
-
-class Reach:
-    """The temperature range of a set relative to the reference, and the largest bias allowed."""
-
-    def __init__(
-        self, range_c: tuple[float, float], edges_c: Sequence[float], reference: float, most: float
-    ) -> None:
-        self._t = np.linspace(*range_c, _GRID) - reference
-        self._beyond_k = TANGENT_SPANS * (range_c[1] - range_c[0])
-        self._farthest_k = max(abs(edge - reference) for edge in edges_c)
-        self._most = most
-
-    def check_bias(self, key: str, level: float, function: TemperatureFunction) -> None:
-        """Raise ValueError if level and curve exceed the largest bias."""
-        if abs(level) > self._most:
+def check_reach(calibration: Calibration, layout: ParameterLayout) -> None:
+    """Raise ValueError, with the key's name, if a part of a calibration exceeds its limits."""
+    reference, sets = calibration.reference_temperature_c, calibration.regime_sets()
+    most = FULL_SCALES * calibration.unit.full_scale
+    _check_axes(calibration, most)
+    edges = [[edge - reference for edge in part.temperature_range_c] for part in sets]
+    outermost = min(map(min, edges)), max(map(max, edges))
+    if calibration.nonlinearity is not None:
+        force = calibration.unit.full_scale / min(abs(a.scale_factor) for a in calibration.axes)
+        calibration.nonlinearity.check_slope(force, outermost)
+    response = calibration.response
+    sizes = [_largest(term, max(map(abs, outermost))) for term in response]
+    for k, (term, size) in enumerate(zip(response, sizes, strict=True)):
+        effect = size * max(map(abs, term.bias))
+        if not effect <= WORST * most:
             raise ValueError(
-                f'`{key}.delta` must leave a bias within {self._most:g}, got {level:g}'
+                f'`response[{k}].bias` must make a bias within {WORST * most:g} of its column, '
+                f'makes {effect:g}'
             )
-        least, largest = self._extremes(function)
-        if not math.isfinite(largest - least):
-            raise ValueError(f'`{key}.bias_function` must be finite over its range {_AROUND}')
-        if max(-least, largest) > self._most:
-            reached = largest if largest > -least else least
-            raise ValueError(
-                f'`{key}.bias_function` must stay within {self._most:g} over its range '
-                f'{_AROUND}, reaches {reached:g}'
-            )
-
-    def check_scale(self, key: str, function: TemperatureFunction, lost: float) -> None:
-        """Raise ValueError if a relative scale, less or plus `lost`, leaves its limits."""
-        least, largest = self._extremes(function)
-        if not least - lost > SMALLEST_RELATIVE_SCALE:
-            raise ValueError(
-                f'`{key}.scale_function` must stay above {SMALLEST_RELATIVE_SCALE:g} over its '
-                f'ranges {_AROUND}, reaches {least - lost:.4g}'
-            )
-        if not largest + lost < LARGEST_RELATIVE_SCALE:
-            raise ValueError(
-                f'`{key}.scale_function` must stay below {LARGEST_RELATIVE_SCALE:g} over its '
-                f'ranges {_AROUND}, reaches {largest + lost:.4g}'
-            )
-
-    def check_terms(self, key: str, terms: Sequence[Term]) -> None:
-        """Raise ValueError if the largest effect of a column exceeds its limit."""
-        for k, term in enumerate(terms):
-            largest = term.largest(self._farthest_k) * max(map(abs, term.bias))
-            if not largest <= WORST * self._most:
+    for regime, part, ends in zip(('static', 'dynamic'), sets, edges, strict=True):
+        at_work = [term.during in ('always', regime) for term in response]
+        for k, (name, axis) in enumerate(zip('xyz', part.axes(), strict=True)):
+            terms = zip(response, sizes, at_work, strict=True)
+            lost = sum(abs(term.scale[k]) * size for term, size, is_at_work in terms if is_at_work)
+            _check_scale(f'{regime}.{name}', _extremes(axis.scale_function, ends), lost)
+        for name, at, axis in zip('xyz', calibration.axes, part.axes(), strict=True):
+            reached = _extremes(axis.bias_function, ends)
+            _check_bias(f'{regime}.{name}', at.bias + axis.delta, reached, most)
+    if calibration.posterior is None:
+        return
+    calibration.posterior.check_size(layout.n_parameters)
+    variances = (calibration.posterior.matrix**2).sum(axis=1) + calibration.posterior.variances
+    for k, axes in enumerate(zip(*(part.axes() for part in sets), strict=True)):
+        for block, functions, bound in (
+            (layout.bias[k], [axis.bias_function for axis in axes], most),
+            (layout.scale[k], [axis.scale_function for axis in axes], LARGEST_RELATIVE_SCALE),
+        ):
+            sd = np.sqrt(variances[block.static : block.end])
+            worst = np.max(sd * [*_regressors(functions, edges), *sizes])
+            if not worst <= WORST * bound:
                 raise ValueError(
-                    f'`{key}[{k}].bias` must make a bias within {WORST * self._most:g} of its '
-                    f'column, makes {largest:g}'
+                    '`posterior.factor` must keep the effect of every standard deviation below '
+                    f'{WORST * bound:g}, got {worst:g}'
                 )
 
-    def losses(self, terms: Sequence[Term], regime: str) -> list[float]:
-        """Return the largest change of each axis' relative scale by the columns of a regime."""
-        active = [term for term in terms if term.column.during in ('always', regime)]
-        with np.errstate(over='ignore'):
-            lost = [np.abs(term.scale) * term.largest(self._farthest_k) for term in active]
-            total: list[float] = np.sum([np.zeros(3), *lost], axis=0).tolist()
-        return total
 
-    def _extremes(self, function: TemperatureFunction) -> tuple[float, float]:
-        try:
-            with np.errstate(all='ignore'):
-                values = function.value(self._t)
-                slopes = function.slope(self._t[[0, -1]])
-                # The curve goes on along its tangents.
-                ends = values[[0, -1]] + slopes * np.array([-self._beyond_k, self._beyond_k])
-                values = np.append(values, ends)
-        except OverflowError:
-            return -math.inf, math.inf
-        if not np.isfinite(values).all():
-            return -math.inf, math.inf
-        return float(np.min(values)), float(np.max(values))
-
-
-def check_posterior(
-    key: str,
-    posterior: Posterior,
-    blocks: Sequence[tuple[Block, tuple[TemperatureFunction, TemperatureFunction], float]],
-    edges: tuple[Sequence[float], Sequence[float]],
-    terms: Sequence[Term],
-) -> None:
-    """
-    Raise ValueError if the effect of a parameter's sd exceeds `WORST` times its bound.
-
-    Each block comes with its functions and bound; `edges` are those of the static and the dynamic
-    set, relative to the reference [K].
-    """
-    variances = (posterior.matrix**2).sum(axis=1) + posterior.variances
-    farthest_k = max(abs(edge) for pair in edges for edge in pair)
-    largest = [term.largest(farthest_k) for term in terms]
-    for block, functions, most in blocks:
-        felt = np.array([*_regressors(functions, edges), *largest])
-        sd = np.sqrt(variances[block.static : block.end]) * felt
-        if not (sd <= WORST * most).all():
+def _check_axes(calibration: Calibration, most: float) -> None:
+    for name, axis in zip('xyz', calibration.axes, strict=True):
+        if abs(axis.bias) > most:
             raise ValueError(
-                f'`{key}` must keep the effect of every standard deviation below '
-                f'{WORST * most:g}, got {sd.max():g}'
+                f'`axes.{name}.bias` must be within twice unit.full_scale, {most:g}, '
+                f'got {axis.bias:g}'
             )
+        force = calibration.unit.full_scale / abs(axis.scale_factor)
+        if fault := QUANTITIES['full-scale force'].fault(force):
+            raise ValueError(
+                f'`axes.{name}.scale_factor` makes unit.full_scale a force that {fault}, '
+                f'got {force:g}'
+            )
+
+
+def _largest(column: Column, farthest_k: float) -> float:
+    """Return the largest value of a column within `farthest_k` [K] of the reference."""
+    physical = {'gradient_even': 1.0, 'rate': _RATE_K_S}.get(
+        column.kind, (_DIFFERENCE_K + abs(column.rest_k)) ** column.order
+    )
+    return min(max(map(abs, column.range)), physical) * float(farthest_k) ** column.power
+
+
+def _check_bias(key: str, level: float, reached: tuple[float, float], most: float) -> None:
+    if abs(level) > most:
+        raise ValueError(f'`{key}.delta` must leave a bias within {most:g}, got {level:g}')
+    least, largest = reached
+    if not math.isfinite(largest - least):
+        raise ValueError(f'`{key}.bias_function` must be finite over its range {_AROUND}')
+    if max(-least, largest) > most:
+        raise ValueError(
+            f'`{key}.bias_function` must stay within {most:g} over its range {_AROUND}, '
+            f'reaches {max(reached, key=abs):g}'
+        )
+
+
+def _check_scale(key: str, reached: tuple[float, float], lost: float) -> None:
+    """Refuse a relative scale that leaves its limits when the columns take or add `lost`."""
+    for word, value, is_kept, limit in (
+        ('above', reached[0] - lost, operator.gt, SMALLEST_RELATIVE_SCALE),
+        ('below', reached[1] + lost, operator.lt, LARGEST_RELATIVE_SCALE),
+    ):
+        if not is_kept(value, limit):
+            raise ValueError(
+                f'`{key}.scale_function` must stay {word} {limit:g} over its ranges {_AROUND}, '
+                f'reaches {value:.4g}'
+            )
+
+
+def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[float, float]:
+    """Return the extremes of a function within its range, and at the ends of its tangents."""
+    lower, upper = edges
+    t = np.linspace(lower, upper, _GRID)
+    beyond_k = TANGENT_SPANS * (upper - lower)
+    try:
+        with np.errstate(all='ignore'):
+            values = function.value(t)
+            ends = values[[0, -1]] + function.slope(t[[0, -1]]) * np.array([-beyond_k, beyond_k])
+            values = np.append(values, ends)
+    except OverflowError:
+        return -math.inf, math.inf
+    if not np.isfinite(values).all():
+        return -math.inf, math.inf
+    return float(np.min(values)), float(np.max(values))
 
 
 def _regressors(
-    functions: tuple[TemperatureFunction, TemperatureFunction],
-    edges: tuple[Sequence[float], Sequence[float]],
-) -> Iterator[float]:
-    for function, set_edges in zip(functions, edges, strict=True):
-        yield 1.0
-        basis: list[Floats] = function.basis(np.array(set_edges))
-        yield from (float(np.abs(values).max()) for values in basis)
+    functions: Sequence[TemperatureFunction], edges: Sequence[Sequence[float]]
+) -> list[float]:
+    """Return the largest derivatives of two functions by their levels and free coefficients."""
+    pairs = zip(functions, edges, strict=True)
+    both = [function.basis(np.array(ends)) for function, ends in pairs]
+    return [size for basis in both for size in (1.0, *(float(np.abs(v).max()) for v in basis))]
