@@ -205,7 +205,7 @@ def test_a_blend_has_the_moments_of_the_mixture():
         mean = rng.normal(size=3)
         states.append((*mean, *(root @ root.T)[upper]))
         samples.append(rng.multivariate_normal(mean, root @ root.T, n))
-    out, back = mix(*states, 0.25, 0.75)
+    out, back = mix(*states, 0.25), mix(*states[::-1], 0.75)
     np.testing.assert_allclose(back, out, rtol=1e-12)
     mixed = np.concatenate(samples)
     # 400 000 samples with an sd of a few: 1 % of the covariances.

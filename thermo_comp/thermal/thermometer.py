@@ -117,12 +117,8 @@ class Thermometer:
         bending = self.bending
         prior_bending = bending * (1.0 - to_quiet) + (1.0 - bending) * to_bending
         prior_quiet = 1.0 - prior_bending
-        quiet, bent = mix(
-            self._quiet,
-            self._bent,
-            bending * to_quiet / prior_quiet,
-            (1.0 - bending) * to_bending / prior_bending,
-        )
+        quiet = mix(self._quiet, self._bent, bending * to_quiet / prior_quiet)
+        bent = mix(self._bent, self._quiet, (1.0 - bending) * to_bending / prior_bending)
         quiet = predict(quiet, dt, lag, self._quiet_power)
         bent = predict(bent, dt, lag, self._bending_power)
 
@@ -238,7 +234,7 @@ class Thermometer:
         """Estimate of the second derivative [K/s^2] and its variance [K^2/s^4]."""
         if self.stamp_ns is None:
             return nan, inf
-        state = mix(self._quiet, self._bent, self.bending, 0.0)[0]
+        state = mix(self._quiet, self._bent, self.bending)
         return state[2], state[8]
 
     def _start(self, stamp_ns: int, reading_c: float) -> None:
@@ -294,42 +290,23 @@ class Thermometer:
         return reading, inf
 
 
-def mix(quiet: State, bent: State, to_quiet: float, to_bent: float) -> tuple[State, State]:
-    """
-    Blend each of two states with the other one by its share of it: mean and covariance of the
-    mixture, which contains the distance of the two.
-    """
-    t, v, a, p00, p01, p02, p11, p12, p22 = quiet
-    u, w, b, r00, r01, r02, r11, r12, r22 = bent
+def mix(state: State, other: State, share: float) -> State:
+    """Mix a state with a share of another: the covariance contains the distance of the two."""
+    t, v, a, p00, p01, p02, p11, p12, p22 = state
+    u, w, b, r00, r01, r02, r11, r12, r22 = other
     dt, dv, da = u - t, w - v, b - a
-    d00, d01, d02, d11, d12, d22 = r00 - p00, r01 - p01, r02 - p02, r11 - p11, r12 - p12, r22 - p22
-    apart = to_quiet * (1.0 - to_quiet)
+    apart = share * (1.0 - share)
     at, av = apart * dt, apart * dv
-    other = to_bent * (1.0 - to_bent)
-    ot, ov = other * dt, other * dv
     return (
-        (
-            t + to_quiet * dt,
-            v + to_quiet * dv,
-            a + to_quiet * da,
-            p00 + to_quiet * d00 + at * dt,
-            p01 + to_quiet * d01 + at * dv,
-            p02 + to_quiet * d02 + at * da,
-            p11 + to_quiet * d11 + av * dv,
-            p12 + to_quiet * d12 + av * da,
-            p22 + to_quiet * d22 + apart * da * da,
-        ),
-        (
-            u - to_bent * dt,
-            w - to_bent * dv,
-            b - to_bent * da,
-            r00 - to_bent * d00 + ot * dt,
-            r01 - to_bent * d01 + ot * dv,
-            r02 - to_bent * d02 + ot * da,
-            r11 - to_bent * d11 + ov * dv,
-            r12 - to_bent * d12 + ov * da,
-            r22 - to_bent * d22 + other * da * da,
-        ),
+        t + share * dt,
+        v + share * dv,
+        a + share * da,
+        p00 + share * (r00 - p00) + at * dt,
+        p01 + share * (r01 - p01) + at * dv,
+        p02 + share * (r02 - p02) + at * da,
+        p11 + share * (r11 - p11) + av * dv,
+        p12 + share * (r12 - p12) + av * da,
+        p22 + share * (r22 - p22) + apart * da * da,
     )
 
 
