@@ -112,7 +112,7 @@ class Recorder:
 
     def _take(self) -> None:
         for name, subscription in self._heard.items():
-            messages, _ = subscription.drain()
+            messages, *_ = subscription.drain()
             if messages:
                 self._came.append((name, messages))
 

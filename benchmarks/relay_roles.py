@@ -123,7 +123,7 @@ def _sink(arguments: argparse.Namespace) -> None:
     is_ready = False
     while len(latencies) < n_expected and time.monotonic() - last < SILENCE_S:
         time.sleep(SINK_REST_S)
-        messages, received_ns = imu.drain()
+        messages, received_ns, _ = imu.drain()
         if messages and not is_ready:
             is_ready = True
             print('ready', flush=True)

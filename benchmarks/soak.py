@@ -124,7 +124,7 @@ class Soak:
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.serialization import deserialize_message
 
-        frames, _ = self._imu.drain()
+        frames, *_ = self._imu.drain()
         now = time.monotonic_ns()
         for data in frames:
             sec, nanosec = STAMP.unpack_from(data, 4)
@@ -136,7 +136,7 @@ class Soak:
         for data in self._flags.drain()[0]:
             self.n_changes += data != self._flag
             self._flag = data
-        reports, _ = self._diagnostics.drain()
+        reports, *_ = self._diagnostics.drain()
         with self._news:
             self.n_heard += len(frames)
             for data in reports:

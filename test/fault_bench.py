@@ -129,8 +129,8 @@ class Bench:
         self.node.destroy_node()
 
     def _hear(self):
-        frames, _ = self._imu.drain()
-        reports, _ = self._diagnostics.drain()
+        frames, *_ = self._imu.drain()
+        reports, *_ = self._diagnostics.drain()
         with self._news:
             self._frames += frames
             for data in reports:

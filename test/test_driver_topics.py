@@ -28,8 +28,8 @@ from std_msgs.msg import Float64
 
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.recording.topics import Topics
-from thermo_comp.ros.fields import LiveField
 from thermo_comp.ros.listener import LiveTopics
+from thermo_comp.ros.messages import LiveField
 from thermo_comp.ros.node import main
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration

@@ -199,7 +199,7 @@ def test_the_node_works_as_the_file_says(path, tmp_path):
     from sensor_msgs.msg import Imu, Temperature
     from std_msgs.msg import Float64
 
-    from thermo_comp.ros.fields import LiveField
+    from thermo_comp.ros.messages import LiveField
 
     names = {'imu': '/imu/uncompensated', 'board': '/temperature/board', **read_names(path)}
     layout = LAYOUTS[path.stem]

@@ -47,7 +47,7 @@ class Running:
         self.thread = threading.Thread(target=self.loop.run, args=(self.take,), daemon=True)
 
     def take(self):
-        messages, received_ns = self.raw.drain()
+        messages, received_ns, _ = self.raw.drain()
         with self.news:
             self.messages += messages
             self.received_ns += received_ns

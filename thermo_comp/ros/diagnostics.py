@@ -151,16 +151,16 @@ class Reporter:
 
     def _inputs(self) -> Iterator[Finding]:
         """List the problems of the publishers of the inputs."""
-        for k, one in enumerate(self._relay.inputs.values()):
+        for name, one in self._relay.inputs.items():
             n_publishers, topic = one.count_publishers(), one.subscription.topic_name
-            if n_publishers > 1 and one.is_contested:
+            if n_publishers > 1 and one.sources.is_contested:
                 text = f'{n_publishers} publishers on {topic}'
                 yield _ERROR, f'{text}, the topic is not used until only one of them sends'
             elif n_publishers > 1:
                 # The middleware lists a killed publisher until its lease ends.
                 yield _WARN, f'{n_publishers} publishers on {topic}, of which one sends'
             elif not n_publishers and (mismatch := _mismatch(self._node, one.subscription)):
-                level = _ERROR if k < 2 else _WARN
+                level = _ERROR if name in ('sample', 'board') else _WARN
                 yield level, f'no messages of a publisher on {topic}: {mismatch}'
 
     def _lost_rests(self) -> Iterator[Finding]:

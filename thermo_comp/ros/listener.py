@@ -17,8 +17,7 @@ from ..recording.serialized import Messages
 from ..recording.topics import Topics, is_thermometer, split_field
 from ..recording.wire import Feed, decode_blocks
 from ..topics import SAMPLES, TEMPERATURE, thermometer
-from .fields import LiveField, live_field
-from .messages import message_class
+from .messages import LiveField, live_field, message_class
 from .waitloop import RawSubscription, WaitLoop, own_node
 
 #: Interval of the search for publishers, and of the blocks [s].
@@ -63,7 +62,7 @@ class LiveTopics:
 
     def _take(self) -> None:
         for role, subscription in self._heard.items():
-            messages, received_ns = subscription.drain()
+            messages, received_ns, _ = subscription.drain()
             if messages:
                 self._came.append((role, messages, received_ns))
 

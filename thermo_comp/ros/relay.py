@@ -22,10 +22,9 @@ from ..online.compensator import Compensator
 from ..online.segments import Model
 from ..recording.blocks import NO_STAMP_NS
 from ..recording.topics import TWINS, split_field
-from ..topics import BOARD, FLAGS, IMU_OUT, SAMPLES, thermometer
+from ..topics import BOARD, FLAGS, IMU_OUT, SAMPLES, TEMPERATURE, thermometer
 from .conversion import SampleConverter, Traffic, read_temperature
-from .fields import LiveField, live_field
-from .messages import message_class, qos_of
+from .messages import LiveField, live_field, message_class, qos_of
 from .parameters import NodeConfig, named_topics
 from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
@@ -65,14 +64,12 @@ class Relay:
         self.traffic = Traffic()
         samples = self._open_samples(config)
         self.running = Running(loaded, config, compensator, samples, self._converter(config))
-        #: Subscriptions by thermometer; fields of thermometers with other types than Temperature.
-        self.thermometers = {
-            name: loop.subscribe(
-                Temperature, split_field(self._topic(name))[0], qos_of(BOARD), is_hot=False
-            )
-            for name in compensator.thermal.inputs
-        }
+        #: Subscriptions by thermometer, and the fields of their messages.
+        self.thermometers: dict[str, RawSubscription] = {}
         self._fields: dict[str, LiveField] = {}
+        for name in compensator.thermal.inputs:
+            topic = split_field(self._topic(name))[0]
+            self._hear(name, topic, LiveField(topic, TEMPERATURE, 'temperature'))
         self._problems: set[str] = set()
         imu = loop.publisher(Imu, self._names.get('output', IMU_OUT.name), qos_of(IMU_OUT))
         self._publish: Callable[[bytes], None] = imu.handle.publish_raw
@@ -107,7 +104,7 @@ class Relay:
     def look(self) -> None:
         """Subscribe again to thermometers whose messages have another type."""
         for name, one in list(self.thermometers.items()):
-            if name in self._fields or one.count_publishers():
+            if self._fields[name].kind is not Temperature or one.count_publishers():
                 continue
             try:
                 field = live_field(self._loop.node, self._topic(name))
@@ -117,16 +114,15 @@ class Relay:
                     self._loop.node.get_logger().error(str(error))
                 continue
             if field is not None:
-                self._fields[name], topic = field, one.subscription.topic_name
+                topic = one.subscription.topic_name
                 self._loop.unsubscribe(self.thermometers.pop(name))
                 # The middleware allows one type per topic: the loop must release the first before.
                 self._loop.call_soon(partial(self._hear, name, topic, field))
 
     def _hear(self, name: str, topic: str, field: LiveField) -> None:
-        one = self._loop.subscribe(field.kind, topic, qos_of(BOARD), is_hot=False)
-        everything = {**self.thermometers, name: one}
-        names = self.running.compensator.thermal.inputs
-        self.thermometers = {key: everything[key] for key in names if key in everything}
+        self._fields[name] = field
+        heard = self._loop.subscribe(field.kind, topic, qos_of(BOARD), is_hot=False)
+        self.thermometers[name] = heard
 
     @property
     def samples(self) -> RawSubscription:
@@ -214,7 +210,8 @@ class Relay:
         self._publish_flags()
 
     def _take_readings(self, name: str, messages: list[bytes], received_ns: list[int]) -> None:
-        read = self._fields[name].read if name in self._fields else read_temperature
+        field = self._fields[name]
+        read = read_temperature if field.kind is Temperature else field.read
         for data, received in zip(messages, received_ns, strict=True):
             reading = read(data)
             if reading is None:

@@ -119,28 +119,19 @@ class RawSubscription:
         #: Mean interval between the messages of the last drain [ns].
         self.interval_ns = 0
 
-    @property
-    def is_contested(self) -> bool:
-        """Whether more than one publisher may be sending."""
-        return self.sources.is_contested
-
-    def drain(self) -> tuple[list[bytes], list[int]]:
-        """Take up to `DRAIN_LIMIT` waiting messages, oldest first, with arrival times [ns]."""
-        messages, received_ns, _ = self.drain_numbered()
-        return messages, received_ns
-
     def drain_of_one(self) -> tuple[list[bytes], list[int], int]:
         """Take the waiting messages that are surely from one publisher, and count the others."""
-        messages, received_ns, numbers = self.drain_numbered()
+        messages, received_ns, numbers = self.drain()
         if not messages:
             return messages, received_ns, 0
         first = self.sources.of_one(self.count_publishers(), numbers, received_ns)
-        return (
-            (messages[first:], received_ns[first:], first) if first else (messages, received_ns, 0)
-        )
+        return messages[first:], received_ns[first:], first
 
-    def drain_numbered(self) -> tuple[list[bytes], list[int], list[int | None]]:
-        """Take the waiting messages with arrival times and the publishers' numbers (or None)."""
+    def drain(self) -> tuple[list[bytes], list[int], list[int | None]]:
+        """
+        Take up to `DRAIN_LIMIT` waiting messages, oldest first, with arrival times [ns] and the
+        publishers' numbers (or None).
+        """
         messages: list[bytes] = []
         received_ns: list[int] = []
         numbers: list[int | None] = []
