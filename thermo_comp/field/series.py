@@ -182,11 +182,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
 def series_of(
     rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
 ) -> Series:
-    """
-    Evaluate rests with a calibration; gravity is that of the log unless stated.
-
-    Raises RecordingError if the thermal states of the log lack a lag that the calibration needs.
-    """
+    """Evaluate rests at the logged or given gravity; RecordingError if they lack a lag."""
     correction = Correction(calibration)
     layout, K = Layout(correction.memory), correction.K[:, 0]
     places = {one: _places(one, correction.memory) for one in {s.memory for s, _ in rests}}

@@ -227,11 +227,7 @@ def _moved(
 
 
 def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """
-    Score updates by the earlier rests on each day, against the calibration.
-
-    With fewer than five days the folds are starts.
-    """
+    """Score updates by the earlier rests on each day, with fewer than five days on each start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start

@@ -92,10 +92,7 @@ class Watch:
 
 
 def watch(series: Series, calibration: Calibration, tolerance: float | None = None) -> Watch:
-    """
-    Compare the rests with the claim of a calibration, or with a tolerance of ``|f| - g`` [m/s^2],
-    and forecast when the unit leaves it.
-    """
+    """Compare rests with the claim or a tolerance of ``|f| - g`` [m/s^2]; forecast its end."""
     names = np.array([str(np.datetime64(int(day), 'D')) for day in series.day])
     ordered = np.unique(names)
     days = _rows(series, names, ordered.tolist(), tolerance)

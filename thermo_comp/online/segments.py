@@ -81,14 +81,11 @@ class ThermalSide:
         self.model, self.calibration = model, model.calibration
         self.correction, self.rate_correction = model.correction, model.rate_correction
         self.inputs = model.inputs
-        self._forget_rate()
+        self._forget_samples()
 
-    def _forget_rate(self) -> None:
+    def _forget_samples(self) -> None:
         unit = self.calibration.unit
         self.rate = RateCheck(unit.cycle_time_s, unit.input == 'counts')
-        self._forget_segment()
-
-    def _forget_segment(self) -> None:
         self._segment_key: tuple[int, int] | None = None
         self._slow_key: int | None = None
         self._slow: list[float] = []
@@ -104,14 +101,10 @@ class ThermalSide:
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
         """Continue with another model or configuration; the original of this copy stays."""
-        before, old, self.config = self.model, self.tracker, config
-        if model is before:
-            self._forget_segment()
-        else:
-            self._use(model, config)
-            self.queue = copy(self.queue)
-            self.queue.keep(lambda entry: entry[2] in self.inputs)
-        is_same = self.calibration.detector == before.calibration.detector
+        old, self.queue = self.tracker, copy(self.queue)
+        self._use(model, config)
+        self.queue.keep(lambda entry: entry[2] in self.inputs)
+        is_same = self.calibration.detector == old.settings
         if is_same and self.correction.memory == old.spec:
             self.tracker = copy(old)
             self.tracker.reconfigure(*self._tracker_config(), now_ns)
@@ -125,7 +118,7 @@ class ThermalSide:
     def reset(self) -> None:
         """Forget temperatures, regime and rate; keep waiting readings and counters."""
         self.tracker = self._new_tracker()
-        self._forget_rate()
+        self._forget_samples()
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """Queue a reading, if the calibration knows its thermometer."""

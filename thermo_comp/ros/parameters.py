@@ -232,7 +232,8 @@ class ParameterRequests:
     ) -> None:
         self._loop, self._prepare, self._apply = loop, prepare, apply
         self._n_waiting = 0
-        self._beside = ThreadPoolExecutor(1, 'parameters')
+        # A request without a file waits for none.
+        self._slow, self._quick = (ThreadPoolExecutor(1, 'parameters') for _ in range(2))
         for service in loop.node.services:
             if service.srv_type in (srv.SetParameters, srv.SetParametersAtomically):
                 loop.handlers[service] = partial(self._take, service.srv_type)
@@ -241,7 +242,8 @@ class ParameterRequests:
 
     def close(self) -> None:
         """Wait for the running preparation; apply nothing any more."""
-        self._beside.shutdown(cancel_futures=True)
+        for pool in (self._slow, self._quick):
+            pool.shutdown(cancel_futures=True)
 
     def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
         is_each, n, reason = kind is srv.SetParameters, len(request.parameters), ''
@@ -268,8 +270,7 @@ class ParameterRequests:
         elif groups:
             self._n_waiting += waits
             for group in groups:
-                read = partial(self._read, group)
-                future = self._beside.submit(read) if waits else _done(read)
+                future = (self._slow if waits else self._quick).submit(self._read, group)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
         # The number of results is limited: to write one per parameter takes as long as to read it.
@@ -303,16 +304,6 @@ class ParameterRequests:
             and node.describe_parameter(change.name).read_only
             and node.get_parameter(change.name).value == change.value
         )
-
-
-def _done(call: Callable[[], Any]) -> Future[Any]:
-    """Call at once, and keep the result or the exception."""
-    future: Future[Any] = Future()
-    try:
-        future.set_result(call())
-    except Exception as error:  # noqa: BLE001 - kept in the future
-        future.set_exception(error)
-    return future
 
 
 def _reply(service: Service, request: Any, answer: Callable[[Any], None]) -> None:

@@ -128,10 +128,7 @@ class RawSubscription:
         return messages[first:], received_ns[first:], first
 
     def drain(self) -> tuple[list[bytes], list[int], list[int | None]]:
-        """
-        Take up to `DRAIN_LIMIT` waiting messages, oldest first, with arrival times [ns] and the
-        publishers' numbers (or None).
-        """
+        """Take waiting messages, oldest first; arrival times [ns]; publishers' numbers or None."""
         messages: list[bytes] = []
         received_ns: list[int] = []
         numbers: list[int | None] = []

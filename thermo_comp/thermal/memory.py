@@ -77,10 +77,7 @@ def start_covariance(lags: Sequence[tuple[str, float]]) -> Floats:
 
 
 class LagBank:
-    """
-    The lags of one input. `start_ns` is the first stamp since the last `forget`; `has_extra` tells
-    whether the lags have a variance (`extra`) besides that of their start.
-    """
+    """The lags of one input; `start_ns` is the first stamp since the last `forget`."""
 
     def __init__(self, taus: tuple[float, ...]) -> None:
         self.taus = taus
@@ -95,6 +92,7 @@ class LagBank:
         self.input = 0.0
         self.lagging: list[float] = self._nil
         self.extra: list[float] = self._nil
+        #: Whether the lags have a variance `extra` besides that of their start.
         self.has_extra = False
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:

@@ -21,11 +21,7 @@ NEVER_NS: Final = 1 << 62
 
 
 class ReadingQueue:
-    """
-    Readings by stamp; at equal stamps the board first, then by name and arrival.
-
-    The case reading triggers the detector, which so has the newest readings of both sensors.
-    """
+    """Readings by stamp; at equal stamps the board first, so that the case decides with both."""
 
     def __init__(self) -> None:
         self._entries: list[Entry] = []
@@ -39,10 +35,7 @@ class ReadingQueue:
         return self._entries[0][0] if self._entries else NEVER_NS
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> int:
-        """
-        Add a reading; return the number of readings refused: this reading if too many wait, or the
-        waiting readings that its stamp shows to be from another clock.
-        """
+        """Add a reading; return the number refused: this one, or those of another clock."""
         n_before = len(self._entries)
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:

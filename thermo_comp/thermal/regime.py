@@ -147,12 +147,7 @@ class RegimeDetector:
 
 
 class _Watch:
-    """
-    Change detection of one sensor, and its calm: the rate is surely below the relaxed rate, now
-    and half a lag ahead.
-
-    The prediction continues the movement of the rate from its mean over the last quarter lag.
-    """
+    """Change detection of one sensor, and whether its rate is calm, now and half a lag ahead."""
 
     def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
         self.change = ChangeDetector(
@@ -202,6 +197,7 @@ class _Watch:
         room -= SURE_SIGMAS * doubt
         if not -room < rate < room:
             return False
+        # The movement from the mean over the last quarter lag goes on.
         ahead = 3.0 * rate - 2.0 * self._mean
         limit = max(relaxed, 3.0 * lead_swing)
         return -limit < ahead < limit

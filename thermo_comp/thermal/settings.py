@@ -62,9 +62,7 @@ Closes = Literal['board', 'case']
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
-    """
-    Smallest ramp, ripple and false alarms of the detector; keys of the file's `detector` section.
-    """
+    """Smallest ramp, ripple, false alarms of the detector; keys of the `detector` section."""
 
     smallest_ramp_k_min: Annotated[
         float, QUANTITIES['ramp'], 'The slowest ramp that must never be missed, K/min.'

@@ -15,10 +15,7 @@ MEMORY_SETTLED_SD: Final = 0.05
 
 
 class Layout:
-    """
-    Index of each gradient, lag and play in a sample, by name; the variance of a gradient or lag
-    follows it. `width` is the length of a sample.
-    """
+    """Index of each gradient, lag and play in a sample; a variance follows a gradient or lag."""
 
     def __init__(self, spec: MemorySpec) -> None:
         self.gradients = {name: GRADIENT + 2 * k for k, name in enumerate(spec.sensors)}

@@ -200,11 +200,7 @@ class Thermometer:
         return True
 
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
-        """
-        Extrapolate to a stamp, linearly within a few reading intervals, held beyond them:
-        temperature [degC], rate [K/s], variance of the temperature [K^2]; ``(nan, nan, inf)``
-        before the first reading.
-        """
+        """Extrapolate temperature, rate and variance to a stamp; held beyond a few intervals."""
         if self.stamp_ns is None:
             return nan, nan, inf
         if not self.is_ready:
@@ -311,10 +307,7 @@ def mix(state: State, other: State, share: float) -> State:
 
 
 def predict(state: State, dt: float, lag: float, power: float) -> State:
-    """
-    Carry a state over `dt` [s]: the acceleration decays with `lag` [s] and is driven by white
-    noise of the spectral density `power` [K^2/s^5].
-    """
+    """Carry a state over `dt` [s]; acceleration: decay `lag` [s], noise `power` [K^2/s^5]."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     half = 0.5 * dt * dt
     decay = 1.0 / (1.0 + dt / lag)
@@ -338,10 +331,7 @@ def predict(state: State, dt: float, lag: float, power: float) -> State:
 
 
 def correct(state: State, measured: float, variance: float) -> tuple[State, float, float]:
-    """
-    Update a state with a temperature [degC] of known variance [K^2]; return the new state, the
-    innovation [K] and its variance.
-    """
+    """Update by a temperature and its variance; return state, innovation [K], its variance."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     spread = p00 + variance
     innovation = measured - t

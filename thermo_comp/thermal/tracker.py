@@ -88,10 +88,7 @@ class ThermalTracker:
         return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self._case_timeout_s
 
     def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
-        """
-        Take a reading [degC] of ``'board'`` or of a sensor; the leading sensor's readings decide
-        the regime. False if it was not used: not finite, not newer, an outlier, not plausible.
-        """
+        """Take a reading [degC]; False if not used: not newer, an outlier or not plausible."""
         sensor, check = self.thermometers[name], self.checks[name]
         if not self._use(name, sensor, check, stamp_ns, celsius):
             return False

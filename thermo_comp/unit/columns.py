@@ -43,7 +43,8 @@ Tracker, fit, correction, covariance and file use this table.
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Final, Literal
+from itertools import product
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
@@ -56,6 +57,12 @@ from .schema import check_ranges
 
 #: A column range that limits no value.
 UNBOUNDED: Final = (-1e9, 1e9)
+#: Kinds of columns whose value is a power of a temperature difference.
+_ORDERS: Final = {
+    'square': 2,
+    'cube': 3,
+    **dict.fromkeys(('gradient', 'board', 'gradient_lag', 'size', 'play', 'bend'), 1),
+}
 #: Lag of a board behind its case if the bags do not determine it [s]: 15 min, typical of a housing
 #: of a few hundred grams in a chamber.
 USUAL_BOARD_LAG_S: Final = 900.0
@@ -167,19 +174,17 @@ class Column:
     @property
     def order(self) -> int:
         """Power of temperature in the value, not counting the factor t^power."""
-        return {'square': 2, 'cube': 3}.get(self.kind, 1)
+        return _ORDERS.get(self.kind, 1)
 
     def steepest(self, raw: Floats, flow_k: float) -> float:
-        """
-        Return the largest slope [1/K] of values `raw` (without t^power) with respect to their
-        temperature difference; for a dimensionless value by the RMS of the gradient, `flow_k` [K].
-        """
+        """Return the largest slope [1/K] of values u; `flow_k` is the RMS of the gradient [K]."""
         if self.kind == 'gradient_even':
             return 1.0 / flow_k
         if self.kind == 'rate':
             return 1.0 / USUAL_BOARD_LAG_S
-        largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
-        return float(self.order * largest ** (self.order - 1))
+        order = _ORDERS[self.kind]
+        largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / order)
+        return float(order * largest ** (order - 1))
 
 
 def bank(
@@ -193,44 +198,25 @@ def bank(
     of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K]. With
     `part_taus`, the time constants of the three axes' parts [s] (0: none), all lags have these.
     """
-    fine, coarse_taus, bend_taus, most_knees = FINE_TAUS, BANK_TAUS, BEND_TAUS, MOST_KNEES
+    fine, coarse, bend_taus, most_knees = FINE_TAUS, BANK_TAUS, BEND_TAUS, MOST_KNEES
     play_taus: tuple[float, ...] = PLAY_TAUS
     if part_taus is not None:
         bend_taus, most_knees = tuple(sorted({*part_taus})), MOST_PART_KNEES
-        fine = coarse_taus = tuple(tau for tau in bend_taus if tau)
+        fine = coarse = tuple(tau for tau in bend_taus if tau)
         play_taus = bend_taus
-    gradient = [Column('gradient', 'gradient', sensor, range=UNBOUNDED) for sensor in sensors]
-    board = [Column('board', 'board', tau_s=tau, range=UNBOUNDED) for tau in fine]
-    lagged_gradient = [
-        replace(column, group='gradient_lag', kind='gradient_lag', sensor=sensor)
-        for sensor in sensors
-        for column in board
-    ]
-    coarse = [column for column in board if column.tau_s in coarse_taus]
-    flow = [*gradient, *(column for column in lagged_gradient if column.tau_s in coarse_taus)]
-    product = [
-        replace(column, group='product', power=power) for power in (1, 2) for column in coarse
-    ]
-    mixed = [replace(column, group='gradient_x_temperature', power=1) for column in flow]
+    gradient = _family('gradient', ['gradient'], sensors)
+    board = _family('board', ['board'], taus=fine)
+    gradient_lag = _family('gradient_lag', ['gradient_lag'], sensors, taus=fine)
+    products = _family('product', ['board'], powers=(1, 2), taus=coarse)
+    mixed = _family('gradient_x_temperature', ['gradient'], sensors, powers=(1,))
+    mixed += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse)
     # The bias of a part that lags the board by m is a polynomial in its temperature t - m:
     # (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
-    square = [replace(column, group='square', kind='square') for column in coarse]
-    square += [replace(column, power=1) for column in square]
-    square += [replace(column, group='square', kind='cube') for column in coarse]
-    even = [
-        Column(
-            'gradient_even', 'gradient_even', sensor, width_k=width, power=power, range=(0.0, 1.0)
-        )
-        for sensor in sensors
-        for power in (0, 1, 2)
-        for width in EVEN_WIDTHS
-    ]
-    even += [
-        Column('gradient_even', kind, sensor, power=power, range=UNBOUNDED)
-        for sensor in sensors
-        for kind in ('size', 'square')
-        for power in (0, 1, 2)
-    ]
+    square = _family('square', ['square'], powers=(0, 1), taus=coarse)
+    square += _family('square', ['cube'], taus=coarse)
+    even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
+    even = [replace(column, range=(0.0, 1.0)) for column in even]
+    even += _family('gradient_even', ['size', 'square'], sensors, (0, 1, 2))
     # A heat pump's load is even in the heat flow; the effect of a change is even about rest.
     rest = at_rest or {}
     even += [
@@ -238,11 +224,7 @@ def bank(
         for column in even
         if rest.get(column.sensor)
     ]
-    play = [
-        Column('play', 'play', tau_s=tau, width_k=width, range=UNBOUNDED)
-        for tau in play_taus
-        for width in PLAY_WIDTHS
-    ]
+    play = _family('play', ['play'], taus=play_taus, widths=PLAY_WIDTHS)
     least_k = LEAST_KNEE_K * MOST_KNEES / most_knees
     n_knees = min(int((span_k[1] - span_k[0]) / least_k), most_knees)
     bend = [
@@ -250,7 +232,22 @@ def bank(
         for tau in bend_taus
         for knee in np.linspace(*span_k, n_knees + 2)[1:-1].round(3).tolist()
     ]
-    return (*gradient, *board, *lagged_gradient, *product, *mixed, *square, *even, *play, *bend)
+    return (*gradient, *board, *gradient_lag, *products, *mixed, *square, *even, *play, *bend)
+
+
+def _family(
+    group: Any,
+    kinds: Sequence[Any],
+    sensors: Sequence[str] = ('case',),
+    powers: Sequence[int] = (0,),
+    taus: Sequence[float] = (0.0,),
+    widths: Sequence[float] = (0.0,),
+) -> list[Column]:
+    """Return the columns of a group with all combinations of the properties."""
+    return [
+        Column(group, kind, sensor, tau, width, power=power, range=UNBOUNDED)
+        for sensor, kind, power, tau, width in product(sensors, kinds, powers, taus, widths)
+    ]
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
@@ -288,11 +285,7 @@ _DURING: Final = ('always', 'static', 'dynamic')
 
 
 class ColumnTable:
-    """
-    Columns, ready to be evaluated over states, shape (width, n); results have (n_columns, n).
-
-    States are evaluated element by element, so a single state gives the bits of a batch.
-    """
+    """Columns over states (width, n), each state evaluated alone; results have (n_columns, n)."""
 
     def __init__(
         self,

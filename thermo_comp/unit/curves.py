@@ -59,10 +59,7 @@ class Curves:
         self._has_lacks = any(one.lack_of_fit for one in sets)
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats]:
-        """
-        Return the distances of states outside the sets' ranges, shape (2, n): of temperature [K],
-        of its rate [K/s], and their sum in half ranges.
-        """
+        """Return distances outside, (2, n): temperature [K], rate [K/s], sum in half ranges."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         if not (over.any() or too_fast.any()):

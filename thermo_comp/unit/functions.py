@@ -267,12 +267,8 @@ def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:
 
 
 def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
-    """
-    Give ``a + b h + c h^2 + d h^3`` on each interval, h from its left knot, shape (4, n - 1).
-
-    The second derivatives at the knots solve the usual tridiagonal system with zeros at both
-    ends. Written in numpy: the node must not import scipy.
-    """
+    """Give ``a, b, c, d`` of ``a + b h + c h^2 + d h^3``, h from the left knot, (4, n - 1)."""
+    # The usual tridiagonal system, in numpy: the node must not import scipy.
     y, h = np.asarray(values), np.diff(np.asarray(knots))
     slopes = np.diff(y) / h
     n = len(y)

@@ -29,10 +29,7 @@ def residual_statistics(residual: Floats) -> ResidualStatistics:
 
 
 def norm_residual(specific_force: Floats, gravity: float | Floats) -> Floats:
-    """
-    Return ``|f| - g`` of forces, shape (..., 3): the residual that needs no attitude. If the known
-    |f| of a rest is not g, it is passed as `gravity`.
-    """
+    """Return ``|f| - g`` of forces (..., 3), which needs no attitude; `gravity`: the known |f|."""
     square = np.einsum('...i,...i->...', specific_force, specific_force)
     return np.asarray(np.sqrt(square) - gravity)
 

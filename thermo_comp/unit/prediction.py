@@ -183,11 +183,7 @@ def ramp_states(
     rate: float = 0.0,
     lasted_s: Floats | float = 0.0,
 ) -> Floats:
-    """
-    Build the states of a ramp or a soak at board temperatures, shape (n,).
-
-    `rate` is the board's [K/s], `lasted_s` the age of the ramp (inf: steady state), shape (n,).
-    """
+    """Build states (n, width) of a ramp that has lasted for `lasted_s` [s] at `rate` [K/s]."""
     layout = Layout(Correction(calibration).memory)
     states = np.zeros((len(temperature), layout.width))
     gradient = calibration.board_lag_s * rate

@@ -22,8 +22,6 @@ _Rate = Annotated[float, QUANTITIES['angular rate']]
 _Density = Annotated[float, QUANTITIES['rate noise density']]
 _Slow = Annotated[float, QUANTITIES['rate slow noise']]
 _Deviation = Annotated[float, QUANTITIES['rate deviation']]
-_Rates, _Densities = tuple[_Rate, _Rate, _Rate], tuple[_Density, _Density, _Density]
-_Slows, _Deviations = tuple[_Slow, _Slow, _Slow], tuple[_Deviation, _Deviation, _Deviation]
 
 
 @dataclass(frozen=True)
