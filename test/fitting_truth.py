@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thermo_comp.fitting.beginning import STEEPEST
-from thermo_comp.fitting.equations import as_vector, moved_by
-from thermo_comp.fitting.growth import Candidates
+from thermo_comp.fitting.equations import as_vector
+from thermo_comp.fitting.hyperparameters import Candidates
 from thermo_comp.fitting.regression import Regression
-from thermo_comp.fitting.unknowns import WHITE, Noise, Prior, Windows, tangent_basis
+from thermo_comp.fitting.unknowns import Noise, Prior, Windows, tangent_basis
 from thermo_comp.fitting.windows import N_SECTIONS
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.typing import Floats
@@ -40,7 +40,7 @@ class Truth:
     start_sd: float = 0.0
     sigma: Floats = field(default_factory=lambda: np.full(3, 2.0 * MICRO))
     #: Gauss-Markov noise of the bias, in addition to the white noise.
-    noise: Noise = WHITE
+    noise: Noise = field(default_factory=Noise)
     offset_sd: float = 0.0
     #: Sd of the supports' tilts [rad per RMS of a temperature].
     tilt_sd: float = 0.0
@@ -179,11 +179,11 @@ def begin(windows, up):
 def mode_of(regression, state, prior):
     """Find the mode to full precision: Newton steps from the result of a fit."""
     found = regression.solve(state, prior, n_steps=12)
-    state, grams = found.state, regression.products(found.layout.used).whole
+    point = regression.at(found.state, prior)
     for _ in range(6):
-        step, *_ = regression.step(state, prior, found.layout, grams)
-        state = moved_by(state, step, found.layout)
-    return regression.solve(state, prior, n_steps=0)
+        step, _ = point.solution
+        point = point.moved(step)
+    return regression.solve(point.state, prior, n_steps=0)
 
 
 def unit_of(state, layout):

@@ -11,8 +11,8 @@ from test_fitting import FACES, sources_of
 from triads import triad
 
 from thermo_comp.fitting import FitOptions, fit
-from thermo_comp.fitting.noise import Whitener
-from thermo_comp.fitting.unknowns import WHITE, Noise
+from thermo_comp.fitting.series import Whitener
+from thermo_comp.fitting.unknowns import Noise
 from thermo_comp.simulation.campaign import Position, parse_cyclogram
 from thermo_comp.simulation.run import arrays
 from thermo_comp.thermal.settings import DetectorSettings
@@ -89,7 +89,7 @@ def dense(position, time, weight, noise):
 
 
 @pytest.mark.parametrize(
-    'noise', [WHITE, Noise(1e-6, 30.0), Noise(1e-2, 1e4), Noise(10.0, 3.0), Noise(1e3, 1e4)]
+    'noise', [Noise(), Noise(1e-6, 30.0), Noise(1e-2, 1e4), Noise(10.0, 3.0), Noise(1e3, 1e4)]
 )
 def test_products_and_determinant_are_those_of_the_dense_matrix(rng, noise):
     position, time, weight = uneven(rng)
@@ -131,8 +131,8 @@ def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
     # The threshold has a false alarm rate of 1 % per series; none of these exceeds it.
     assert [
         whitener.estimate(series, weight)
-        for whitener, weight, series in (drawn(rng, 5, 100, WHITE) for _ in range(10))
-    ] == 10 * [WHITE]
+        for whitener, weight, series in (drawn(rng, 5, 100, Noise()) for _ in range(10))
+    ] == 10 * [Noise()]
 
 
 def test_a_time_that_no_position_holds_is_not_claimed(rng):
@@ -141,4 +141,4 @@ def test_a_time_that_no_position_holds_is_not_claimed(rng):
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
     alone = Whitener(np.arange(3), np.zeros(3))
-    assert alone.estimate(rng.standard_normal((3, 3)), np.ones(3)) == WHITE
+    assert alone.estimate(rng.standard_normal((3, 3)), np.ones(3)) == Noise()

@@ -25,8 +25,8 @@ def ratio(path):
     short = {'window_s': 1.0, 'cell_s': 0.2, 'min_rest_s': 1.0, 'fewest_windows': FEWEST_WINDOWS}
     bags = [reduce_source(source_of(stamps, accel, name=path.stem), full_scale=None, **short)]
     result = fit_bags(bags, options)
-    posterior, prior = result.selected.posterior, result.selected.prior
-    calibration, data = result.calibration, result.windows.data
+    posterior = result.fit.posterior
+    calibration, data = result.calibration, result.fit.windows.data
     K = np.array([axis.scale_factor for axis in calibration.axes])
     found = []
     for p in range(data.n_positions):
@@ -34,7 +34,7 @@ def ratio(path):
         rest = Regression(rows_of(data, kept), STANDARD_GRAVITY, K / posterior.state.kappa)
         others = np.arange(data.n_positions) != p
         local = {name: getattr(posterior.state, name)[others] for name in ('up', 'offset', 'tilt')}
-        state = rest.solve(replace(posterior.state, **local), prior, n_steps=3).state
+        state = rest.solve(replace(posterior.state, **local), posterior.prior, n_steps=3).state
         found.append(np.concatenate((state.kappa, state.bias, state.misalignment)))
     scatter = np.var(np.array(found), axis=0) * (len(found) - 1)
     variance = np.diag(calibration.posterior.covariance())

@@ -17,7 +17,6 @@ from thermo_comp.errors import FitError, ThermoCompError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.claim import claim_of
 from thermo_comp.fitting.equations import moved_by
-from thermo_comp.fitting.forces import Forces
 from thermo_comp.fitting.known_force import (
     MAGNITUDE,
     ROTATION,
@@ -29,7 +28,7 @@ from thermo_comp.fitting.known_force import (
     parse_sections,
 )
 from thermo_comp.fitting.left_out import score_of
-from thermo_comp.fitting.nonlinear import choose, prior_sd, starting_sd
+from thermo_comp.fitting.nonlinear import Forces, choose, prior_sd, starting_sd
 from thermo_comp.fitting.priors import population
 from thermo_comp.fitting.selection import Selected
 from thermo_comp.judging.evaluation import judge_bags
@@ -74,7 +73,7 @@ def chosen(rng, **terms):
     truth, regression, state = table(rng, **terms)
     prior = prior_of(truth, (), nonlinear_sd=starting_sd(regression.forces, OPTIONS))
     posterior = regression.solve(state, prior, n_steps=12)
-    begun = Selected(posterior, prior, score_of(regression, posterior, prior), ())
+    begun = Selected(posterior, score_of(regression, posterior), ())
     selected, found = choose(regression, begun, OPTIONS)
     return truth, selected.posterior, found
 
@@ -291,9 +290,8 @@ def test_a_claim_has_the_terms_and_the_radius_as_the_posterior_has_them(rng):
     truth, regression, state = table(rng, 1e-5, k3=1e-6, radius_sd=0.01)
     prior = prior_of(truth, (), nonlinear_sd=starting_sd(regression.forces, OPTIONS))
     posterior = regression.solve(state, prior, n_steps=12)
-    score = score_of(regression, posterior, prior)
     typical = np.outer([1.0, 0.1], regression.windows.kelvins)
-    claim = claim_of(regression, Selected(posterior, prior, score, ()), typical)
+    claim = claim_of(regression, posterior, typical)
     for name in ('nonlinear', 'radius', 'misalignment'):
         before, after = (getattr(one, name) for one in (posterior.layout, claim.layout))
         used = before >= 0

@@ -227,7 +227,7 @@ def test_leaving_a_position_out_is_a_fit_without_it(rng, groups, tolerance):
     regression, state = begin(windows, up)
     prior = prior_of(truth, groups)
     whole = mode_of(regression, state, prior)
-    score = score_of(regression, whole, prior)
+    score = score_of(regression, whole)
     before = regression.force(whole.state)
     for p in (0, 6, 13):
         own = windows.position == p
@@ -250,7 +250,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
     regression, state = begin(windows, up)
     prior = prior_of(truth, groups)
     whole = mode_of(regression, state, prior)
-    score = score_of(regression, whole, prior)
+    score = score_of(regression, whole)
     for section in range(windows.n_sections):
         own = windows.section == section
         force = regression.force(refit_of(whole, regression, prior, ~own))
@@ -263,7 +263,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
     assert score.sections.rms == pytest.approx(np.sqrt(score.sections.square.mean()))
     # One position cannot be left out: the drift is that of the sections.
     alone, state = begin(rows_of(windows, np.arange(24)), up[:1])
-    alone_score = score_of(alone, alone.solve(state, prior), prior)
+    alone_score = score_of(alone, alone.solve(state, prior))
     assert np.isnan(alone_score.positions.rms)
     assert np.isfinite(alone_score.drift).all()
     assert alone_score.rms == alone_score.sections.rms
@@ -276,7 +276,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
     regression, state = begin(windows, up)
     prior = prior_of(truth, misalignment_sd=1e-3)
     found = mode_of(regression, state, prior)
-    score = score_of(regression, found, prior)
+    score = score_of(regression, found)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
     # The drift needs neither; M keeps its value and its uncertainty.
@@ -365,7 +365,7 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise):
     regression, state = begin(without_starts(windows), up)
     prior = prior_of(truth, ('curve',))
     posterior = mode_of(regression, state, prior)
-    inactive = regression.inactive(posterior, prior, asked)
+    inactive = regression.inactive(posterior, asked)
     wide = column_sd(('board', 'idle'), 1e-2, 1e-3)
     found = mode_of(regression, posterior.state, replace(prior, column_sd=prior.column_sd + wide))
     places = found.layout.weights[:, :, asked].transpose(0, 2, 1).ravel()

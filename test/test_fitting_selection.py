@@ -22,11 +22,11 @@ from fitting_truth import (
     without_starts,
 )
 
-from thermo_comp.fitting.bayes_factors import group_evidence
 from thermo_comp.fitting.beginning import STEEPEST
 from thermo_comp.fitting.claim import claim_of
-from thermo_comp.fitting.comparison import is_better
+from thermo_comp.fitting.evidence import group_evidence
 from thermo_comp.fitting.hyperparameters import downweigh, settle
+from thermo_comp.fitting.left_out import is_better
 from thermo_comp.fitting.regression import Regression
 from thermo_comp.fitting.selection import Selected, fit_all, select
 from thermo_comp.fitting.unknowns import InformativePrior, Noise
@@ -81,9 +81,9 @@ def calm():
 
 def test_what_explains_nothing_is_not_chosen(calm):
     regression, found, _ = calm
-    np.testing.assert_array_equal(found.prior.column_sd > 0.0, [~IDLE, ~IDLE])
+    np.testing.assert_array_equal(found.posterior.prior.column_sd > 0.0, [~IDLE, ~IDLE])
     assert chosen_groups(found) == {'curve', 'board'}
-    evidence = group_evidence(regression, found.posterior, found.prior)
+    evidence = group_evidence(regression, found.posterior)
     assert {(one.part, one.group) for one in evidence} == {
         (part, group) for part in ('bias', 'scale') for group in ('curve', 'board')
     }
@@ -109,7 +109,7 @@ def test_what_is_forced_stays(calm):
     regression, _, truth = calm
     _, found = selected_of(truth, regression.windows, calm[1].posterior.state.up, ('idle',))
     assert chosen_groups(found) == set(ALL)
-    assert (found.prior.column_sd[:, IDLE] > 0.0).all()
+    assert (found.posterior.prior.column_sd[:, IDLE] > 0.0).all()
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_a_part_that_lags_is_found_although_no_curve_helps_alone(n_positions, st
 
 def test_noises_come_out(noisy):
     _, found, truth = noisy
-    prior = found.prior
+    prior = found.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(found)
     # 1080 windows per axis: white noise is determined to 3 %, slightly worse with the slow noise.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
@@ -162,8 +162,8 @@ def test_noises_come_out(noisy):
 
 def test_white_noise_is_not_taken_for_slow_noise(calm):
     _, found, truth = calm
-    np.testing.assert_allclose(found.prior.sigma, truth.sigma, rtol=0.12)
-    assert found.prior.noise == Noise()
+    np.testing.assert_allclose(found.posterior.prior.sigma, truth.sigma, rtol=0.12)
+    assert found.posterior.prior.noise == Noise()
 
 
 def test_prior_sds_are_those_of_the_weights(calm):
@@ -171,8 +171,8 @@ def test_prior_sds_are_those_of_the_weights(calm):
     # the hyperprior of a factor of ten shifts it by 1 / (2 x 3 x 5.3) of the distance.
     regression, found, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
-    np.testing.assert_allclose(found.prior.column_sd[0, :4], true[:4], rtol=0.25)
-    for one in group_evidence(regression, found.posterior, found.prior):
+    np.testing.assert_allclose(found.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
+    for one in group_evidence(regression, found.posterior):
         assert 0.0 < one.effective_parameters <= 6.0 + 1e-9
         assert len(one.prior_sd) == 2
 
@@ -184,9 +184,7 @@ def test_no_weight_is_believed_steeper_than_a_data_sheet():
     regression, state = begin(windows, up)
     candidates = candidates_of(windows)
     prior = replace(constants(truth), column_sd=candidates.typical)
-    _, found = settle(
-        regression, state, prior, candidates.typical, candidates.largest, candidates.fixed
-    )
+    found = settle(regression, state, prior, candidates).prior
     assert (found.column_sd <= candidates.largest).all()
     per_kelvin = found.column_sd[0, 0] / windows.kelvins[0]
     assert per_kelvin == pytest.approx(STEEPEST[0])
@@ -211,7 +209,7 @@ def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
     regression, state = begin(without_starts(windows), up)
     prior = prior_of(truth, column_sd=column_sd(ALL, 3e-4, 3e-5))
     posterior = mode_of(regression, state, prior)
-    evidence = group_evidence(regression, posterior, prior)
+    evidence = group_evidence(regression, posterior)
     assert [(one.part, one.group) for one in evidence] == [
         (part, group) for part in ('bias', 'scale') for group in ALL
     ]
@@ -229,7 +227,7 @@ def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
 def test_what_a_group_explains_is_what_it_adds(calm):
     regression, found, truth = calm
     columns = regression.windows.columns[:, 2:4]
-    evidence = group_evidence(regression, found.posterior, found.prior)
+    evidence = group_evidence(regression, found.posterior)
     explains = {(one.part, one.group): one.explains_m_s2 for one in evidence}
     expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
     # About 100 ug, with a noise of 2 ug.
@@ -248,8 +246,11 @@ def test_outliers_do_not_pull(calm):
     # 2 % of the windows, each limited to 3 sd, shift the result by about one sd; without limit
     # each counts 100 sd, and hides the curve.
     assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
-    np.testing.assert_allclose(other.prior.sigma, truth.sigma, rtol=0.2)
-    np.testing.assert_array_equal(other.prior.column_sd[0] > 0.0, one.prior.column_sd[0] > 0.0)
+    np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
+    used, used_with_outliers = (
+        fitted.posterior.prior.column_sd[0] > 0.0 for fitted in (one, other)
+    )
+    np.testing.assert_array_equal(used_with_outliers, used)
 
 
 def test_means_of_few_values_are_no_knocks():
@@ -266,7 +267,7 @@ def test_means_of_few_values_are_no_knocks():
     regression, state = begin(replace(windows, mean=windows.mean - NOMINAL * shifted), up)
     posterior = regression.solve(state, prior, n_steps=0)
     before = regression.weight.copy()
-    downweigh(regression, posterior, prior)
+    downweigh(regression, posterior)
     changed = regression.weight / before
     assert changed[100] < 0.02
     np.testing.assert_array_equal(np.delete(changed, 100), 1.0)
@@ -279,8 +280,8 @@ def test_of_two_columns_that_are_almost_one_the_better_stays():
     noise = np.random.default_rng(7).standard_normal(len(columns))
     columns[:, 4] = columns[:, 2] + 0.02 * columns[:, 2].std() * noise
     regression, found = selected_of(truth, replace(windows, columns=columns), up)
-    assert found.prior.column_sd[0, 2] > 0.0
-    assert found.prior.column_sd[0, 4] == 0.0
+    assert found.posterior.prior.column_sd[0, 2] > 0.0
+    assert found.posterior.prior.column_sd[0, 4] == 0.0
     left = regression.residual(found.posterior.state, found.posterior.layout) / truth.sigma
     assert np.sqrt(np.mean(left**2)) < 1.05
 
@@ -290,7 +291,7 @@ def test_how_bags_begin_is_learnt(start_sd, lower, upper):
     truth = Truth(start_sd=start_sd)
     windows, up = table_of(truth, 18, np.random.default_rng(9), n_windows=60)
     _, found = selected_of(truth, windows, up)
-    assert lower <= found.prior.start_share <= upper
+    assert lower <= found.posterior.prior.start_share <= upper
     assert chosen_groups(found) == {'curve', 'board'}
 
 
@@ -314,7 +315,7 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
     )  # fmt: skip
     fixed = replace(candidates, fixed=np.ones((2, 6), dtype=bool))
     found = fit_all(regression, state, prior, fixed, priors)
-    assert found.prior.informative is priors[int(away > 0.0)]
+    assert found.posterior.prior.informative is priors[int(away > 0.0)]
     curve = unit_of(found.posterior.state, layout)[places]
     # The same data: both results differ by less than their uncertainties.
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(found.posterior.variance[places]).max()
@@ -332,7 +333,7 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
 
     found, left = drift_left(windows)
     # 12 positions x 2 angles x 2 columns: a sd of 10 %.
-    assert 0.7 < found.prior.tilt_sd / truth.tilt_sd < 1.3
+    assert 0.7 < found.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
     # A tilt of 5 urad changes any axis by 5 ug; the noise of 720 windows is 0.1 ug for each
     # weight.
     assert left < 0.5 * MICRO
@@ -356,7 +357,7 @@ def claimed(n_positions, gravity_sd=0.0):
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
     found = select(regression, state, constants(truth), candidates)
-    claim = claim_of(regression, found, None, gravity_sd)
+    claim = claim_of(regression, found.posterior, None, gravity_sd)
     return claim.covariance, found.posterior.covariance
 
 

@@ -252,8 +252,8 @@ def test_the_file_corrects_as_the_regression(fitted):
     # Curves, sets and linear columns through the calibration's correction. Windows are means over
     # a minute; powers of means differ from means of powers by some ppm at 1 K/min.
     result, _ = fitted
-    windows, calibration = result.windows, result.calibration
-    state, prior = result.selected.posterior.state, result.selected.prior
+    windows, calibration = result.fit.windows, result.calibration
+    state, prior = result.fit.posterior.state, result.fit.posterior.prior
     correction = Correction(calibration)
     pairs = correction.bias_scale(states_of(windows, calibration)).swapaxes(0, 1)
     force = np.column_stack(
@@ -276,7 +276,7 @@ def test_covariance_of_the_file_is_that_of_the_claim(fitted):
     layout = parameter_layout(calibration)
     covariance = calibration.posterior.covariance()
     assert covariance.shape == (layout.n_parameters, layout.n_parameters)
-    state = result.selected.posterior.state
+    state = result.fit.posterior.state
     K = np.array([axis.scale_factor for axis in calibration.axes])
     sd = np.sqrt(np.diag(claim.covariance))
     found = np.sqrt(np.diag(covariance))

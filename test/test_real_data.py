@@ -39,7 +39,7 @@ def unit(request, real_data, work):
 
 
 def means_of(result):
-    data = result.windows.data
+    data = result.fit.windows.data
     return np.array([data.mean[data.position == p].mean(axis=0) for p in range(data.n_positions)])
 
 

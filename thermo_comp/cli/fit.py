@@ -21,7 +21,7 @@ from .shared_options import argument, option
 if TYPE_CHECKING:
     from ..convert.log import ForeignLog
     from ..fitting import FitResult
-    from ..fitting.growth import Trial
+    from ..fitting.selection import Trial
     from ..unit.calibration import Calibration
     from ..unit.rate_bias import Gyroscope
 
@@ -183,8 +183,8 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     n_positions = len(distinct_directions(np.array([one.up for one in result.positions])))
     if verbose:
         _say_positions(out, result)
-    _say_models(out, result.selected.trials)
-    taus = result.windows.model.part_taus
+    _say_models(out, result.fit.selected.trials)
+    taus = result.fit.windows.model.part_taus
     if taus is not None:
         out.line(
             'each axis is a curve of the temperature of its part, which lags the board by '
@@ -211,7 +211,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
         gravity=calibration.gravity_m_s2,
         left_out_rms_m_s2=left_out.rms,
         residuals_m_s2=result.residuals,
-        models=[_model(trial) for trial in result.selected.trials],
+        models=[_model(trial) for trial in result.fit.selected.trials],
         part_lags_s=taus,
         **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
         gyroscope=gyroscope and picked(gyroscope, _RATES) | {'residuals_rad_s': result.rates},

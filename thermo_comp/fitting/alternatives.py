@@ -7,30 +7,21 @@ and the end condition of the dynamic regime.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from ..typing import Floats
-from ..unit.columns import bank
-from .beginning import regress
-from .comparison import is_better
+from ..unit.columns import Column, bank
+from .beginning import Problem, regress
+from .left_out import is_better
 from .nonlinear import with_forces
 from .options import FitOptions, sets_of
 from .part_lags import find_parts
-from .priors import prior_columns, prior_sets
+from .priors import prior_model
 from .reduction import ReducedBag
-from .regression import Regression
-from .selection import Selected
+from .selection import Fit, Selected
 from .sensors import board_span, gradients_at_rest, learn_detector
-from .start import ConstantCalibration
-from .windows import SET, Model, ThermalWindows, thermal_windows
-
-Progress = Callable[[float], None]
-Regressed = tuple[Regression, Selected, Floats | None]  # see `regress`
-
-# Largest left-out drift, relative to the noise, of a model with the lags of parts beside which no
-# bank of lags is tried.
-_AT_NOISE = 2.0
+from .windows import SET, Model, ThermalWindows, Track, thermal_windows
 
 
 def model_of(
@@ -45,11 +36,14 @@ def model_of(
     """
     prior, reference = options.prior, options.reference_temperature
     if prior is not None:
-        sets, columns = prior_sets(prior), prior_columns(prior)
-        detector = options.detector or prior.detector
-        return Model(options.model, sets, columns, prior.sensors, detector, reference)
+        return replace(
+            prior_model(prior),
+            name=options.model,
+            detector=options.detector or prior.detector,
+            reference_temperature=reference,
+        )
     detector, sensors = options.detector or learn_detector(bags), sensors_of(bags)
-    columns = ()
+    columns: tuple[Column, ...] = ()
     if options.model != 'golovach':
         rests = gradients_at_rest(bags, sensors)
         columns = bank(sensors, rests, board_span(bags, reference), part_taus)
@@ -64,60 +58,56 @@ def model_of(
     return Model(options.model, sets, columns, sensors, detector, reference, part_taus)
 
 
-def regressed(
-    windows: ThermalWindows,
-    bags: Sequence[ReducedBag],
-    start: ConstantCalibration,
-    up: Floats,
-    options: FitOptions,
-    tell: Progress,
-) -> tuple[ThermalWindows, Regressed]:
-    """Fit the windows, with the better of the alternatives; return the windows used."""
-    windows, result = _with_lags(windows, bags, start, up, options, tell)
+def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
+    """Fit the windows, with the better of the alternatives; the fit has the windows used."""
+    bags, options = problem.bags, problem.options
+    fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
-    if not has_choice or not _may_have_sets(result[1]):
-        return windows, result
+    if not has_choice or not _may_have_sets(fit.selected):
+        return fit
     # The dynamic regime ends at constant temperatures of case and board, or of the case alone.
     # This affects only the sets.
-    model = windows.model
+    model = fit.windows.model
     closed = replace(model, detector=replace(model.detector, closes='case'))
-    others = with_forces(thermal_windows(bags, closed), bags, options)
-    others = replace(others, data=replace(others.data, undisturbed=windows.data.undisturbed))
-    again = regress(others, start, up, options, tell)
+    undisturbed = fit.windows.data.undisturbed
+    other = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
     # Both have the same columns: halves of the program, which limit their number, say nothing.
-    found = is_better(result[1].score, again[1].score, by_halves=False)
-    return (others, again) if found else (windows, result)
+    return other if is_better(fit.selected.score, other.selected.score, by_halves=False) else fit
 
 
-def _with_lags(
-    windows: ThermalWindows,
+def windows_of(
     bags: Sequence[ReducedBag],
-    start: ConstantCalibration,
-    up: Floats,
+    model: Model,
     options: FitOptions,
-    tell: Progress,
-) -> tuple[ThermalWindows, Regressed]:
+    tracks: Sequence[Track] | None = None,
+    undisturbed: Floats | None = None,
+) -> ThermalWindows:
+    """Return the windows of bags with |f|; `tracks`: known thermal states of the detector."""
+    windows = with_forces(thermal_windows(bags, model, tracks), bags, options)
+    return replace(windows, data=replace(windows.data, undisturbed=undisturbed))
+
+
+def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows with the lags of the parts, if the axes are curves of one part each.
 
     A bank of lags is used if there are no such parts. It is tried as well if the model of the
     parts is not at the noise, and taken if it is better on left-out data.
     """
+    bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
-    parts = find_parts(windows, start) if is_free else None
+    parts = find_parts(windows, problem.start) if is_free else None
     if parts is None:
-        return windows, regress(windows, start, up, options, tell)
+        return regress(windows, problem)
     model = model_of(bags, options, parts.taus)
-    own = with_forces(thermal_windows(bags, model, windows.tracks), bags, options)
-    own = replace(own, data=replace(own.data, undisturbed=parts.undisturbed))
-    result = regress(own, start, up, options, tell)
-    selected = result[1]
-    if selected.score.rms > _AT_NOISE * float(selected.prior.sigma.mean()):
-        other = regress(windows, start, up, options, tell)
-        if is_better(selected.score, other[1].score):
-            return windows, other
-    return own, result
+    of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
+    fit = regress(of_parts, problem)
+    if not fit.is_at_noise:
+        with_bank = regress(windows, problem)
+        if is_better(fit.selected.score, with_bank.selected.score):
+            return with_bank
+    return fit
 
 
 def _may_have_sets(selected: Selected) -> bool:
@@ -128,10 +118,10 @@ def _may_have_sets(selected: Selected) -> bool:
     80 % of its noise.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
-    limit = 0.8 * chosen.prior.sigma
+    limit = 0.8 * chosen.posterior.prior.sigma
     return any(
         SET in trial.groups
-        and (trial.is_chosen or (trial.is_near and (trial.prior.sigma < limit).all()))
+        and (trial.is_chosen or (trial.is_near and (trial.posterior.prior.sigma < limit).all()))
         for trial in selected.trials
     )
 

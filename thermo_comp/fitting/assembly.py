@@ -26,21 +26,20 @@ from ..unit.calibration import (
     parameter_layout,
 )
 from ..unit.columns import USUAL_BOARD_LAG_S, Column
-from ..unit.functions import TemperatureFunction
 from ..unit.nonlinearity import Kind, Nonlinearity
 from ..unit.posterior import posterior_of
 from ..unit.provenance import Provenance, ResidualSummary, Source
-from .bayes_factors import group_evidence
-from .claim import Claim
+from .claim import Claim, lack_of_fit
 from .data_checks import Finding
 from .equations import as_vector
-from .evidence import ResidualRow
-from .lack_of_fit import lack_of_fit
+from .evidence import ResidualRow, group_evidence
 from .reduction import ReducedBag
 from .regression import Regression
-from .selection import Selected
-from .unknowns import Layout, Prior, State
+from .selection import Fit
+from .unknowns import Layout, State
 from .windows import Sets, ThermalWindows
+
+Range = tuple[float, float]
 
 # Ratio of the valid range of rates and of linear columns to the range in the data. The response
 # to a heat flow is linear, so a ramp twice as fast has columns twice as large. Curves over
@@ -49,9 +48,7 @@ _LINEAR_RANGE = 2.0
 
 
 def build_calibration(
-    windows: ThermalWindows,
-    regression: Regression,
-    selected: Selected,
+    fit: Fit,
     claim: Claim,
     bags: Sequence[ReducedBag],
     unit: Unit,
@@ -65,53 +62,17 @@ def build_calibration(
 
     `known`: the calibration that was the prior; the valid ranges include its ranges.
     """
-    model, prior, state = windows.model, selected.prior, selected.posterior.state
-    layout = claim.layout
-    taken = (layout.weights[:, 0, len(model.sets.levels()) :] >= 0).any(axis=0)
-    used = np.flatnonzero(taken).tolist()
+    (windows, regression, *_), posterior = fit, fit.posterior
+    model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
+    # Places of the response columns that are in use, or that only the covariance has.
+    weights = layout.weights[:, 0, len(model.sets.levels()) :]
+    used = np.flatnonzero((weights >= 0).any(axis=0)).tolist()
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_parameters(regression, layout, state, model.sets, used, kinds)
     values = to_file @ as_vector(state, layout)[: layout.n_unit]
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
-    is_seen = windows.was_measured
-    # Margins of the valid ranges [K], [K/min]. A test at one temperature is valid near it. Without
-    # a thermometer the range is wide, and the covariance of the slope covers the unknown curve.
-    temperatures = _range(windows.temperature, 0.5 if is_seen else 50.0)
-    rates = _widened(windows.rate * 60.0, _LINEAR_RANGE, 0.01 if is_seen else 3.0)
-    slow = _slow_error(prior, claim).tolist()
-    earlier = (None, None) if known is None else known.regime_sets()
-    lacks = lack_of_fit(windows, regression, selected, claim) if regression.gravity else ((), ())
-    # The file states ``|f| - g`` of left-out positions only if all positions have a left-out norm.
-    is_norm = bool(np.isfinite(selected.score.norms.square).all())
-    regimes = []
-    for family, one, lack in zip(model.sets.families, earlier, lacks, strict=True):
-        x, y, z = (_blank(family, sd) for sd in slow)
-        regimes.append(
-            RegimeSet(
-                temperatures if one is None else union((temperatures, one.temperature_range_c)),
-                rates if one is None else union((rates, one.rate_range_k_min)),
-                *(x, y, z),
-                lack_of_fit=lack,
-            )
-        )
-    static, dynamic = regimes
-    seen = [_column_range(model.columns[k], windows.raw[:, k]) for k in used]
-    # A column with zero weight contributes only to the covariance, which is valid at any value.
-    span = temperatures[1] - temperatures[0]
-    n_curves = len(model.sets.levels())
-    for at, k in enumerate(used):
-        if (
-            not state.weights[:, :, n_curves + k].any()
-            and model.columns[k].kind != 'gradient_even'
-        ):
-            most = span ** model.columns[k].order
-            seen[at] = union((seen[at], (-most, most)))
-    columns = [
-        replace(
-            model.columns[k], range=one if known is None else union((one, model.columns[k].range))
-        )
-        for k, one in zip(used, seen, strict=True)
-    ]
+    static, dynamic = _regime_sets(fit, claim, known)
+    columns = _valid_columns(windows, state, used, known)
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     blank = Calibration(
         format_version=FORMAT_VERSION,
@@ -131,43 +92,99 @@ def build_calibration(
         response=blank_terms(columns),
         board_lag_s=known.board_lag_s if known else _board_lag(windows),
         detector=model.detector,
-        provenance=Provenance(
-            created=datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ'),
-            tool_version=__version__,
-            model=model.name,
-            sources=tuple(
-                Source(bag.source.name, bag.source.sha256 or '', bag.n_samples) for bag in bags
-            ),
-            residuals=tuple(
-                ResidualSummary(
-                    section=row.section,
-                    n_windows=row.fitted.n,
-                    raw_rms_m_s2=row.raw.rms,
-                    rms_m_s2=row.fitted.rms,
-                    max_m_s2=row.fitted.peak,
-                    left_out_rms_m_s2=row.left_out.rms if is_norm and row.left_out.n else None,
-                )
-                for row in residuals
-                if row.fitted.n
-            ),
-            notes=tuple(
-                f'{finding.name}: {finding.message}'
-                for finding in findings
-                if finding.level != 'good'
-            ),
-        ),
-        evidence=group_evidence(regression, selected.posterior, prior) if is_seen else (),
+        provenance=_provenance(fit, bags, residuals, findings),
+        evidence=group_evidence(regression, posterior) if windows.was_measured else (),
         nonlinearity=nonlinearity,
     )
     covariance = to_file @ claim.covariance @ to_file.T
     return with_parameters(blank, state.kappa * regression.nominal_scale, values, covariance)
 
 
-def _blank(family: TemperatureFunction, slow: float) -> AxisSet:
-    """Return the curves of one axis in one regime with all coefficients 0."""
-    nothing = (0.0,) * family.n_free
-    bias, scale = (family.with_free(nothing, reference) for reference in (0.0, 1.0))
-    return AxisSet(bias, scale, residual_sd_m_s2=slow)
+def _temperature_range(windows: ThermalWindows) -> Range:
+    """
+    Return the valid range of temperatures. A test at one temperature is valid near it. Without a
+    thermometer the range is wide, and the covariance of the slope covers the unknown curve.
+    """
+    return _range(windows.temperature, 0.5 if windows.was_measured else 50.0)
+
+
+def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[RegimeSet]:
+    """Return the static and the dynamic set with their ranges, all coefficients 0."""
+    windows, prior = fit.windows, fit.posterior.prior
+    temperatures = _temperature_range(windows)
+    rates = _range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, _LINEAR_RANGE)
+    # The sd of mounting offset plus slow noise of each axis [m/s^2].
+    slow = np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.ratio).tolist()
+    lacks = lack_of_fit(fit, claim) if fit.regression.gravity else ((), ())
+    result = []
+    for k, (family, lack) in enumerate(zip(windows.model.sets.families, lacks, strict=True)):
+        zero = (0.0,) * family.n_free
+        bias, scale = (family.with_free(zero, reference) for reference in (0.0, 1.0))
+        x, y, z = (AxisSet(bias, scale, residual_sd_m_s2=sd) for sd in slow)
+        regime = RegimeSet(temperatures, rates, x, y, z, lack_of_fit=lack)
+        if known is not None:
+            earlier = known.regime_sets()[k]
+            regime = replace(
+                regime,
+                temperature_range_c=union((temperatures, earlier.temperature_range_c)),
+                rate_range_k_min=union((rates, earlier.rate_range_k_min)),
+            )
+        result.append(regime)
+    return result
+
+
+def _valid_columns(
+    windows: ThermalWindows, state: State, used: Sequence[int], known: Calibration | None
+) -> list[Column]:
+    """Return the response columns in use with their valid ranges."""
+    lower, upper = _temperature_range(windows)
+    n_curves = len(windows.model.sets.levels())
+    result = []
+    for k in used:
+        column = windows.model.columns[k]
+        valid = column.range
+        if column.kind != 'gradient_even':
+            valid = _range(windows.raw[:, k], 0.01, _LINEAR_RANGE**column.order)
+            if not state.weights[:, :, n_curves + k].any():
+                # A column with zero weight contributes only to the covariance, which is valid at
+                # any value.
+                most = (upper - lower) ** column.order
+                valid = union((valid, (-most, most)))
+        result.append(
+            replace(column, range=valid if known is None else union((valid, column.range)))
+        )
+    return result
+
+
+def _provenance(
+    fit: Fit,
+    bags: Sequence[ReducedBag],
+    residuals: Sequence[ResidualRow],
+    findings: Sequence[Finding],
+) -> Provenance:
+    # The file states ``|f| - g`` of left-out positions only if all positions have a left-out norm.
+    is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
+    return Provenance(
+        created=datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ'),
+        tool_version=__version__,
+        model=fit.windows.model.name,
+        sources=tuple(
+            Source(bag.source.name, bag.source.sha256 or '', bag.n_samples) for bag in bags
+        ),
+        residuals=tuple(
+            ResidualSummary(
+                section=row.section,
+                n_windows=row.fitted.n,
+                raw_rms_m_s2=row.raw.rms,
+                rms_m_s2=row.fitted.rms,
+                max_m_s2=row.fitted.peak,
+                left_out_rms_m_s2=row.left_out.rms if is_norm and row.left_out.n else None,
+            )
+            for row in residuals
+            if row.fitted.n
+        ),
+        notes=tuple(str(finding) for finding in findings if finding.level != 'good'),
+    )
 
 
 def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
@@ -305,11 +322,6 @@ def _board_lag(windows: ThermalWindows) -> float:
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 
 
-def _slow_error(prior: Prior, claim: Claim) -> Floats:
-    """Return the sd of mounting offset plus slow noise of each axis, shape (3,) [m/s^2]."""
-    return np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.ratio)
-
-
 def _numbers(values: Floats) -> tuple[float, ...]:
     return tuple(float(v) + 0.0 for v in values)  # no -0.0
 
@@ -319,25 +331,16 @@ def _triple(values: Floats) -> tuple[float, float, float]:
     return a, b, c
 
 
-def _column_range(column: Column, values: Floats) -> tuple[float, float]:
-    if column.kind == 'gradient_even':
-        return column.range
-    return _widened(values, _LINEAR_RANGE**column.order, 0.01)
-
-
-def union(ranges: Iterable[tuple[float, float]]) -> tuple[float, float]:
+def union(ranges: Iterable[Range]) -> Range:
     """Return the smallest range that contains all ranges."""
     lower, upper = zip(*ranges, strict=True)
     return min(lower), max(upper)
 
 
-def _widened(values: Floats, ratio: float, margin: float) -> tuple[float, float]:
-    lower, upper = _range(values, margin)
-    return min(lower, ratio * lower), max(upper, ratio * upper)
-
-
-def _range(values: Floats, smallest_margin: float) -> tuple[float, float]:
+def _range(values: Floats, smallest_margin: float, ratio: float = 1.0) -> Range:
+    """Return the range of values with a margin, its edges outside 0 multiplied by a ratio."""
     lower, upper = float(np.min(values)), float(np.max(values))
     # 2 % of the span: thermometer noise shall not put the fitted data outside their own range.
     margin = max(0.02 * (upper - lower), smallest_margin)
-    return lower - margin, upper + margin
+    lower, upper = lower - margin, upper + margin
+    return min(lower, ratio * lower), max(upper, ratio * upper)

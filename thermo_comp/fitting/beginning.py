@@ -6,8 +6,8 @@ Owns the initial state and the prior of the regression, with or without a prior 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,12 +15,13 @@ from ..errors import FitError
 from ..typing import Bools, Floats
 from .coverage import distinct_directions
 from .data_checks import POSITIONS_NEEDED
-from .growth import Candidates
+from .hyperparameters import Candidates
 from .nonlinear import starting_sd, with_terms
 from .options import FitOptions
 from .priors import informative_priors, with_calibration
+from .reduction import ReducedBag
 from .regression import Regression
-from .selection import Selected, fit_all, select
+from .selection import Fit, fit_all, select
 from .start import (
     ConstantCalibration,
     constant_calibration,
@@ -28,7 +29,7 @@ from .start import (
     white_noise_of,
     within_positions,
 )
-from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior
+from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State
 from .windows import CURVE, ThermalWindows
 
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
@@ -36,47 +37,84 @@ from .windows import CURVE, ThermalWindows
 STEEPEST = np.array([5e-3, 2e-4])
 # Smallest typical slope of the bias [m/s^2 per K]: 0.1 ug/K, better than navigation grade.
 _FLATTEST = 1e-6
-# Smallest and largest scale of mounting and turn-on offsets [m/s^2]: 30 ug, as of sensors of
-# navigation grade, and 0.5 mg, as of consumer MEMS; the tail of the Student prior allows for more.
-_MOUNTING_SCALES = 3e-4, 5e-3
-# Initial sd of mounting offsets, and smallest initial noise [m/s^2]: 1 ug.
-_INITIAL_SIGMA = 1e-5
 
 
-def regress(
-    windows: ThermalWindows,
-    start: ConstantCalibration,
-    up: Floats,
-    options: FitOptions,
-    progress: Callable[[float], None],
-) -> tuple[Regression, Selected, Floats | None]:
+@dataclass(frozen=True)
+class Problem:
     """
-    Fit the windows, with or without a prior calibration.
+    The input of a regression, beside its windows.
 
-    Returns the regression, the chosen model, and the typical prior sd of all columns that could
-    have taken part, shape (2, m); None if the model has no choice of columns.
+    start: the triad without temperature
+    up: directions of the positions, shape (n_positions, 3)
     """
-    data = windows.data
-    n_directions = len(distinct_directions(up))
+
+    bags: Sequence[ReducedBag]
+    options: FitOptions
+    start: ConstantCalibration
+    up: Floats
+    progress: Callable[[float], None]
+
+
+def regress(windows: ThermalWindows, problem: Problem) -> Fit:
+    """Fit the windows, with or without a prior calibration."""
+    data, options, start = windows.data, problem.options, problem.start
+    known, n_directions = options.prior, len(distinct_directions(problem.up))
     if options.model == 'golovach' or n_directions < POSITIONS_NEEDED:
         # P attitudes show 3 P drifts. A unit has 6 of them (bias and scale of each axis), supports
         # have 2 P, so below 6 attitudes a tilt cannot be distinguished from a drift of the unit.
         # The paper's model has no tilts: they would take the errors that its two sets leave.
         data = replace(data, tilt=data.tilt[:, :0])
     regression = Regression(data, options.gravity, start.scale)
+    state = initial_state(regression, start, problem.up)
+    prior = _initial_prior(windows, start, options)
+    candidates = _candidates(windows, start, options, has_one_direction=n_directions == 1)
+    if known is not None:
+        state = with_terms(with_calibration(known, regression, state), known)
+        *others, widest = informative_priors(known, regression, state, windows.model.sets, options)
+        prior = replace(prior, column_sd=data.parts.astype(np.float64), informative=widest)
+        fixed = replace(candidates, fixed=np.ones_like(candidates.fixed))
+        return Fit(windows, regression, fit_all(regression, state, prior, fixed, others))
+    if options.model == 'golovach':
+        prior = replace(prior, column_sd=candidates.typical)
+        return Fit(windows, regression, fit_all(regression, state, prior, candidates))
+    narrow = prior
+    if n_directions < POSITIONS_NEEDED:
+        narrow = _narrowed(prior, regression, state, options)
+
+    def tell(part: float) -> None:
+        problem.progress(0.7 + 0.25 * part)
+
+    settling = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
+    selected = select(regression, state, narrow, settling, tell)
+    chosen = selected.posterior
+    wide = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
+    selected = replace(selected, posterior=replace(chosen, prior=wide))
+    return Fit(windows, regression, selected, candidates.typical)
+
+
+def initial_state(regression: Regression, start: ConstantCalibration, up: Floats) -> State:
+    """Return the state of a constant calibration."""
     inverse = np.asarray(np.linalg.inv(start.misalignment), dtype=np.float64)
     misalignment = inverse[[1, 2, 2], [0, 0, 1]]
-    state = regression.initial_state(start.bias / start.scale, misalignment, up)
-    candidates = _candidates(windows, start, options, has_one_direction=n_directions == 1)
+    return regression.initial_state(start.bias / start.scale, misalignment, up)
+
+
+def _initial_prior(
+    windows: ThermalWindows, start: ConstantCalibration, options: FitOptions
+) -> Prior:
+    """Return the prior of the constants and of the noises, without columns."""
+    data = windows.data
     drift = within_positions(data.mean / start.scale, data.position)
-    sigma = max(float(np.sqrt(np.mean(drift**2))), _INITIAL_SIGMA)
+    # Initial sd of mounting offsets, and smallest initial noise [m/s^2]: 1 ug.
+    least = 1e-5
+    sigma = max(float(np.sqrt(np.mean(drift**2))), least)
     prior = Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, BIAS_SD),
         scale_sd=SCALE_SD,
         misalignment_sd=MISALIGNMENT_SD,
-        column_sd=np.zeros_like(candidates.typical),
-        offset_sd=_INITIAL_SIGMA,
+        column_sd=np.zeros((2, len(data.groups))),
+        offset_sd=least,
         sigma=np.full(3, sigma),
         offset_scale=_mounting_scale(windows, start),
     )
@@ -84,37 +122,24 @@ def regress(
         prior = replace(prior, nonlinear_sd=starting_sd(data.forces, options))
     if options.mounting_sd is not None:
         prior = replace(prior, offset_sd=options.mounting_sd, offset_scale=0.0)
+    return prior
 
-    def tell(part: float) -> None:
-        progress(0.7 + 0.25 * part)
 
-    if options.prior is not None:
-        known = options.prior
-        state = with_calibration(known, regression, state)
-        state = with_terms(state, known)
-        *others, widest = informative_priors(known, regression, state, windows.model.sets, options)
-        prior = replace(prior, column_sd=data.parts.astype(np.float64), informative=widest)
-        fixed = replace(candidates, fixed=np.ones_like(candidates.fixed))
-        return regression, fit_all(regression, state, prior, fixed, others), None
-    if options.model == 'golovach':
-        prior = replace(prior, column_sd=candidates.typical)
-        return regression, fit_all(regression, state, prior, candidates), None
-    narrow = prior
-    if n_directions < POSITIONS_NEEDED:
-        # Few attitudes do not determine all constants, and the errors of an incomplete model would
-        # move them far. During the selection their prior sd is therefore five times the largest
-        # error of a norm, at least 5 % and at most 100 % of the prior's sd.
-        norms = np.linalg.norm(position_means(data) / start.scale, axis=1)
-        off = 5.0 * float(np.abs(norms - regression.norms(state)).max())
-        bias, scale = (
-            float(np.clip(ratio, 0.05, 1.0))
-            for ratio in (off / BIAS_SD, off / options.gravity / SCALE_SD)
-        )
-        narrow = replace(prior, bias_sd=bias * prior.bias_sd, scale_sd=scale * prior.scale_sd)
-    settling = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
-    selected = select(regression, state, narrow, settling, tell)
-    wide = replace(selected.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
-    return regression, replace(selected, prior=wide), candidates.typical
+def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOptions) -> Prior:
+    """
+    Return the prior of the constants during the selection of the columns.
+
+    Few attitudes do not determine all constants, and the errors of an incomplete model would move
+    them far. Therefore their sd is five times the largest error of a norm, at least 5 % and at
+    most 100 % of the prior's sd.
+    """
+    norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
+    off = 5.0 * float(np.abs(norms - regression.norms(state)).max())
+    bias, scale = (
+        float(np.clip(ratio, 0.05, 1.0))
+        for ratio in (off / BIAS_SD, off / options.gravity / SCALE_SD)
+    )
+    return replace(prior, bias_sd=bias * prior.bias_sd, scale_sd=scale * prior.scale_sd)
 
 
 def _is_slow(windows: ThermalWindows) -> Bools:
@@ -125,8 +150,7 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     the covariance has those that are linear, see `claim`.
     """
     data = windows.data
-    begin = np.searchsorted(data.bag, np.arange(data.bag.max() + 1))
-    longest_s = float(np.max(np.maximum.reduceat(data.time, begin) - data.time[begin]))
+    longest_s = float(data.age.max())
     taus = [column.tau_s for column in windows.model.columns]
     taus = [0.0] * (len(data.groups) - len(taus)) + taus
     return np.asarray(np.array(taus) > longest_s / np.log(10.0))
@@ -138,12 +162,14 @@ def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> floa
     within bounds.
     """
     data = windows.data
-    same = (data.position[2:] == data.position[:-2]).nonzero()[0]
-    if not len(same):
+    inner = data.inner
+    if not len(inner):
         return _FLATTEST
     sigma = float(np.median(white_noise_of(data, start.scale)))
-    density = sigma * np.sqrt(float(np.median(np.diff(data.time)[same])))
-    least, most = _MOUNTING_SCALES
+    density = sigma * np.sqrt(float(np.median(np.diff(data.time)[inner])))
+    # Bounds: 30 ug, as of sensors of navigation grade, and 0.5 mg, as of consumer MEMS; the tail
+    # of the Student prior allows for more.
+    least, most = 3e-4, 5e-3
     # Readings that never change have no noise; offsets of 1e6 times it have no posterior.
     least = max(min(least, 100.0 * density), _FLATTEST)
     return float(np.clip(3.0 * density, least, most))

@@ -1,11 +1,17 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the published covariance: that of the fit, widened by what the data do not determine.
+Owns the published uncertainty: the covariance of the fit, widened by what the data do not
+determine, and the lack of fit, the excess of the left-out errors over it.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. The weight of each fit is its evidence times
 a half-Student prior. The standard deviation of gravity is a common error of the scale factors.
+
+The lack of fit per regime and temperature is the mean square of the left-out drift less its
+published variance. So a kink of the curve, a tilt of the support or a drift of the bias widens the
+uncertainty although no column describes it. Models within one standard error of the chosen model
+contribute half of their squared difference from it.
 
 References
 ----------
@@ -20,19 +26,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..typing import Floats, Ints
+from ..typing import Bools, Floats, Ints
+from ..unit.calibration import LackOfFit
 from .equations import as_vector
-from .growth import LAGS
 from .hyperparameters import STUDENT_NU
 from .regression import Posterior, Regression
-from .selection import Selected
-from .unknowns import Layout, Prior
-
-# Grid of the mounting's standard deviation, relative to the scale of its prior: steps of a quarter
-# decade, over which the log evidence is smooth.
-_MOUNTING_GRID = 10.0 ** np.arange(-3.0, 1.51, 0.25)
-# Smallest standard deviation that is as likely as larger ones, on a logarithmic scale.
-_LEAST_LIKELY = 0.01
+from .selection import LAGS, Fit
+from .start import within_positions
+from .unknowns import Layout, Prior, State
 
 
 @dataclass(frozen=True)
@@ -52,23 +53,23 @@ class Claim:
 
 def claim_of(
     regression: Regression,
-    selected: Selected,
+    chosen: Posterior,
     candidates: Floats | None = None,
     gravity_sd: float = 0.0,
 ) -> Claim:
     """
-    Return the published covariance.
+    Return the published covariance of the fit of the chosen model.
 
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
     do not determine are added to the covariance; `gravity_sd`: [m/s^2]
     """
-    prior = selected.prior
-    posterior = regression.solve(selected.posterior.state, prior, n_steps=0)
+    prior = chosen.prior
+    posterior = regression.solve(chosen.state, prior, n_steps=0)
     layout, covariance, offset_sd = posterior.layout, posterior.covariance, prior.offset_sd
     if prior.offset_scale > 0.0:
-        covariance, offset_sd = _over_mountings(regression, posterior, prior)
+        covariance, offset_sd = _over_mountings(regression, posterior)
     if candidates is not None:
-        wider = _with_unseen(regression, posterior, prior, candidates)
+        wider = _with_unseen(regression, posterior, candidates)
         wide = regression.solve(posterior.state, wider, n_steps=0)
         # The unseen columns are added at the mounting sd of the mode, the mixture's excess to it.
         at = _places(posterior.layout, wide.layout)
@@ -96,9 +97,7 @@ def _places(layout: Layout, wider: Layout) -> Ints:
     return places
 
 
-def _with_unseen(
-    regression: Regression, posterior: Posterior, prior: Prior, typical: Floats
-) -> Prior:
+def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) -> Prior:
     """
     Add unseen columns to the prior, so that the covariance does not state that they are 0.
 
@@ -107,8 +106,8 @@ def _with_unseen(
     window's noise, the column enters the covariance with this sd and zero weight. A column that
     hardly moved is judged as if it had moved as far as the temperature did.
     """
-    groups = np.array(regression.windows.groups)
-    inactive = regression.inactive(posterior, prior, np.isin(groups, LAGS) & typical.any(axis=0))
+    groups, prior = np.array(regression.windows.groups), posterior.prior
+    inactive = regression.inactive(posterior, np.isin(groups, LAGS) & typical.any(axis=0))
     seen = np.diag(inactive.S).reshape(-1, 3)
     seen = seen.sum(axis=1) / np.maximum((seen > 0.0).sum(axis=1), 1)
     sd = np.zeros_like(typical)
@@ -127,19 +126,21 @@ def _with_unseen(
     return replace(prior, column_sd=np.where(matters, sd, prior.column_sd))
 
 
-def _over_mountings(
-    regression: Regression, posterior: Posterior, prior: Prior
-) -> tuple[Floats, float]:
+def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Floats, float]:
     """Return covariance and offset sd of the mixture of fits over the mounting's sd."""
-    tried = prior.offset_scale * _MOUNTING_GRID
+    prior = posterior.prior
+    # Grid of the mounting's standard deviation, relative to the scale of its prior: steps of a
+    # quarter decade, over which the log evidence is smooth.
+    grid = 10.0 ** np.arange(-3.0, 1.51, 0.25)
+    tried = prior.offset_scale * grid
     fits = [
         regression.solve(posterior.state, replace(prior, offset_sd=float(sd)), n_steps=1)
         for sd in tried
     ]
     # Density per step of the logarithm: flat below the scale, with a Student's tail above it, and
     # falling to 0 below a hundredth of the scale, which few mountings reach.
-    density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(_MOUNTING_GRID**2 / STUDENT_NU)
-    density += np.log(np.minimum(_MOUNTING_GRID / _LEAST_LIKELY, 1.0))
+    density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
+    density += np.log(np.minimum(grid / 0.01, 1.0))
     weight = np.array([fit.log_evidence for fit in fits]) + density
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
@@ -150,3 +151,64 @@ def _over_mountings(
         away = as_vector(one.state, one.layout)[:n] - here
         covariance += share * (one.covariance + np.outer(away, away))
     return covariance, float(np.sqrt(weight @ tried**2))
+
+
+def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:
+    """Return the lack of fit of the static and of the dynamic regime; () for none."""
+    windows, regression, selected, _ = fit
+    prior, state, position = fit.posterior.prior, fit.posterior.state, windows.data.position
+    noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.ratio)
+    claimed = drift_variance(regression, state, claim.layout, claim.covariance)
+    excess = selected.score.drift**2 - noise - claimed
+    drift = within_positions(regression.force(state), position)
+    model_error = np.zeros_like(drift)
+    for trial in selected.trials:
+        if trial.is_near:
+            other = within_positions(regression.force(trial.posterior.state), position)
+            model_error = np.maximum(model_error, 0.5 * (other - drift) ** 2)
+    static, dynamic = (
+        _points(windows.temperature, excess, model_error, rows & np.isfinite(excess[:, 0]))
+        for rows in (~windows.is_dynamic, windows.is_dynamic)
+    )
+    return static, dynamic
+
+
+def drift_variance(
+    regression: Regression, state: State, layout: Layout, covariance: Floats
+) -> Floats:
+    """Return the variance of the drift of each window by a covariance of the unit, (n, 3)."""
+    in_bias, in_scale = (np.flatnonzero(mask) for mask in layout.used)
+    on_bias, on_scale = (
+        within_positions(regression.columns[:, one], regression.windows.position)
+        for one in (in_bias, in_scale)
+    )
+    force = regression.along_axes(state)
+    result = np.zeros((len(on_bias), 3))
+    for axis in range(3):
+        a = force[regression.windows.position, axis][:, None]
+        along = np.hstack((on_bias, a * on_scale))
+        at = layout.axis[axis, 2 : 2 + along.shape[1]]
+        result[:, axis] = np.sum((along @ covariance[np.ix_(at, at)]) * along, axis=1)
+    return result
+
+
+def _points(
+    temperature: Floats, excess: Floats, model_error: Floats, rows: Bools
+) -> tuple[LackOfFit, ...]:
+    """Average the excess of some windows in at most 5 bins of temperature, 10 windows or more."""
+    n_bins = min(5, int(rows.sum()) // 10)
+    if not n_bins:
+        return ()
+    temperature, excess, model_error = temperature[rows], excess[rows], model_error[rows]
+    points: list[LackOfFit] = []
+    for part in np.array_split(np.argsort(temperature, kind='stable'), n_bins):
+        mean = excess[part].mean(axis=0)
+        # Errors of neighbouring windows are correlated: ten windows count as one observation. An
+        # excess below two standard errors is set to 0.
+        error = excess[part].std(axis=0) / np.sqrt(max(len(part) / 10.0, 1.0))
+        mean = np.where(mean > 2.0 * error, mean, 0.0)
+        x, y, z = np.sqrt(mean + model_error[part].mean(axis=0)).tolist()
+        celsius = float(temperature[part].mean())
+        if not points or celsius > points[-1].temperature_c:
+            points.append(LackOfFit(celsius, (x, y, z)))
+    return tuple(points) if any(any(one.sd_m_s2) for one in points) else ()

@@ -71,7 +71,9 @@ def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
     gain /= np.einsum('ij,ij->i', moved, columns_of_norm) + sd * sd
     gain[np.max(_SPHERE @ seen.T, axis=1, initial=-1.0) > math.cos(math.radians(20.0))] = 0.0
     good = gain >= max(0.5 * gain.max(), 1e-300)
-    tier = next(tier for tier in _TIERS if good[tier].any())
+    # Slices of `_SPHERE`: faces, edges and corners of a cube, then all other directions.
+    tiers = slice(0, 6), slice(6, 18), slice(18, 26), slice(26, None)
+    tier = next(tier for tier in tiers if good[tier].any())
     # Among directions of equal gain take the first.
     return np.asarray(_SPHERE[tier][np.argmax(gain[tier] >= 0.99 * gain[tier].max())])
 
@@ -243,5 +245,3 @@ def _spiral(n: int) -> Floats:
 
 # Unit vectors: the 26 of a cube, then 500 that cover the sphere evenly (8 degrees apart).
 _SPHERE = np.concatenate([_cube(), _spiral(500)])
-# Slices of `_SPHERE`: faces, edges and corners of a cube, then all other directions.
-_TIERS = (slice(0, 6), slice(6, 18), slice(18, 26), slice(26, None))

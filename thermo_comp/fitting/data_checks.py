@@ -30,6 +30,7 @@ from .windows import ThermalWindows
 
 if TYPE_CHECKING:
     from .evidence import ResidualRow
+    from .selection import Fit
 
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_ADVISED = 6, 9, 18
 
@@ -41,6 +42,9 @@ class Finding:
     name: str
     level: Literal['refusal', 'advice', 'good']
     message: str
+
+    def __str__(self) -> str:
+        return f'{self.name}: {self.message}'
 
 
 def _advice(name: str, message: str) -> Finding:
@@ -288,26 +292,20 @@ def can_tell_misalignment(up: Floats) -> bool:
     return geometry(distinct, with_misalignment=True) <= 6.0
 
 
-def judge_constants(
-    windows: ThermalWindows,
-    up: Floats,
-    constants: Sequence[Floats],
-    raw: float,
-    options: FitOptions,
-) -> Iterator[Finding]:
+def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Finding]:
     """
     Refuse data that appear to be compensated already.
 
-    `constants`: K, bias [m/s^2] and elements of M; `raw`: RMS of |f| - g with these alone [m/s^2].
+    `raw`: RMS of |f| - g with the constants of the triad alone [m/s^2].
     No triad is built with all constants below 1e-4 and a drift of |f| below 2e-5 g over 20 K.
     """
-    K, bias, skew = constants
-    span = float(np.ptp(windows.temperature)) if windows.has_temperature else 0.0
+    state, K = fit.posterior.state, fit.posterior.state.kappa * fit.regression.nominal_scale
+    span = float(np.ptp(fit.windows.temperature))
     scale = float(np.abs(K / (1.0 if options.input == 'm/s^2' else K.mean()) - 1.0).max())
-    worst, skewed = float(np.abs(bias).max()), float(np.abs(skew).max())
-    least = max(scale, worst / options.gravity, skewed)
-    is_none = least < 1e-4 and raw < 2e-5 * options.gravity
-    if is_none and span > 20.0 and can_tell_misalignment(up):
+    worst, skewed = float(np.abs(state.bias).max()), float(np.abs(state.misalignment).max())
+    largest = max(scale, worst / options.gravity, skewed)
+    is_none = largest < 1e-4 and raw < 2e-5 * options.gravity
+    if is_none and span > 20.0 and can_tell_misalignment(state.up):
         yield Finding(
             'compensated',
             'refusal',

@@ -21,9 +21,6 @@ from ..typing import Floats
 from .tangent import Normal
 from .unknowns import Layout
 
-# Relative jitters of a matrix that rounding may have made indefinite; they add up.
-_JITTERS = (1e-13, 1e-11, 1e-9, 1e-7)
-
 
 def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     """
@@ -38,7 +35,8 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     scaled = matrix / root[..., None, :]
     scaled /= root[..., :, None]
     every = np.arange(matrix.shape[-1])
-    for jitter in _JITTERS:
+    jitters = 1e-13, 1e-11, 1e-9, 1e-7  # they add up
+    for jitter in jitters:
         scaled[..., every, every] += jitter
         try:
             factor = np.linalg.cholesky(scaled)
@@ -46,7 +44,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
             if matrix.ndim > 2:
                 # Only the matrices that need more jitter get it.
                 return np.stack([factored(*one) for one in zip(matrix, square, strict=True)])
-            if jitter == _JITTERS[-1]:
+            if jitter == jitters[-1]:
                 raise
         else:
             break

@@ -20,66 +20,55 @@ from ..text import one_line
 from ..typing import Floats
 from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
+from .beginning import initial_state
+from .claim import drift_variance
 from .data_checks import Finding
-from .lack_of_fit import drift_of_positions, drift_variance
-from .left_out import Score
 from .options import FitOptions
-from .priors import constants_of, informative_priors, prior_columns, prior_sets, with_calibration
+from .priors import constants_of, informative_priors, prior_model, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
-from .selection import Selected
-from .start import position_means
-from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State
-from .windows import Model, ThermalWindows, thermal_windows
+from .selection import Fit
+from .start import within_positions
+from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State, Windows
+from .windows import ThermalWindows, thermal_windows
 
-# Smallest number of bags with a majority that one bag can contradict.
-_FEWEST_BAGS = 4
-# A bag contradicts the others if the RMS of its left-out drift exceeds their median, and the white
-# noise of a window, by this factor.
+# A bag contradicts the others, or a prior, if the RMS of its drift exceeds the usual one by this
+# factor.
 _LEAST_RATIO = 5.0
-# The exclusion of the bag must decrease the mean square of the others' left-out drift by this.
-_LEAST_FACTOR = 2.0
-# Standard deviation of the level of a bag [m/s^2]: 1 mg, more than the turn-on of a navigation
-# sensor.
-_LEVEL_SD = 1e-2
-# Factor of the root of a precision that keeps the parameters at the mean of the prior.
-_PRECISION_FACTOR = 1e4
 
 
-def contradicting_bag(windows: ThermalWindows, selected: Selected) -> int | None:
+def contradicting_bag(fit: Fit) -> int | None:
     """
     Find the bag that may be of another environment; None if none is suspect.
 
-    It is the one whose left-out drift is far larger than that of all others. A bag whose drift the
-    others do not determine is it if theirs is far above the noise.
+    It is the one whose left-out drift is far above the median of all bags, and the white noise of
+    a window. A bag whose drift the others do not determine is it if theirs is far above the noise.
     """
-    square = _square_of_bags(windows, selected.score)
+    square = _square_of_bags(fit)
     known = np.isfinite(square)
-    if known.sum() < _FEWEST_BAGS:
+    if known.sum() < 4:
+        # A majority that one bag can contradict needs four bags.
         return None
     usual = float(np.median(square[known]))
-    limit = _LEAST_RATIO**2 * float(np.mean(selected.prior.sigma**2))
+    limit = _LEAST_RATIO**2 * float(np.mean(fit.posterior.prior.sigma**2))
     if (~known).sum() == 1 and usual > limit:
         return int(np.argmin(known))
     worst = int(np.nanargmax(square))
     return worst if square[worst] > max(_LEAST_RATIO**2 * usual, limit) else None
 
 
-def is_better_without(
-    whole: tuple[ThermalWindows, Selected], rest: tuple[ThermalWindows, Selected], bag: int
-) -> bool:
-    """Whether the other bags' left-out drift falls once a bag takes no part in the fit."""
-    before = np.delete(_square_of_bags(whole[0], whole[1].score), bag)
-    after = _square_of_bags(rest[0], rest[1].score)
+def is_better_without(whole: Fit, rest: Fit, bag: int) -> bool:
+    """Whether the mean square of the other bags' left-out drift is halved without a bag."""
+    before, after = np.delete(_square_of_bags(whole), bag), _square_of_bags(rest)
     known = np.isfinite(before) & np.isfinite(after)
-    return bool(known.any() and before[known].mean() > _LEAST_FACTOR * after[known].mean())
+    return bool(known.any() and before[known].mean() > 2.0 * after[known].mean())
 
 
-def _square_of_bags(windows: ThermalWindows, score: Score) -> Floats:
+def _square_of_bags(fit: Fit) -> Floats:
     """Mean square of the left-out drift of each bag, shape (n_bags,), NaN where it is unknown."""
-    bag, square = windows.data.bag_of_position, score.positions.square
-    count = np.where(np.isfinite(square), score.positions.windows, 0.0)
-    weighted = np.bincount(bag, np.where(count > 0.0, square, 0.0) * count)
+    bag, folds = fit.windows.data.bag_of_position, fit.selected.score.positions
+    count = np.where(np.isfinite(folds.square), folds.windows, 0.0)
+    weighted = np.bincount(bag, np.where(count > 0.0, folds.square, 0.0) * count)
     total = np.bincount(bag, count)
     return np.where(total > 0.0, weighted / np.maximum(total, 1.0), np.nan)
 
@@ -92,11 +81,7 @@ def bags_contradicting_prior(
     parameters fixed, no start states and tilts of the bag explain it.
     """
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
-    constants = constants_of(known)
-    regression = Regression(data, options.gravity, constants.scale)
-    up = constants.force(position_means(data))
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
-    state = _state_of(known, regression, up)
+    regression, state = _at_calibration(known, data, options.gravity)
     first = informative_priors(known, regression, state, windows.model.sets, options)[0]
     # The noise of a window, as long as the calibration's typical ones.
     window_s = windows.typical_count * known.unit.cycle_time_s
@@ -107,32 +92,33 @@ def bags_contradicting_prior(
         scale_sd=SCALE_SD,
         misalignment_sd=MISALIGNMENT_SD,
         column_sd=data.parts.astype(np.float64),
-        # The level may have moved by a turn-on or by ageing: only the drift is judged.
-        offset_sd=_LEVEL_SD,
+        # The level may have moved by a turn-on or by ageing, of 1 mg or less [m/s^2]: only the
+        # drift is judged.
+        offset_sd=1e-2,
         sigma=np.maximum(sigma, 1e-9),
-        informative=replace(first, root=first.root * _PRECISION_FACTOR),
+        # This factor keeps the parameters at the mean of the prior.
+        informative=replace(first, root=1e4 * first.root),
     )
-    found = regression.solve(state, prior, n_steps=4)
-
-    left = drift_of_positions(regression, regression.residual(found.state, found.layout))
+    fitted = regression.solve(state, prior, n_steps=4)
+    drift = within_positions(regression.residual(fitted.state, fitted.layout), data.position)
     inverse = np.linalg.inv(first.root)
-    claimed = drift_variance(regression, state, found.layout, inverse @ inverse.T)
+    claimed = drift_variance(regression, state, fitted.layout, inverse @ inverse.T)
     lacks = [point.sd_m_s2 for one in known.regime_sets() for point in one.lack_of_fit]
     lack = np.square(lacks).max(axis=0) if lacks else np.zeros(3)
-    share = np.sum(left**2, axis=1) / np.sum(claimed + prior.sigma**2 + lack, axis=1)
-    bag = data.bag
-    mean = np.bincount(bag, share) / np.maximum(np.bincount(bag), 1)
-    found_bags: list[int] = np.flatnonzero(mean > _LEAST_RATIO**2).tolist()
-    return found_bags
+    ratio = np.sum(drift**2, axis=1) / np.sum(claimed + prior.sigma**2 + lack, axis=1)
+    mean = np.bincount(data.bag, ratio) / np.maximum(np.bincount(data.bag), 1)
+    contradicting: list[int] = np.flatnonzero(mean > _LEAST_RATIO**2).tolist()
+    return contradicting
 
 
-def _state_of(known: Calibration, regression: Regression, up: Floats) -> State:
-    constants = constants_of(known)
-    inverse = np.asarray(np.linalg.inv(constants.misalignment), dtype=np.float64)
-    begin = regression.initial_state(
-        constants.bias / constants.scale, inverse[[1, 2, 2], [0, 0, 1]], up
-    )
-    return with_calibration(known, regression, begin)
+def _at_calibration(
+    calibration: Calibration, data: Windows, gravity: float
+) -> tuple[Regression, State]:
+    """Return the regression of windows, and the state of a calibration."""
+    constants = constants_of(calibration)
+    regression = Regression(data, gravity, constants.scale)
+    state = initial_state(regression, constants, constants.directions(data))
+    return regression, with_calibration(calibration, regression, state)
 
 
 def with_excluded_error(
@@ -142,27 +128,14 @@ def with_excluded_error(
     Add the error of the correction of bags that took no part to the lack of fit of both sets;
     `others` says what the bags contradict.
     """
-    model = Model(
-        calibration.provenance.model,
-        prior_sets(calibration),
-        prior_columns(calibration),
-        calibration.sensors,
-        calibration.detector,
-        calibration.reference_temperature_c,
+    windows = thermal_windows(bags, prior_model(calibration))
+    regression, state = _at_calibration(calibration, windows.data, calibration.gravity_m_s2)
+    drift = within_positions(regression.force(state), windows.data.position)
+    regimes = ~windows.is_dynamic, windows.is_dynamic
+    static, dynamic = (
+        _widened(regime, np.mean(drift[rows if rows.any() else slice(None)] ** 2, axis=0))
+        for regime, rows in zip(calibration.regime_sets(), regimes, strict=True)
     )
-    alone = thermal_windows(bags, model)
-    constants = constants_of(calibration)
-    regression = Regression(alone.data, calibration.gravity_m_s2, constants.scale)
-    up = constants.force(position_means(alone.data))
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
-    state = _state_of(calibration, regression, up)
-    drift = drift_of_positions(regression, regression.force(state))
-    is_dynamic = alone.weight > 0.5
-    sets = []
-    for one, rows in ((calibration.static, ~is_dynamic), (calibration.dynamic, is_dynamic)):
-        square = np.mean(drift[rows if rows.any() else slice(None)] ** 2, axis=0)
-        sets.append(_widened(one, square))
-    static, dynamic = sets
     rms = float(np.sqrt(np.mean(drift**2))) / MICRO_G
     names = ', '.join(one_line(bag.source.name) for bag in bags)
     finding = Finding(
@@ -175,12 +148,11 @@ def with_excluded_error(
     return replace(calibration, static=static, dynamic=dynamic), finding
 
 
-def _widened(one: RegimeSet, square: Floats) -> RegimeSet:
-    points: Sequence[LackOfFit] = one.lack_of_fit
-    if not points:
-        points = (LackOfFit(float(np.mean(one.temperature_range_c)), (0.0, 0.0, 0.0)),)
-    wider = []
-    for point in points:
+def _widened(regime: RegimeSet, square: Floats) -> RegimeSet:
+    """Add a variance of each axis, shape (3,), to the lack of fit of a regime."""
+    middle = LackOfFit(float(np.mean(regime.temperature_range_c)), (0.0, 0.0, 0.0))
+    points = []
+    for point in regime.lack_of_fit or (middle,):
         x, y, z = np.sqrt(np.square(point.sd_m_s2) + square).tolist()
-        wider.append(replace(point, sd_m_s2=(x, y, z)))
-    return replace(one, lack_of_fit=tuple(wider))
+        points.append(replace(point, sd_m_s2=(x, y, z)))
+    return replace(regime, lack_of_fit=tuple(points))

@@ -16,19 +16,38 @@ are linear combinations of the base series of the windows (`series`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from functools import wraps
+from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
-from .last_result import last_result_kept
 from .series import Base, Series
 from .tangent import Tangent
 from .unknowns import Layout, Prior, State, Windows, lay_out
 
-#: Row and column of the unknown elements of M^-1.
-MISALIGNMENT_ROWS = ((1, 0), (2, 0), (2, 1))
+_Self = TypeVar('_Self')
+_Given = ParamSpec('_Given')
+_Result = TypeVar('_Result')
+
+
+def last_result_kept(
+    method: Callable[Concatenate[_Self, _Given], _Result],
+) -> Callable[Concatenate[_Self, _Given], _Result]:
+    """Keep the last result of a method; it is returned again for the same objects as arguments."""
+    name = f'_last_{method.__name__}'
+
+    @wraps(method)
+    def kept(self: _Self, /, *args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
+        last: tuple[tuple[object, ...], _Result] | None = self.__dict__.get(name)
+        if last is None or any(a is not b for a, b in zip(last[0], args, strict=True)):
+            last = args, method(self, *args, **kwargs)
+            self.__dict__[name] = last
+        return last[1]
+
+    return kept
 
 
 class Effects(NamedTuple):
@@ -129,7 +148,6 @@ class Equations(Series):
             bends = np.einsum('vpik,ijk->vjpi', terms, state.nonlinear.reshape(3, 2, -1))
         return Effects(force, across, state.kappa * (force + bends[0, 0]), bends[0], bends[1])
 
-    @last_result_kept
     def tangent(self, state: State, layout: Layout, base: Base) -> Tangent:
         """Linearise the equations about a state."""
         force, across, read, _, _ = self.effects(state)
@@ -203,9 +221,10 @@ class Equations(Series):
 
     def _by_misalignment(self, state: State) -> Floats:
         """Differentiate the force along each axis by the misalignment, times kappa, (n, 3, 3)."""
-        result = np.zeros((len(state.up), 3, len(MISALIGNMENT_ROWS)))
+        result = np.zeros((len(state.up), 3, 3))
         turned = self._norm(state) * state.up
-        for k, (row, source) in enumerate(MISALIGNMENT_ROWS):
+        # Row and column of each element of the inverse of M.
+        for k, (row, source) in enumerate(((1, 0), (2, 0), (2, 1))):
             result[:, row, k] = state.kappa[row] * turned[:, source]
         return result
 
@@ -268,7 +287,6 @@ class Equations(Series):
         result[layout.up] = 0.0 if self.gravity else 1.0
         return result
 
-    @last_result_kept
     def away(self, state: State, prior: Prior, layout: Layout) -> Floats:
         """Return the unknowns less the mean of the prior, 0 for all but the unit's, (n,)."""
         result = as_vector(state, layout)
@@ -280,15 +298,13 @@ class Equations(Series):
         return result
 
 
-# Unknowns to which a step is added; attitudes move in their tangent planes.
-_ADDED = (
-    *('kappa', 'bias', 'weights', 'misalignment', 'offset', 'tilt'),
-    *('start', 'nonlinear', 'radius', 'stretch'),
-)
-
-
 def _added(layout: Layout) -> list[str]:
-    return [name for name in _ADDED if getattr(layout, name).size]
+    """Return the unknowns to which a step is added: all but the attitudes."""
+    names = (
+        *('kappa', 'bias', 'weights', 'misalignment', 'offset', 'tilt'),
+        *('start', 'nonlinear', 'radius', 'stretch'),
+    )
+    return [name for name in names if getattr(layout, name).size]
 
 
 def as_vector(state: State, layout: Layout) -> Floats:

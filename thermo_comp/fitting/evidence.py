@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the residuals that a fit reports: of each step of the model, and of each position.
+Owns the evidence that a fit reports: the residuals of each step of the model and of each
+position, and the contribution of each group of columns.
 
 Each position has two residuals: in sample, and with the unit's parameters fitted without this
 position, which estimates the error in a new attitude.
@@ -9,17 +10,22 @@ position, which estimates the error in a new attitude.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from ..typing import Floats
+from ..typing import Bools, Floats
 from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
+from ..unit.provenance import GroupEvidence
+from .equations import as_vector
+from .gains import log_bayes_factors
 from .left_out import Score
-from .regression import Regression
-from .selection import Selected
+from .regression import Posterior, Regression
+from .selection import Fit
 from .unknowns import Noise, State
-from .windows import CURVE, SET, ThermalWindows
+from .windows import CURVE, SET
 
 
 @dataclass(frozen=True)
@@ -64,32 +70,35 @@ class ResidualRow:
     left_out: ResidualStatistics
 
 
-def residual_rows(
-    windows: ThermalWindows, regression: Regression, selected: Selected, *, is_shared: bool
-) -> tuple[tuple[ResidualRow, ...], Floats]:
-    """
-    Return the residuals of the steps of the model, and the left-out error of each window [m/s^2].
-
-    `is_shared`: whether the curve columns act in both regimes, see `windows.Sets`.
-    """
-    state = selected.posterior.state
-    steps = [regression.force(replace(state, weights=np.zeros_like(state.weights)))]
-    rungs = (_with_only(regression, selected, groups) for groups in ((CURVE,), (CURVE, SET)))
-    steps += [regression.force(step) for step in (*rungs, state)]
+def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats]:
+    """Return residuals of the steps of the model, and left-out errors of all windows [m/s^2]."""
+    (windows, regression, selected, _), state = fit, fit.posterior.state
+    steps = [
+        replace(state, weights=np.zeros_like(state.weights)),
+        *(_with_only(regression, fit.posterior, groups) for groups in ((CURVE,), (CURVE, SET))),
+        state,
+    ]
     sizes = regression.norms(state)[regression.windows.position]
-    residuals = [norm_residual(force, sizes) for force in steps]
+    residuals = [norm_residual(regression.force(step), sizes) for step in steps]
     left_out = left_out_error(selected.score, sizes)
-    is_dynamic = windows.weight > 0.5
-    known = np.isfinite(left_out)
-    tables = [statistics_by_regime(r, is_dynamic) for r in residuals]
-    if not is_shared:
-        tables[1] = statistics_by_regime(np.empty(0), np.empty(0, bool))
-    tables.append(statistics_by_regime(left_out[known], is_dynamic[known]))
+    if not windows.model.sets.is_shared:
+        residuals[1] = np.full_like(left_out, np.nan)
+    tables = tables_of((*residuals, left_out), windows.is_dynamic)
     rows = tuple(
         ResidualRow(section, *(table[section] for table in tables))
         for section in ('static', 'dynamic', 'all')
     )
     return rows, left_out
+
+
+def tables_of(
+    residuals: Iterable[Floats], is_dynamic: Bools
+) -> list[dict[str, ResidualStatistics]]:
+    """Return the statistics by regime of some residuals, shape (n,), where they are known."""
+    return [
+        statistics_by_regime(one[np.isfinite(one)], is_dynamic[np.isfinite(one)])
+        for one in residuals
+    ]
 
 
 def left_out_error(score: Score, gravity: float | Floats) -> Floats:
@@ -102,26 +111,24 @@ def left_out_error(score: Score, gravity: float | Floats) -> Floats:
     return np.asarray(np.where(np.isfinite(norm), norm, drift))
 
 
-def _with_only(regression: Regression, selected: Selected, groups: tuple[str, ...]) -> State:
+def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...]) -> State:
     """Fit again with some groups only, under a flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
     # The residuals of such a model are mostly model error: all windows get equal weight.
     prior = replace(
-        selected.prior,
+        chosen.prior,
         column_sd=only * regression.windows.parts * [[0.05], [0.005]],
         offset_sd=1e-7,
         offset_scale=0.0,
         noise=Noise(),
         informative=None,
     )
-    return regression.solve(selected.posterior.state, prior).state
+    return regression.solve(chosen.state, prior).state
 
 
-def position_reports(
-    windows: ThermalWindows, regression: Regression, selected: Selected, left_out: Floats
-) -> tuple[PositionReport, ...]:
+def position_reports(fit: Fit, left_out: Floats) -> tuple[PositionReport, ...]:
     """List the positions with their RMS residuals in sample and left out."""
-    state = selected.posterior.state
+    (windows, regression, *_), state = fit, fit.posterior.state
     sizes = regression.norms(state)[regression.windows.position]
     residual = norm_residual(regression.force(state), sizes)
     result = []
@@ -138,4 +145,37 @@ def position_reports(
                 left_out_rms=float(np.sqrt(np.mean(left_out[rows] ** 2))),
             )
         )
+    return tuple(result)
+
+
+def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupEvidence, ...]:
+    """Return RMS contribution, effective parameters and log Bayes factor of each group in use."""
+    names = np.array(regression.windows.groups)
+    prior, state, layout = posterior.prior, posterior.state, posterior.layout
+    mode = as_vector(state, layout)[: layout.n_unit]
+    force = (regression.norms(state)[:, None] * state.up)[regression.windows.position]
+    effective = posterior.effective_parameters
+    parts: tuple[Literal['bias', 'scale'], ...] = ('bias', 'scale')
+    result = []
+    for k, part in enumerate(parts):
+        for group in dict.fromkeys(regression.windows.groups):
+            used = (names == group) & (prior.column_sd[k] > 0.0)
+            if not used.any():
+                continue
+            added = regression.columns[:, used] @ state.weights[k][:, used].T
+            if part == 'scale':
+                added = added * force
+            places, sd = layout.weights[k][:, used].ravel(), prior.column_sd[k][used]
+            each = regression.weight_sd(prior)[k][:, used].ravel()
+            (gain,) = log_bayes_factors(mode, posterior.covariance, places[None], each[None])
+            result.append(
+                GroupEvidence(
+                    group,
+                    part,
+                    float(np.sqrt(np.mean(added**2))),
+                    max(float(effective[k][used].sum()), 0.0),
+                    float(gain),
+                    tuple(sd.tolist()),
+                )
+            )
     return tuple(result)

@@ -9,7 +9,7 @@ code at zero force is subtracted before the fit and added to the bias afterwards
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -24,9 +24,9 @@ from ..unit.calibration import Axes, AxisReference, Calibration, Unit
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.nonlinearity import NonlinearTerm
 from . import data_checks
-from .alternatives import model_of, regressed
+from .alternatives import model_of, regressed, windows_of
 from .assembly import build_calibration
-from .beginning import first_guess
+from .beginning import Problem, first_guess
 from .claim import claim_of
 from .coverage import LeastKnown, least_known, rough_centre
 from .data_checks import Finding, enforce
@@ -42,11 +42,10 @@ from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of
 from .reduction import ReducedBag, reduce_source
-from .selection import Selected
+from .selection import Fit
 from .sensors import without_copies
 from .sources import FitSource
-from .start import position_means
-from .windows import FEWEST_WINDOWS, ThermalWindows, thermal_windows
+from .windows import FEWEST_WINDOWS
 
 Progress = Callable[[float], None]
 
@@ -56,12 +55,11 @@ class FitResult:
     """A calibration with its residuals and findings; `rates`: residuals of the gyroscope."""
 
     calibration: Calibration
-    selected: Selected
+    fit: Fit
     residuals: tuple[ResidualRow, ...]
     positions: tuple[PositionReport, ...]
     findings: tuple[Finding, ...]
     least_known: LeastKnown | None
-    windows: ThermalWindows
     bags: tuple[ReducedBag, ...]
     rates: tuple[RateRow, ...] = ()
 
@@ -116,14 +114,16 @@ def _fit_about_offset(
     if not offset.any():
         return _fit_one_environment(bags, options, progress)
     codes = ' '.join(f'{code:g}' for code in offset)
-    note = f'zero force reads {codes} counts: the samples use an offset code'
+    finding = Finding(
+        'offset', 'advice', f'zero force reads {codes} counts: the samples use an offset code'
+    )
     prior = options.prior and about(options.prior, -offset)
     centred_bags = [centred(bag, offset) for bag in bags]
     result = _fit_one_environment(centred_bags, replace(options, prior=prior), progress)
     return replace(
         result,
-        calibration=with_notes(about(result.calibration, offset), [f'offset: {note}']),
-        findings=(Finding('offset', 'advice', note), *result.findings),
+        calibration=with_notes(about(result.calibration, offset), [finding]),
+        findings=(finding, *result.findings),
         bags=tuple(bags),
     )
 
@@ -172,120 +172,112 @@ def about(calibration: Calibration, offset: Floats) -> Calibration:
     return replace(calibration, unit=replace(unit, full_scale=full_scale), axes=Axes(*moved))
 
 
-def with_notes(calibration: Calibration, notes: Sequence[str]) -> Calibration:
-    """Add notes to a calibration's provenance."""
+def with_notes(calibration: Calibration, findings: Iterable[Finding]) -> Calibration:
+    """Add findings to the notes of a calibration's provenance."""
     provenance = calibration.provenance
-    return replace(calibration, provenance=replace(provenance, notes=(*provenance.notes, *notes)))
+    notes = (*provenance.notes, *map(str, findings))
+    return replace(calibration, provenance=replace(provenance, notes=notes))
 
 
 def _fit_one_environment(
-    bags: Sequence[ReducedBag], options: FitOptions, tell: Progress
+    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
     """Fit the bags, without those of another environment, see `environments`."""
-    whole = _fit(bags, options, tell)
+    whole = _fit(bags, options, progress)
     known = options.prior
+    gone: list[int] = []
     if known is None:
-        bag = contradicting_bag(whole.windows, whole.selected)
+        bag = contradicting_bag(whole.fit)
         gone = [] if bag is None else [bag]
-    elif known.unit.serial == whole.calibration.unit.serial and not whole.windows.data.forces:
-        gone = bags_contradicting_prior(whole.windows, known, options)
-    else:
-        gone = []
+    elif known.unit.serial == whole.calibration.unit.serial and not whole.fit.windows.data.forces:
+        gone = bags_contradicting_prior(whole.fit.windows, known, options)
     if not gone:
         return whole
     kept = [bag for k, bag in enumerate(bags) if k not in gone]
     rest = whole
     if kept:
-        rest = _fit(kept, options, tell)
-        pair = (whole.windows, whole.selected), (rest.windows, rest.selected)
-        if known is None and not is_better_without(*pair, gone[0]):
+        rest = _fit(kept, options, progress)
+        if known is None and not is_better_without(whole.fit, rest.fit, gone[0]):
             return whole
     elif known is not None:
         # All bags contradict the prior, so none can update it.
         provenance = whole.calibration.provenance
         rest = replace(whole, calibration=replace(known, provenance=provenance))
-    calibration, finding = with_excluded_error(
-        rest.calibration,
-        [bags[k] for k in gone],
-        'the other bags' if known is None else 'the prior',
-    )
+    others = 'the other bags' if known is None else 'the prior'
+    excluded = [bags[k] for k in gone]
+    calibration, finding = with_excluded_error(rest.calibration, excluded, others)
     return replace(
         rest,
-        calibration=with_notes(calibration, [f'{finding.name}: {finding.message}']),
+        calibration=with_notes(calibration, [finding]),
         findings=(*rest.findings, finding),
         bags=tuple(bags),
     )
 
 
-def _fit(bags: Sequence[ReducedBag], options: FitOptions, tell: Progress) -> FitResult:
+def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) -> FitResult:
     """Fit a calibration to bags whose readings at zero force are near 0."""
-    seen = [bool(len(bag.board.value)) for bag in bags]
-    if any(seen) and not all(seen):
-        name = bags[seen.index(False)].source.name
-        raise FitError(f'{name}: no board temperature, which the other bags have')
-    serial = check_serial([bag.source for bag in bags], options)
-    findings = enforce(data_checks.judge_prior(serial, options.prior), options)
-    findings += enforce(data_checks.judge_bags(bags, options), options)
-    bags, copies = without_copies(bags)
-    findings += data_checks.judge_copies(copies)
-    known = options.prior
-    terms: tuple[NonlinearTerm, ...] = ()
-    model = model_of(bags, options)
-    tell(0.55)
-    windows = with_forces(thermal_windows(bags, model), bags, options)
-    if known is not None and windows.data.forces and known.nonlinearity is None:
-        known = with_blank(known, options)
-        options = replace(options, prior=known)
+    bags, findings = _judged(bags, options)
+    windows = windows_of(bags, model_of(bags, options), options)
+    if options.prior and windows.data.forces and options.prior.nonlinearity is None:
+        options = replace(options, prior=with_blank(options.prior, options))
         windows = with_forces(windows, bags, options)
+    known = options.prior
     start = first_guess(windows, options) if known is None else constants_of(known)
-    up = start.force(position_means(windows.data))
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    up = start.directions(windows.data)
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(data_checks.judge_windows(windows, up, has_case), options)
-    tell(0.7)
-    windows, (regression, selected, typical) = regressed(windows, bags, start, up, options, tell)
+    progress(0.7)
+    fit = regressed(windows, Problem(bags, options, start, up, progress))
+    terms: tuple[NonlinearTerm, ...] = ()
     if known is None:
-        selected, terms = choose(regression, selected, options)
-    claim = claim_of(regression, selected, typical, options.gravity_sd)
-    is_shared = model.sets.is_shared
-    residuals, left_out = residual_rows(windows, regression, selected, is_shared=is_shared)
-    state = selected.posterior.state
-    K = state.kappa * start.scale
-    constants, raw = (K, state.bias, state.misalignment), residuals[-1].raw.rms
-    found_none = data_checks.judge_constants(windows, up, constants, raw, options)
-    findings += enforce(found_none, options)
-    findings += data_checks.judge_result(
-        K, residuals, claim.offset_sd, options, windows.has_temperature
-    )
+        selected, terms = choose(fit.regression, fit.selected, options)
+        fit = fit._replace(selected=selected)
+    claim = claim_of(fit.regression, fit.posterior, fit.typical, options.gravity_sd)
+    residuals, left_out = residual_rows(fit)
+    findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
+    K = fit.posterior.state.kappa * start.scale
+    has_temperature = fit.windows.has_temperature
+    findings += data_checks.judge_result(K, residuals, claim.offset_sd, options, has_temperature)
     try:
-        unit, nonlinearity = _unit(bags, options), of_file(regression, terms, options)
+        nonlinearity = of_file(fit.regression, terms, options)
         calibration = build_calibration(
-            *(windows, regression, selected, claim, bags, unit),
-            *(residuals, findings, known, nonlinearity),
+            *(fit, claim, bags, _unit(bags, options)), *(residuals, findings, known, nonlinearity)
         )
         rates: tuple[RateRow, ...] = ()
-        if known is not None or not is_beyond(windows):
-            calibration, rates = add_gyroscope(calibration, windows, bags, options)
-        elif windows.angular_rate.shape[1]:
+        if known is not None or not is_beyond(fit.windows):
+            calibration, rates = add_gyroscope(calibration, fit.windows, bags, options)
+        elif fit.windows.angular_rate.shape[1]:
             text = 'the unit rotated in some rests, so no gyroscope was fitted'
             findings.append(Finding('rate', 'advice', text))
     except ValueError as error:
         raise _unusable(error) from error
-    least = least_known(calibration, selected.posterior.state.up)
-    unseen = list(data_checks.judge_coverage(least))
-    unseen += judge_terms(calibration)
-    calibration = with_notes(calibration, [f'{one.name}: {one.message}' for one in unseen])
+    least = least_known(calibration, fit.posterior.state.up)
+    unseen = [*data_checks.judge_coverage(least), *judge_terms(calibration)]
     return FitResult(
-        calibration=calibration,
-        selected=selected,
+        calibration=with_notes(calibration, unseen),
+        fit=fit,
         residuals=residuals,
-        positions=position_reports(windows, regression, selected, left_out),
+        positions=position_reports(fit, left_out),
         findings=(*findings, *unseen),
         least_known=least,
-        windows=windows,
         bags=tuple(bags),
         rates=rates,
     )
+
+
+def _judged(
+    bags: Sequence[ReducedBag], options: FitOptions
+) -> tuple[list[ReducedBag], list[Finding]]:
+    """Return the bags without copied thermometers, and the findings about the raw data."""
+    has_board = [bool(len(bag.board.value)) for bag in bags]
+    if any(has_board) and not all(has_board):
+        name = bags[has_board.index(False)].source.name
+        raise FitError(f'{name}: no board temperature, which the other bags have')
+    serial = check_serial([bag.source for bag in bags], options)
+    findings = enforce(data_checks.judge_prior(serial, options.prior), options)
+    findings += enforce(data_checks.judge_bags(bags, options), options)
+    kept, copies = without_copies(bags)
+    return kept, findings + data_checks.judge_copies(copies)
 
 
 def _unusable(error: ValueError) -> FitError:

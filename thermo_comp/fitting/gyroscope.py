@@ -19,20 +19,18 @@ import numpy as np
 
 from ..unit.calibration import Calibration, gyroscope_of
 from ..unit.gravity import EARTH_RATE
-from ..unit.metrics import ResidualStatistics, statistics_by_regime
+from ..unit.metrics import ResidualStatistics
 from .assembly import build_calibration
 from .claim import claim_of
-from .growth import Candidates
+from .evidence import tables_of
+from .hyperparameters import Candidates
 from .options import FitOptions
 from .reduction import ReducedBag
 from .regression import Regression
-from .selection import Selected, select
+from .selection import Fit, select
 from .start import position_means, within_positions
-from .unknowns import Prior
+from .unknowns import Prior, Windows
 from .windows import ThermalWindows
-
-# Sd of the Earth's rate on one axis in an unknown attitude [rad/s].
-_EARTH_SD = EARTH_RATE / math.sqrt(3.0)
 
 
 @dataclass(frozen=True)
@@ -73,49 +71,48 @@ def add_gyroscope(
     level = position_means(data)
     up = np.tile((0.0, 0.0, 1.0), (data.n_positions, 1))
     state = regression.initial_state(level.mean(axis=0), np.zeros(3), up)
-    allowed = {*data.groups} if options.groups is None else {*options.groups}
-    is_candidate = np.isin(data.groups, list(allowed)) & (data.kelvins > 0.0)
-    kelvins = np.outer((1.0, 0.0), is_candidate * data.kelvins)
-    forced = np.zeros(len(data.groups), dtype=bool)
-    # Typical and largest sd of a slope [rad/s per K]; the largest is that of consumer MEMS.
-    candidates = Candidates(
-        1e-5 * kelvins, 5e-3 * kelvins, forced, np.zeros(kelvins.shape, dtype=bool)
-    )
+    # Sd of the Earth's rate on one axis in an unknown attitude [rad/s].
+    earth_sd = EARTH_RATE / math.sqrt(3.0)
     prior = Prior(
         bias_mean=np.zeros(3),
         bias_sd=np.full(3, 1.0),  # [rad/s], flat for any gyroscope
         scale_sd=1.0,
         misalignment_sd=1.0,
-        column_sd=np.zeros_like(kelvins),
-        offset_sd=_EARTH_SD,
+        column_sd=np.zeros((2, len(data.groups))),
+        offset_sd=earth_sd,
         sigma=np.full(3, 1e-5),
-        offset_scale=_EARTH_SD,
+        offset_scale=earth_sd,
     )
-    selected = select(regression, state, prior, candidates)
+    fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
     # The positions show the offsets, so their sd is not marginalised.
-    fixed_sd = replace(selected, prior=replace(selected.prior, offset_scale=0.0))
-    claim = claim_of(regression, fixed_sd)
+    fixed_sd = replace(fit.posterior.prior, offset_scale=0.0)
+    claim = claim_of(regression, replace(fit.posterior, prior=fixed_sd))
     # The Earth's rate in the offsets is a true rate, not an error of the gyroscope.
-    turn_on = math.sqrt(max(claim.offset_sd**2 - _EARTH_SD**2, 0.0))
-    triad = build_calibration(
-        windows, regression, selected, replace(claim, offset_sd=turn_on), bags, calibration.unit
-    )
+    turn_on = math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0))
+    claim = replace(claim, offset_sd=turn_on)
+    triad = build_calibration(fit, claim, bags, calibration.unit)
     needed = {*calibration.sensors, *triad.sensors}
     sensors = tuple(name for name in windows.model.sensors if name in needed)
     result = replace(calibration, gyroscope=gyroscope_of(triad), sensors=sensors)
-    return result, _rows(windows, regression, selected)
+    return result, _residual_rows(fit)
 
 
-def _rows(
-    windows: ThermalWindows, regression: Regression, selected: Selected
-) -> tuple[RateRow, ...]:
-    position, fitted = windows.data.position, regression.force(selected.posterior.state)
-    is_dynamic = np.repeat(windows.weight > 0.5, 3)
-    raw, by_fit = (
-        within_positions(rate, position).ravel() for rate in (windows.angular_rate, fitted)
+def _candidates(data: Windows, options: FitOptions) -> Candidates:
+    """Return the columns that the bias of the rate may have."""
+    allowed = {*data.groups} if options.groups is None else {*options.groups}
+    is_candidate = np.isin(data.groups, list(allowed)) & (data.kelvins > 0.0)
+    kelvins = np.outer((1.0, 0.0), is_candidate * data.kelvins)
+    none = np.zeros(kelvins.shape, dtype=bool)
+    # Typical and largest sd of a slope [rad/s per K]; the largest is that of consumer MEMS.
+    return Candidates(1e-5 * kelvins, 5e-3 * kelvins, none[0], none)
+
+
+def _residual_rows(fit: Fit) -> tuple[RateRow, ...]:
+    (windows, regression, *_), position = fit, fit.windows.data.position
+    raw, fitted = (
+        within_positions(rate, position).ravel()
+        for rate in (windows.angular_rate, regression.force(fit.posterior.state))
     )
-    left_out = selected.score.drift.ravel()
-    known = np.isfinite(left_out)
-    tables = [statistics_by_regime(one, is_dynamic) for one in (raw, by_fit)]
-    tables.append(statistics_by_regime(left_out[known], is_dynamic[known]))
+    residuals = raw, fitted, fit.selected.score.drift.ravel()
+    tables = tables_of(residuals, np.repeat(windows.is_dynamic, 3))
     return tuple(RateRow(section, *(table[section] for table in tables)) for section in tables[0])

@@ -28,8 +28,6 @@ from ..unit.gravity import parse_acceleration
 #: Keys of a bag's metadata.
 MAGNITUDE, ROTATION = 'specific_force_magnitude_m_s2', 'rotation_topic'
 RADIUS, RADIUS_SD = 'rotation_radius_m', 'rotation_radius_sd_m'
-#: Smallest number of rate readings in a rest: fewer give no standard error of their mean.
-_FEWEST_RATES = 3
 
 
 class Section(NamedTuple):
@@ -91,12 +89,12 @@ class KnownForce:
                     return Magnitude(one.size, sd=one.sd)
             return Magnitude(None)
         inside = (self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns)
-        n = int(inside.sum())
-        if n < _FEWEST_RATES:
+        n, needed = int(inside.sum()), 3  # fewer readings give no standard error of their mean
+        if n < needed:
             since_s = (start_ns - first_ns) * 1e-9
             raise FitError(
                 f'{self.name}: {n} readings of the rotation rate in the rest that begins at '
-                f'{since_s:.1f} s, need {_FEWEST_RATES}'
+                f'{since_s:.1f} s, need {needed}'
             )
         spin = self.rate[inside] ** 2 * self.radius
         mean, sd = float(spin.mean()), float(spin.std(ddof=1)) / math.sqrt(len(spin))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the score of a model: the error of its correction on data that took no part in the fit.
+Owns the score of a model on data that took no part in the fit, and the comparison of two scores.
 
 Each position is left out in turn, and so is each section and each half of the program, in all
 positions at once. Left-out halves detect columns that interpolate between the sections of one
@@ -11,10 +11,16 @@ and no tilts of the support.
 The errors are the drift (each axis less its mean over the position, which does not depend on the
 attitude) and ``|f| - g`` of the position, if the other positions determine it.
 
+A model is better if it reduces the error by more than the standard error over the folds, both for
+positions and for sections of the program. One that describes only one recording, or one program,
+fails one of the two tests.
+
 References
 ----------
 .. [1] D. R. Roberts et al., Cross-validation strategies for data with temporal, spatial,
    hierarchical, or phylogenetic structure, Ecography 40 (2017): leave out blocks.
+.. [2] A. Vehtari, A. Gelman, J. Gabry, Practical Bayesian model evaluation using leave-one-out
+   cross-validation, Statistics and Computing 27 (2017).
 
 """
 
@@ -27,15 +33,16 @@ import numpy as np
 
 from ..typing import Floats, Ints
 from .elimination import inverse_root
-from .equations import moved_by
-from .regression import Posterior, Regression
-from .unknowns import Prior, State
+from .regression import Point, Posterior, Regression
+from .unknowns import State
 
 # Largest ratio of the variance of a position's norm or drift without this position in the fit to
 # that with it, mounting offset and noise included. Above it the position is not scored.
 _VARIANCE_RATIO = 10.0
 # Smallest number of windows of a position from which its drift is scored.
 _FEWEST_WINDOWS = 8
+# Logarithms of mean squares that differ by less than this count as equal: 5 % of an RMS.
+_EQUAL = 0.1
 
 
 @dataclass(frozen=True)
@@ -74,15 +81,15 @@ class Folds:
         before, after = ((one.square * one.windows)[known] + 1e-300 for one in (self, other))
         whole = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # One fold has no scatter; 0.1 is 5 % of an RMS.
-            return whole, 0.1
+            # One fold has no scatter.
+            return whole, _EQUAL
         each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))
         spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
-        found = [(whole, spread), (float(each.mean()), float(each.std(ddof=1) / np.sqrt(n)))]
-        if found[0][0] * found[1][0] < 0.0:
-            return 0.0, max(error for _, error in found)
-        return max(found, key=lambda one: abs(one[0]) / max(one[1], 1e-12))
+        estimates = [(whole, spread), (float(each.mean()), float(each.std(ddof=1) / np.sqrt(n)))]
+        if estimates[0][0] * estimates[1][0] < 0.0:
+            return 0.0, max(error for _, error in estimates)
+        return max(estimates, key=lambda one: abs(one[0]) / max(one[1], 1e-12))
 
 
 @dataclass(frozen=True)
@@ -114,79 +121,115 @@ class Score:
     @property
     def rms(self) -> float:
         """RMS of the left-out drift: the larger of that of positions and of sections."""
-        found = [one.rms for one in (self.positions, self.sections) if np.isfinite(one.rms)]
-        return max(found, default=float('nan'))
+        known = [one.rms for one in (self.positions, self.sections) if np.isfinite(one.rms)]
+        return max(known, default=float('nan'))
 
 
-def score_of(regression: Regression, posterior: Posterior, prior: Prior) -> Score:
+def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
+    """
+    Whether the second model is better on left-out data by more than the standard error. Halves of
+    the program limit the number of columns; they do not compare models of the same columns.
+    """
+    return gain(before, after, by_halves=by_halves) > 0.0
+
+
+def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
+    """
+    Return the gain of a model if it exceeds its standard errors, else 0.
+
+    It is the sum of the log gains of the drift. If the drifts are equal, the norms of left-out
+    positions decide with a gain of two standard errors.
+    """
+    positions, sections, norms = _gains(before, after)
+    drift = [one for one in (positions, sections) if one]
+    # The RMS error of halves may rise by a quarter, as two folds scatter by that.
+    is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
+    if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
+        return 0.0
+    total = sum(gain for gain, _ in drift)
+    if total > _EQUAL * len(drift) and all(gain > error for gain, error in drift):
+        return total
+    is_sure = norms is not None and norms[0] > max(2.0 * norms[1], _EQUAL)
+    if is_sure and norms and all(abs(gain) < _EQUAL for gain, _ in drift):
+        return norms[0]
+    return 0.0
+
+
+def is_undecided(before: Score, after: Score) -> bool:
+    """Whether left-out data do not decide: equal drifts, and no norms scored in both models."""
+    *drift, norms = _gains(before, after)
+    return norms is None and all(abs(one[0]) < _EQUAL for one in drift if one)
+
+
+def is_near(chosen: Score, other: Score) -> bool:
+    """Whether a model is at most one standard error worse than the chosen one."""
+    gains = [one for one in _gains(chosen, other) if one]
+    return bool(gains) and all(gain > -error for gain, error in gains)
+
+
+def _gains(before: Score, after: Score) -> list[tuple[float, float] | None]:
+    return [b.gain_of(a) for b, a in zip(before.kinds, after.kinds, strict=True)]
+
+
+def score_of(regression: Regression, posterior: Posterior) -> Score:
     """Score a model on left-out positions, sections and halves of the program."""
-    regression.whiten(prior.noise)
-    windows = regression.windows
-    share = regression.weight / windows.weight
-    positions, norms, force, drift = _by_positions(regression, posterior, prior, share)
-    n_sections = windows.n_sections if windows.n_sections > 1 else 0
-    numbers = np.arange(n_sections)
-    single, halves = list(numbers[:, None]), np.array_split(numbers, 2) if n_sections else []
-    by_section, section_drift = _by_sections(regression, posterior, prior, share, single)
-    by_half, _ = _by_sections(regression, posterior, prior, share, halves, is_within=True)
+    regression.whiten(posterior.prior.noise)
+    n_sections = regression.windows.n_sections
+    numbers = np.arange(n_sections if n_sections > 1 else 0)
+    positions, norms, force, drift = _by_positions(regression, posterior)
+    sections, section_drift = _by_sections(regression, posterior, numbers[:, None])
+    halves = np.array_split(numbers, 2) if len(numbers) else []
+    by_halves, _ = _by_sections(regression, posterior, halves, is_within=True)
     drift = np.where(np.isfinite(drift), drift, section_drift)
-    return Score(positions, by_section, norms, force, drift, by_half)
+    return Score(positions, sections, norms, force, drift, by_halves)
 
 
 def _by_positions(
-    regression: Regression, posterior: Posterior, prior: Prior, share: Floats
+    regression: Regression, posterior: Posterior
 ) -> tuple[Folds, Folds, Floats, Floats]:
     """Leave out each position; return folds of drift and norm, corrected windows and drift."""
-    windows, state, layout = regression.windows, posterior.state, posterior.layout
-    products = regression.products(layout.used)
-    tangent, _ = regression.linearised(state, layout, products.whole)
-    means = tangent.of(regression.at_starts(products.means[:, None], state, products.base))
+    windows, share = regression.windows, regression.weight / regression.windows.weight
+    point = regression.at(posterior.state, posterior.prior)
+    products = regression.products(point.layout.used)
+    means = point.tangent.of(
+        regression.at_starts(products.means[:, None], point.state, products.base)
+    )
     n_positions = windows.n_positions
-    edges = np.searchsorted(windows.position, np.arange(n_positions + 1))
+    edges = windows.edges
     counts = np.diff(edges).astype(np.float64)
     force = np.full((len(windows.time), 3), np.nan)
-    sizes = regression.norms(state)
+    sizes = regression.norms(point.state)
     drift = np.full_like(force, np.nan)
-    squares, norms = np.full(n_positions, np.nan), np.full(n_positions, np.nan)
-    matrices = regression.without_each(state, prior, layout) if n_positions > 1 else ()
-    for p, matrix in enumerate(matrices):
+    squares, norms = np.full((2, n_positions), np.nan)
+    for p, matrix in enumerate(point.without_each() if n_positions > 1 else ()):
         rows = slice(edges[p], edges[p + 1])
-        moved, root = _refitted(regression, posterior, prior, matrix)
-        own = regression.force(moved, rows)
-        weight = share[rows]
-        level = np.average(own, axis=0, weights=weight)
-        away = own - level
-        is_known = _is_drift_determined(regression, posterior, prior, root, rows)
-        if rows.stop - rows.start >= _FEWEST_WINDOWS and is_known:
-            drift[rows] = away
-            square = np.mean(away**2, axis=1)
-            squares[p] = np.average(square, weights=weight)
-        if _is_norm_determined(regression, posterior, prior, means[p, :, 0], root, p):
-            force[rows] = own
-            error = np.linalg.norm(own, axis=1) - sizes[p]
+        state, root = _refitted(point, matrix)
+        corrected, weight = regression.force(state, rows), share[rows]
+        is_known = _is_drift_determined(point, posterior, root, rows)
+        if counts[p] >= _FEWEST_WINDOWS and is_known:
+            drift[rows] = corrected - np.average(corrected, axis=0, weights=weight)
+            squares[p] = np.average(np.mean(drift[rows] ** 2, axis=1), weights=weight)
+        if _is_norm_determined(point, posterior, means[p, :, 0], root, p):
+            force[rows] = corrected
+            error = np.linalg.norm(corrected, axis=1) - sizes[p]
             norms[p] = np.average(error**2, weights=weight)
     return Folds(squares, counts), Folds(norms, counts), force, drift
 
 
-def _refitted(
-    regression: Regression, posterior: Posterior, prior: Prior, matrix: Floats
-) -> tuple[State, Floats]:
+def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
     """
     Return the state of a fit with other normal equations, to first order, and the root of its
     covariance, see `Posterior`.
     """
-    state, layout = posterior.state, posterior.layout
-    step, factor = regression.unit_step(matrix, prior, layout, state)
-    whole = np.zeros(layout.n)
-    whole[: layout.n_unit] = step
-    return moved_by(state, whole, layout), inverse_root(factor)
+    step, factor = point.unit_step(matrix)
+    whole = np.zeros(point.layout.n)
+    whole[: point.layout.n_unit] = step
+    return point.moved(whole).state, inverse_root(factor)
 
 
-def _is_drift_determined(
-    regression: Regression, posterior: Posterior, prior: Prior, root: Floats, rows: slice
-) -> bool:
+def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows: slice) -> bool:
     """Whether a fit without this position, with this root, determines its drift."""
-    state, layout = posterior.state, posterior.layout
+    regression, layout, sigma = point.regression, point.layout, point.prior.sigma
     in_bias, in_scale = layout.used
     if not in_bias.any():
         return True
@@ -194,42 +237,40 @@ def _is_drift_determined(
     some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
     some = some - some.mean(axis=0)
     p = regression.windows.position[rows.start]
-    force = regression.along_axes(state)[p]
-    by_others = everything = 0.0
+    force = regression.along_axes(point.state)[p]
+    by_others = by_all = 0.0
     for axis in range(3):
         along = np.hstack((some[:, in_bias], force[axis] * some[:, in_scale]))
         at = layout.axis[axis, 2 : 2 + along.shape[1]]
         by_others += float(np.sum((along @ root[at]) ** 2))
-        everything += float(np.sum((along @ posterior.root[at]) ** 2))
-    noise = float(np.sum(prior.sigma**2)) * len(some)
-    return by_others < _VARIANCE_RATIO * (everything + noise)
+        by_all += float(np.sum((along @ posterior.root[at]) ** 2))
+    noise = float(np.sum(sigma**2)) * len(some)
+    return by_others < _VARIANCE_RATIO * (by_all + noise)
 
 
 def _is_norm_determined(
-    regression: Regression, posterior: Posterior, prior: Prior, means: Floats, root: Floats, p: int
+    point: Point, posterior: Posterior, means: Floats, root: Floats, p: int
 ) -> bool:
     """
     Whether a fit without this position, with this root, determines its norm; `means`: derivatives
     of its mean reading, see `Tangent.of`.
     """
-    if not regression.gravity:
+    if not point.regression.gravity:
         return False
-    state, layout = posterior.state, posterior.layout
+    state, layout = point.state, point.layout
     on_axes = np.linalg.inv(state.inverse).T @ state.up[p] / state.kappa
     along = np.zeros(layout.n_unit)
     for axis in range(3):
         places = layout.unit[axis, :-1]
         along[places] += on_axes[axis] * means[axis, -1 - len(places) : -1]
-    everything = float(np.sum((along @ posterior.root) ** 2)) + prior.offset_sd**2
-    return float(np.sum((along @ root) ** 2)) < _VARIANCE_RATIO * everything
+    by_all = float(np.sum((along @ posterior.root) ** 2)) + point.prior.offset_sd**2
+    return float(np.sum((along @ root) ** 2)) < _VARIANCE_RATIO * by_all
 
 
 def _by_sections(
     regression: Regression,
     posterior: Posterior,
-    prior: Prior,
-    share: Floats,
-    folds: Sequence[Ints],
+    folds: Sequence[Ints] | Ints,
     *,
     is_within: bool = False,
 ) -> tuple[Folds, Floats]:
@@ -239,27 +280,23 @@ def _by_sections(
     `folds`: the sections left out at once, in all positions; `is_within`: score only windows at
     temperatures that occur in the fit
     """
-    windows, layout = regression.windows, posterior.layout
-    products = regression.products(layout.used)
-    edges = np.searchsorted(windows.position, np.arange(windows.n_positions + 1))
+    windows, share = regression.windows, regression.weight / regression.windows.weight
+    products = regression.products(posterior.layout.used)
     drift = np.full((len(windows.time), 3), np.nan)
     squares, counts = np.full(len(folds), np.nan), np.zeros(len(folds))
     for k, fold in enumerate(folds):
-        grams = products.without(fold)
-        state = posterior.state
+        point = regression.at(posterior.state, posterior.prior, products.without(fold))
         # Two Gauss-Newton steps from the fit of all data are sufficient.
         for _ in range(2):
-            step, *_rest = regression.step(state, prior, layout, grams)
-            state = moved_by(state, step, layout)
-        force = regression.force(state)
+            point = point.moved(point.solution[0])
+        force = regression.force(point.state)
         gone = np.isin(windows.section, fold)
+        judged = gone
         if is_within:
             t = windows.columns[:, 0]
             judged = gone & (t >= t[~gone].min()) & (t <= t[~gone].max())
-        else:
-            judged = gone
         for p in range(windows.n_positions):
-            rows = np.arange(edges[p], edges[p + 1])
+            rows = np.arange(*windows.edges[p : p + 2])
             out, stayed = rows[judged[rows]], rows[~gone[rows]]
             if len(out) and len(stayed) >= _FEWEST_WINDOWS:
                 level = np.average(force[stayed], axis=0, weights=share[stayed])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the choice of the nonlinear terms of a fit by log evidence and by left-out norms.
+Owns |f| that is not 1 g in all positions, and the choice of the nonlinear terms over it.
 
 A term that the data determine is removed if it lowers the log evidence, or if it does not improve
 the left-out norms. A term that the data do not determine stays near its prior, with the prior sd.
@@ -10,26 +10,24 @@ the left-out norms. A term that the data do not determine stays near its prior, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 
 from ..errors import FitError
 from ..typing import Floats
 from ..unit.calibration import Calibration, parameter_layout
-from ..unit.nonlinearity import POWERS, Kind, Nonlinearity, NonlinearTerm
+from ..unit.nonlinearity import POWERS, Kind, Nonlinearity, NonlinearTerm, linearised, unit_of
 from ..unit.posterior import Posterior as FilePosterior
 from .data_checks import Finding
-from .forces import Forces
-from .growth import LEAST_GAIN, TRIAL_GAIN
+from .hyperparameters import LEAST_GAIN
 from .left_out import Score, score_of
 from .options import FitOptions
 from .reduction import ReducedBag
 from .regression import Posterior, Regression
-from .selection import Selected
-from .unknowns import Prior, State
+from .selection import TRIAL_GAIN, Selected
+from .unknowns import State
 from .windows import ThermalWindows
 
 # Prior sd of a coefficient's change per kelvin over that of the coefficient [1/K].
@@ -37,9 +35,73 @@ _SLOPE_RATIO = 0.02
 # Effective parameters per coefficient from which the data determine it: 0.99 means that the
 # posterior sd is a tenth of the prior sd.
 _DETERMINED = 0.99
-_ZERO = (0.0, 0.0, 0.0)
 
 _Active = frozenset[int]  # places of the coefficients in use
+
+
+@dataclass(frozen=True)
+class Forces:
+    """
+    The known magnitude ``|f|^2 = still^2 + spin^2`` of each position, (n_positions,) [m/s^2].
+
+    kinds: the k nonlinear terms that may take part, in the order of a file; the order of the
+        coefficients is all kinds at the reference temperature, then all kinds per kelvin
+    t: board temperature of each window less the reference, shape (n,) [K]
+    still: |f| without rotation; gravity if the unit rotates
+    spin: centripetal acceleration w^2 r at the stated radius; 0 without rotation
+    sd: standard deviation of |f| without the part of the radius
+    radius_sd: relative standard deviation of the radius; 0 if the radius is not estimated
+    """
+
+    kinds: tuple[Kind, ...]
+    t: Floats
+    still: Floats
+    spin: Floats
+    sd: Floats
+    radius_sd: float = 0.0
+
+    def norms(self, radius: Floats, stretch: Floats) -> Floats:
+        """Return |f| of each position, given the relative errors of radius and |f|."""
+        turned = self.spin * (1.0 + radius.sum())
+        return np.asarray(np.hypot(self.still, turned) * (1.0 + stretch.sum(axis=1)))
+
+    def by_radius(self, radius: Floats) -> Floats:
+        """Differentiate the logarithm of |f| by the relative error of the radius."""
+        turned = self.spin * (1.0 + radius.sum())
+        return np.asarray(self.spin * turned / (self.still**2 + turned**2))
+
+    @property
+    def sizes(self) -> Floats:
+        """|f| of each position as stated."""
+        return np.hypot(self.still, self.spin)
+
+    @property
+    def stretch_sd(self) -> Floats:
+        """Relative standard deviation of |f| of each position, above 0."""
+        return np.maximum(self.sd / self.sizes, 1e-12)
+
+    def terms(self, force: Floats) -> tuple[Floats, Floats]:
+        """Return each term per unit coefficient and its slope, (*force.shape, k)."""
+        each = {
+            'square': (force**2, 2.0 * force),
+            'odd_square': (np.abs(force) * force, 2.0 * np.abs(force)),
+            'cube': (force**3, 3.0 * force**2),
+        }
+        pairs = [np.array(each[kind]) / unit_of(kind) for kind in self.kinds]
+        value, slope = np.stack(pairs, axis=-1) if pairs else np.zeros((2, *force.shape, 0))
+        return value, slope
+
+    def linearise(self, x: Floats, nonlinear: Floats, rows: slice) -> Floats:
+        """Return the readings of windows, shape (n, 3), without the nonlinear terms."""
+        k = len(self.kinds)
+        at = nonlinear[:, :k] + self.t[rows, np.newaxis, np.newaxis] * nonlinear[:, k:]
+        k2, kq, k3 = (
+            at[..., self.kinds.index(kind)] / unit_of(kind)
+            if kind in self.kinds
+            else np.zeros_like(x)
+            for kind in POWERS
+        )
+        return linearised(x, k2, kq, k3)
 
 
 def with_forces(
@@ -93,6 +155,51 @@ def starting_sd(forces: Forces, options: FitOptions) -> Floats:
     return np.asarray(prior_sd(forces, options) * np.tile(begins, 2))
 
 
+class _TermFits:
+    """Fits with some of the nonlinear coefficients, and what a coefficient adds to them."""
+
+    def __init__(self, regression: Regression, selected: Selected, sd: Floats) -> None:
+        """Take the prior sd of the coefficients, shape (2 k,)."""
+        self._regression, self._begin, self._sd = regression, selected.posterior, sd
+        self._n_kinds = len(sd) // 2
+        self.posterior, self.score = cache(self._posterior), cache(self._score)
+
+    def _posterior(self, used: _Active) -> Posterior:
+        is_used = np.isin(np.arange(len(self._sd)), list(used))
+        prior = replace(self._begin.prior, nonlinear_sd=self._sd * is_used)
+        return self._regression.solve(self._begin.state, prior)
+
+    def _score(self, used: _Active) -> Score:
+        return score_of(self._regression, self.posterior(used))
+
+    def term(self, kind: int) -> _Active:
+        """Return the coefficients of a term: at the reference temperature, and per kelvin."""
+        return frozenset((kind, self._n_kinds + kind))
+
+    def loss(self, used: _Active, gone: _Active) -> float:
+        """Return the loss of log evidence without some coefficients."""
+        return self.posterior(used).log_evidence - self.posterior(used - gone).log_evidence
+
+    def left_out_gain(self, used: _Active, gone: _Active) -> tuple[float, float]:
+        """Return the log gain of left-out norms by some coefficients, and its standard error."""
+        return self.score(used - gone).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
+
+    def is_determined(self, used: _Active, at: int) -> bool:
+        """Whether the data determine a coefficient."""
+        posterior = self.posterior(used)
+        share = posterior.determined[posterior.layout.nonlinear[:, at]]
+        return bool(share.mean() > _DETERMINED)
+
+    def thinned(self, used: _Active) -> _Active:
+        """Remove terms that the data determine and that lower the log evidence."""
+        kinds = [at for at in sorted(used) if at < self._n_kinds and self.is_determined(used, at)]
+        losses = {at: self.loss(used, self.term(at)) for at in kinds}
+        worst = min(losses, key=losses.__getitem__, default=None)
+        if worst is None or losses[worst] > -LEAST_GAIN:
+            return used
+        return self.thinned(used - self.term(worst))
+
+
 def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
@@ -100,69 +207,40 @@ def choose(
     forces = regression.forces
     if forces is None:
         return selected, ()
-    k, wide = len(forces.kinds), prior_sd(forces, options)
-
-    @cache
-    def fitted(used: _Active) -> tuple[Posterior, Prior]:
-        prior = replace(selected.prior, nonlinear_sd=wide * np.isin(np.arange(2 * k), list(used)))
-        return regression.solve(selected.posterior.state, prior), prior
-
-    @cache
-    def score(used: _Active) -> Score:
-        return score_of(regression, *fitted(used))
-
-    def loss(used: _Active, without: _Active) -> float:
-        return fitted(used)[0].log_evidence - fitted(without)[0].log_evidence
-
-    def left_out_gain(used: _Active, without: _Active) -> tuple[float, float]:
-        return score(without).norms.gain_of(score(used).norms) or (0.0, 0.0)
-
-    def is_determined(used: _Active, at: int) -> bool:
-        posterior = fitted(used)[0]
-        share = posterior.determined[posterior.layout.nonlinear[:, at]]
-        return bool(share.mean() > _DETERMINED)
-
-    def thinned(used: _Active) -> _Active:
-        asked = [at for at in range(k) if at in used and is_determined(used, at)]
-        losses = {at: loss(used, used - {at, k + at}) for at in asked}
-        worst = min(losses, key=losses.__getitem__, default=None)
-        if worst is None or losses[worst] > -LEAST_GAIN:
-            return used
-        return thinned(used - {worst, k + worst})
-
-    odd = forces.kinds.index('odd_square')
-    used = thinned(frozenset(range(2 * k)) - {odd, k + odd})
-    joined = used | {odd, k + odd}
-    if loss(joined, used) > TRIAL_GAIN:
-        gain, error = left_out_gain(joined, used)
-        used = thinned(joined) if gain > error else used
-    found: dict[int, tuple[float, float]] = {}
+    k, sd = len(forces.kinds), prior_sd(forces, options)
+    fits = _TermFits(regression, selected, sd)
+    odd = fits.term(forces.kinds.index('odd_square'))
+    used = fits.thinned(frozenset(range(2 * k)) - odd)
+    if fits.loss(used | odd, odd) > TRIAL_GAIN:
+        gain, error = fits.left_out_gain(used | odd, odd)
+        used = fits.thinned(used | odd) if gain > error else used
+    evidence: dict[int, tuple[float, float]] = {}
     for at in sorted(at for at in used if at < k):
-        without = used - {at, k + at}
-        gain, error = left_out_gain(used, without)
-        if gain <= error and is_determined(used, at):
-            used = without
+        gain, error = fits.left_out_gain(used, fits.term(at))
+        if gain <= error and fits.is_determined(used, at):
+            used -= fits.term(at)
         else:
-            found[at] = loss(used, without), gain
-    for at in found:
-        if is_determined(used, k + at) and loss(used, used - {k + at}) < -LEAST_GAIN:
-            used = used - {k + at}
-    posterior, prior = fitted(used)
-    fit: dict[str, Any] = {'score': score(used), 'posterior': posterior, 'prior': prior}
+            evidence[at] = fits.loss(used, fits.term(at)), gain
+    for at in evidence:
+        per_kelvin = frozenset((k + at,))
+        if fits.is_determined(used, k + at) and fits.loss(used, per_kelvin) < -LEAST_GAIN:
+            used -= per_kelvin
+    posterior, score = fits.posterior(used), fits.score(used)
     trials = tuple(
-        replace(trial, **fit) if trial.is_chosen else trial for trial in selected.trials
+        replace(one, posterior=posterior, score=score) if one.is_chosen else one
+        for one in selected.trials
     )
     terms = []
-    for at, evidence in found.items():
+    for at, of_term in evidence.items():
         places = posterior.layout.nonlinear[:, [at, k + at]]
         determined = max(float(posterior.determined[places[places >= 0]].sum()), 0.0)
-        terms.append(blank_term(forces.kinds[at], float(wide[at]), determined, *evidence))
-    return replace(selected, **fit, trials=trials), tuple(terms)
+        terms.append(blank_term(forces.kinds[at], float(sd[at]), determined, *of_term))
+    return Selected(posterior, score, trials), tuple(terms)
 
 
 def blank_term(kind: Kind, sd: float, *evidence: float) -> NonlinearTerm:
     """Return a term with all coefficients 0."""
-    return NonlinearTerm(kind, _ZERO, _ZERO, sd, *evidence)
+    return NonlinearTerm(kind, (0.0,) * 3, (0.0,) * 3, sd, *evidence)
 
 
 def of_file(
@@ -180,7 +258,7 @@ def of_file(
         low, high = min(low, known.force_range_m_s2[0]), max(high, known.force_range_m_s2[1])
     sd = known.beyond_sd_g_g2 if known else options.nonlinear_sd('square')
     kept = known.terms if known else terms
-    blank = (replace(term, coefficient=_ZERO, per_kelvin=_ZERO) for term in kept)
+    blank = (replace(term, coefficient=(0.0,) * 3, per_kelvin=(0.0,) * 3) for term in kept)
     return Nonlinearity((low, high), sd, tuple(blank))
 
 

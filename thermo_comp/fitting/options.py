@@ -25,31 +25,31 @@ from ..errors import FitError
 from ..recording.stillness import STILL_SD
 from ..thermal.settings import DetectorSettings
 from ..unit.calibration import Calibration
+from ..unit.columns import bank
 from ..unit.functions import CubicSpline, Exponential, Polynomial, TemperatureFunction
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.nonlinearity import Kind
 from .reduction import ReducedBag
 from .windows import Sets
 
-#: Range of gravity on land, with a margin [m/s^2]; a value outside it is a mistake in typing.
-PLAUSIBLE_GRAVITY = (9.76, 9.84)
 #: Largest code of the converter of the paper's unit: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0
-#: Families of the curve over temperature.
-CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
+# Families of the curve over temperature; the first three are polynomials of order 1, 2, 3.
+_CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
+_POLYNOMIALS = _CURVES[:3]
 #: Groups of columns that the fit selects: the curve, the difference of the two sets, the response.
-GROUPS = (
-    'curve', 'set', 'gradient', 'board', 'gradient_lag', 'product', 'gradient_x_temperature',
-    'square', 'gradient_even', 'gradient_even_about_rest', 'play', 'bend',
-)  # fmt: skip
-_ORDERS = {'linear': 1, 'quadratic': 2, 'cubic': 3}
+GROUPS = tuple(
+    dict.fromkeys(
+        ('curve', 'set', *(one.group for one in bank(at_rest={'case': 1.0}, span_k=(-9.0, 9.0))))
+    )
+)
 #: Names of the refusals that a user can allow.
 REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compensated')
 # Allowed words of each option.
 _WORDS: dict[str, tuple[str, ...]] = {
     'input': ('counts', 'm/s^2'),
     'model': ('response', 'golovach'),
-    **dict.fromkeys(('static_curve', 'dynamic_curve'), CURVES),
+    **dict.fromkeys(('static_curve', 'dynamic_curve'), _CURVES),
     **dict.fromkeys(('groups', 'forced'), GROUPS),
     'allow': REFUSALS,
 }
@@ -63,7 +63,7 @@ class FitOptions:
     gravity: local gravity [m/s^2]; FitError if it does not occur on Earth
     model: 'response' selects from all columns; 'golovach' is the paper's model: a linear static
         and a quadratic dynamic set, no response
-    static_curve, dynamic_curve: one of `CURVES`; None for the model's default
+    static_curve, dynamic_curve: a family; None for the model's default
     groups, forced: groups of columns that may take part (None: all), and that are not selected but
         always kept
     prior: calibration of this unit or of its type; its columns are the model
@@ -109,7 +109,8 @@ class FitOptions:
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        low, high = PLAUSIBLE_GRAVITY
+        # The range of gravity on land, with a margin; a value outside it is a mistake in typing.
+        low, high = 9.76, 9.84
         if not low <= self.gravity <= high:
             raise FitError(
                 f'local gravity {self.gravity:g} m/s^2 is not found on Earth ({low}..{high} m/s^2)'
@@ -159,7 +160,7 @@ def sets_of(options: FitOptions, bags: Sequence[ReducedBag]) -> Sets:
     is_paper = options.model == 'golovach'
     static = options.static_curve or ('linear' if is_paper else 'cubic')
     dynamic = options.dynamic_curve or ('quadratic' if is_paper else None)
-    if dynamic is None and static in _ORDERS:
+    if dynamic is None and static in _POLYNOMIALS:
         return Sets(_family(static, lower, upper), _family('quadratic', lower, upper))
     return Sets(
         _family(static, lower, upper), _family(dynamic or static, lower, upper), is_shared=False
@@ -167,8 +168,8 @@ def sets_of(options: FitOptions, bags: Sequence[ReducedBag]) -> Sets:
 
 
 def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
-    if name in _ORDERS:
-        return Polynomial((0.0, *[1.0] * _ORDERS[name]))
+    if name in _POLYNOMIALS:
+        return Polynomial((0.0, *[1.0] * (1 + _POLYNOMIALS.index(name))))
     if name == 'exponential':
         # The leakage of semiconductors doubles in about 10 K: an e-fold of 15 K, and of 30 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))

@@ -22,23 +22,10 @@ from .hyperparameters import undisturbed
 from .start import ConstantCalibration, position_means, white_noise_of
 from .windows import ThermalWindows
 
-# Distance [K] and largest number of the nodes of the spline of the bias.
-_NODE_K, _MOST_NODES = 0.6, 60
-# Largest number of windows used to find a time constant.
-_MOST_WINDOWS = 3000
 # Time constants that are shorter than those of the columns [s].
 _SHORT_TAUS = (15.0, 21.0, 30.0, 42.0)
-# Largest RMS residual, relative to the white noise, of a unit whose axes are curves of parts.
-_AT_NOISE = 1.5
-# Smallest ratio of the RMS residual without lags to that with them if it is larger: the lags
-# explain most, but slow noise or another effect remains.
-_MOST_EXPLAINED = 8.0
-# Smallest relative increase of the RMS residual if a time constant changes by `_STEP`.
-_INCREASE, _STEP = 0.05, 2.0**0.5
-# Time constant in the middle of the interpolation [s].
-_MIDDLE_S = 200.0
-# Ridge of the normal equations, relative to their diagonal.
-_RIDGE = 1e-7
+# Ratio of neighbouring time constants of the columns.
+_STEP = 2.0**0.5
 
 
 @dataclass(frozen=True)
@@ -71,8 +58,10 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     residual = np.column_stack([curves.residual(tau, axis) for axis, tau in enumerate(found)])
     factors = undisturbed(residual, data.weight, data.position)
     square = np.average(residual**2, axis=0, weights=data.weight * factors)
-    is_at_noise = (square <= (_AT_NOISE * white_noise_of(data, start.scale)) ** 2).all()
-    if not is_at_noise and min(map(curves.reduction, found, range(3))) < _MOST_EXPLAINED:
+    # An RMS residual up to 1.5 times the white noise is noise alone. With a larger one the lags
+    # must explain most, 7/8 of the RMS without them: slow noise or another effect remains.
+    is_at_noise = (square <= (1.5 * white_noise_of(data, start.scale)) ** 2).all()
+    if not is_at_noise and min(map(curves.reduction, found, range(3))) < 8.0:
         return None
     x, y, z = (round(float(tau), 1) for tau in found)
     return Parts((x, y, z), factors)
@@ -91,19 +80,19 @@ class _PartCurves:
         data = windows.data
         self._position, self._bag = data.position, data.bag
         self._weight = data.weight[:, None]
-        self._first = np.searchsorted(data.position, np.arange(data.n_positions))
+        self._first = data.edges[:-1]
         self._t = windows.temperature - windows.model.reference_temperature
         self._taus = np.array([windows.model.columns[k].tau_s for k in lags])
         # Lags between those of the columns are interpolated: their ratio to the time constant is
         # smooth, and the rate at 0.
         ratios = np.column_stack((windows.rate, windows.raw[:, lags] / self._taus))
         self._ratio = CubicSpline(_even(np.append(0.0, self._taus)), ratios, axis=1)
-        begin = np.searchsorted(data.bag, np.arange(data.bag.max() + 1))
-        self._age = data.time - data.time[begin][data.bag]
+        self._age = data.age
         force = (position_means(data) - start.bias) / start.scale
         self._force = force[data.position]
         self._measured = self._centred(data.mean / start.scale)
-        self._some = slice(None, None, max(len(data.time) // _MOST_WINDOWS, 1))
+        # 3000 windows are sufficient to find a time constant.
+        self._some = slice(None, None, max(len(data.time) // 3000, 1))
 
     def time_constant(self, axis: int) -> float:
         """Return the time constant with the smallest residuals [s]; 0 without a lag."""
@@ -120,9 +109,9 @@ class _PartCurves:
         return tau if self._square(tau, axis) < self._square(0.0, axis) else 0.0
 
     def is_determined(self, tau_s: float, axis: int) -> bool:
-        """Whether the residuals increase if the time constant of an axis changes."""
+        """Whether the RMS residual rises by 5 % if the time constant changes by `_STEP`."""
         others = (tau_s / _STEP, tau_s * _STEP) if tau_s else (_SHORT_TAUS[0] * _STEP,)
-        limit = (1.0 + _INCREASE) ** 2 * self._square(tau_s, axis)
+        limit = 1.05**2 * self._square(tau_s, axis)
         return all(self._square(other, axis) > limit for other in others)
 
     def reduction(self, tau_s: float, axis: int) -> float:
@@ -147,7 +136,8 @@ class _PartCurves:
         x: Floats = self._t - tau_s * self._ratio(_even(np.asarray(tau_s)))
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
-        n_nodes = int(np.clip(span / _NODE_K, 4, _MOST_NODES))
+        # The spline of the bias has a node every 0.6 K, and at most 60 of them.
+        n_nodes = int(np.clip(span / 0.6, 4, 60))
         inner = np.linspace(low, low + span, n_nodes)
         knots = np.pad(inner, 3, mode='edge')
         bias = BSpline.design_matrix(np.clip(x, low, low + span), knots, 3).toarray()
@@ -167,8 +157,8 @@ class _PartCurves:
 
 
 def _even(tau_s: Floats) -> Floats:
-    """Spread time constants [s] evenly."""
-    return np.asarray(tau_s / (tau_s + _MIDDLE_S))
+    """Spread time constants [s] evenly over 0 .. 1, 200 s in the middle."""
+    return np.asarray(tau_s / (tau_s + 200.0))
 
 
 def _solved(series: Floats, measured: Floats) -> Floats:
@@ -176,4 +166,5 @@ def _solved(series: Floats, measured: Floats) -> Floats:
     normal, right = series.T @ series, series.T @ measured
     size = np.sqrt(np.diag(normal)) + 1e-12
     normal = normal / np.outer(size, size)
-    return np.asarray(np.linalg.solve(normal + _RIDGE * np.eye(len(normal)), right / size) / size)
+    normal[np.diag_indices_from(normal)] += 1e-7  # nearly equal series have a solution, too
+    return np.asarray(np.linalg.solve(normal, right / size) / size)

@@ -32,13 +32,10 @@ from .options import FitOptions
 from .regression import Regression
 from .start import ConstantCalibration
 from .unknowns import InformativePrior, State
-from .windows import Sets
+from .windows import Model, Sets
 
 #: Smallest number of units of a population: fewer give no scatter.
 UNITS_NEEDED = 3
-# Share of the scatter of a population that is taken as uncorrelated between the parameters. A few
-# units do not show all directions in which another unit can differ.
-_UNCORRELATED = 0.01
 # Candidates of the further uncorrelated variance, relative to each variance of the prior.
 _INFLATIONS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 
@@ -57,10 +54,16 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
     )
 
 
-def prior_sets(calibration: Calibration) -> Sets:
-    """Return the curves of a calibration, one for each regime."""
-    return Sets(
-        calibration.static.x.bias_function, calibration.dynamic.x.bias_function, is_shared=False
+def prior_model(calibration: Calibration) -> Model:
+    """Return the model of a calibration, with one curve for each regime."""
+    static, dynamic = (one.x.bias_function for one in calibration.regime_sets())
+    return Model(
+        name=calibration.provenance.model,
+        sets=Sets(static, dynamic, is_shared=False),
+        columns=prior_columns(calibration),
+        sensors=calibration.sensors,
+        detector=calibration.detector,
+        reference_temperature=calibration.reference_temperature_c,
     )
 
 
@@ -191,8 +194,11 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     vectors = np.array([vector for vector, _ in units])
     mean = vectors.mean(axis=0)
     away = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
-    scatter = (1.0 - _UNCORRELATED) * away.T @ away
-    scatter[np.diag_indices_from(scatter)] += _UNCORRELATED * np.sum(away**2, axis=0)
+    # A share of the scatter is taken as uncorrelated between the parameters, since a few units do
+    # not show all directions in which another unit can differ.
+    share = 0.01
+    scatter = (1.0 - share) * away.T @ away
+    scatter[np.diag_indices_from(scatter)] += share * np.sum(away**2, axis=0)
     # Add the variance of the mean.
     scatter *= 1.0 + 1.0 / len(vectors)
     # Parameters that none of the units determined keep the uncertainty of their own prior.

@@ -14,10 +14,11 @@ scatter of its samples implies.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -35,13 +36,6 @@ from .sources import FitSource, angular_velocity
 WINDOW_S = 10.0
 # Candidates of the length of the shortest rest [s], the strictest first.
 _MIN_RESTS_S = (3.0, 2.0, 1.0)
-# Candidates of the largest ratio of a rest's variance to the quietest one, the strictest first.
-_VARIANCE_RATIOS = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
-# Numbers of samples in a cell if the samples are slow: where rests are interrupted, where they are
-# short.
-_FEWER_SAMPLES, _FEW_SAMPLES = 10, 5
-# Part of a bag at rest that is not interrupted, and part that shorter cells must add.
-_MOSTLY_STILL, _MORE_STILL = 0.95, 0.05
 
 
 class Readings(NamedTuple):
@@ -129,6 +123,46 @@ class ReducedBag:
         return self.temperatures.get('case', NO_READINGS)
 
 
+class _Pass:
+    """
+    One pass over the blocks of a source.
+
+    cells: statistics of the samples
+    temperatures: readings of each thermometer
+    causes: counts of what can explain the lack of a rest
+    has_rate: whether all blocks have a finite angular rate
+    """
+
+    def __init__(self, source: FitSource, accumulator: CellAccumulator) -> None:
+        readings: dict[str, list[Readings]] = {}
+        n_impossible: Counter[str] = Counter()
+        self.causes = CauseCounter()
+        self.n_samples, self.has_rate = 0, True
+        for block in source.blocks():
+            rate = angular_velocity(block)
+            if len(block.accel_stamp_ns):
+                self.has_rate &= rate is not None and bool(np.isfinite(rate).all())
+            accumulator.add(block.accel_stamp_ns, block.accel, rate)
+            self.causes.add(block)
+            for name, (reading_ns, celsius, _) in block.temperatures.items():
+                earlier = readings.setdefault(name, [NO_READINGS])
+                n_impossible[name] += int(np.count_nonzero(np.abs(celsius) > HOTTEST))
+                new = _thinned(reading_ns, celsius, earlier[-1].stamp_ns[-1:])
+                if len(new.stamp_ns):
+                    earlier.append(new)
+            self.n_samples += len(block.accel_stamp_ns)
+        self.cells = accumulator.finish()
+        self.temperatures = {
+            name: Readings(*map(np.concatenate, zip(*parts, strict=True)))
+            for name, parts in readings.items()
+        }
+        for name, n in n_impossible.items():
+            if n > len(self.temperatures[name].value):
+                raise FitError(
+                    f'{source.name}: {n} readings of {name} are beyond {HOTTEST:g} degC'
+                )
+
+
 def reduce_source(
     source: FitSource,
     *,
@@ -148,42 +182,17 @@ def reduce_source(
     variance of a rest is chosen in the same way. A cell has `least` samples, or 5 if the samples
     are slow and the unit rarely rests as long.
     """
-    cells = CellAccumulator(min(cell_s, window_s), full_scale, window_s, least)
-    readings: dict[str, list[Readings]] = {}
-    n_samples = 0
-    n_impossible: Counter[str] = Counter()
-    causes = CauseCounter()
-    has_rate = True
-    for block in source.blocks():
-        rate = angular_velocity(block)
-        if len(block.accel_stamp_ns):
-            has_rate &= rate is not None and bool(np.isfinite(rate).all())
-        cells.add(block.accel_stamp_ns, block.accel, rate)
-        causes.add(block)
-        for name, (reading_ns, celsius, _) in block.temperatures.items():
-            own = readings.setdefault(name, [NO_READINGS])
-            n_impossible[name] += int(np.count_nonzero(np.abs(celsius) > HOTTEST))
-            new = _thinned(reading_ns, celsius, own[-1].stamp_ns[-1:])
-            if len(new.stamp_ns):
-                own.append(new)
-        n_samples += len(block.accel_stamp_ns)
-    for name, n in n_impossible.items():
-        if n > sum(len(one.value) for one in readings[name]):
-            raise FitError(f'{source.name}: {n} readings of {name} are beyond {HOTTEST:g} degC')
-    found, reader = cells.finish(), source.reader()
-    if source.force is not None:
-        # The thresholds are chosen by the norms at rest, which must be those of gravity.
-        found = stillness.without_rotation(found)
-        shortest = min_rest_s or _MIN_RESTS_S[0]
-        ranges = stillness.still_intervals(found, shortest, still_sd)
+    one = _Pass(source, CellAccumulator(min(cell_s, window_s), full_scale, window_s, least))
+    # The norms at rest choose the thresholds only if they are those of gravity.
+    cells = one.cells if source.force is None else stillness.without_rotation(one.cells)
+    if source.force is None:
+        ranges = _rests(cells, min_rest_s, still_sd)
     else:
-        ranges = _rests(found, min_rest_s, still_sd)
-    per_window = max(1, round(window_s / found.cell_s)) if found.cell_s else 1
-    n_still = sum(upper - lower for lower, upper in ranges)
-    if least == stillness.MIN_SAMPLES and found.cell_s > 3.0:
-        closer = _with_shorter_cells(
+        ranges = stillness.still_intervals(cells, min_rest_s or _MIN_RESTS_S[0], still_sd)
+    if least == stillness.MIN_SAMPLES and cells.cell_s > 3.0:
+        in_shorter_cells = partial(
+            reduce_source,
             source,
-            n_still / len(found.count),
             window_s=window_s,
             cell_s=cell_s,
             min_rest_s=min_rest_s,
@@ -191,62 +200,77 @@ def reduce_source(
             full_scale=full_scale,
             fewest_windows=fewest_windows,
         )
-        if closer is not None:
-            return closer
+        still_part = sum(b - a for a, b in ranges) / len(cells.count)
+        shorter = _with_shorter_cells(source, still_part, in_shorter_cells)
+        if shorter is not None:
+            return shorter
+    restless = one.causes.cause(cells, still_sd)
+    if not ranges and not restless:
+        restless = f'no still interval: {_why_restless(cells, one.n_samples, still_sd)}'
+    return _bag(source, one, cells, ranges, window_s, fewest_windows, restless)
+
+
+def _bag(
+    source: FitSource,
+    one: _Pass,
+    cells: Cells,
+    ranges: Sequence[tuple[int, int]],
+    window_s: float,
+    fewest_windows: int,
+    restless: str,
+) -> ReducedBag:
+    """Make the statistics of a bag from its cells and its rests, ranges of cells."""
+    per_window = max(1, round(window_s / cells.cell_s)) if cells.cell_s else 1
+    sizes = [min(per_window, max(1, (b - a) // fewest_windows)) for a, b in ranges]
+    reader = source.reader()
     return ReducedBag(
         source=source,
-        start_ns=found.start_ns,
-        end_ns=found.start_ns + (round(found.time[-1] * 1e9) if len(found.time) else 0),
+        start_ns=cells.start_ns,
+        end_ns=cells.start_ns + (round(cells.time[-1] * 1e9) if len(cells.time) else 0),
         intervals=tuple(
-            _windows(
-                found,
-                lower,
-                upper,
-                min(per_window, max(1, (upper - lower) // fewest_windows)),
-                has_rate,
-            )
-            for lower, upper in ranges
+            _windows(cells, *edges, size, one.has_rate)
+            for edges, size in zip(ranges, sizes, strict=True)
         ),
-        temperatures={
-            name: Readings(*map(np.concatenate, zip(*own, strict=True)))
-            for name, own in readings.items()
-        },
-        n_samples=n_samples,
-        n_dropped=found.n_dropped,
-        n_saturated=found.n_saturated,
-        n_cells=len(found.count),
-        n_still_cells=n_still,
+        temperatures=one.temperatures,
+        n_samples=one.n_samples,
+        n_dropped=cells.n_dropped,
+        n_saturated=cells.n_saturated,
+        n_cells=len(cells.count),
+        n_still_cells=sum(upper - lower for lower, upper in ranges),
         # A bag without a usable sample has no cells: its window length is the option's.
-        window_s=round(per_window * found.cell_s, 6) or window_s,
-        cycle_s=found.cell_s / float(np.median(found.count)) if len(found.count) else np.nan,
-        is_integer=found.is_integer,
-        middle=found.middle,
-        max_abs=_max_abs(found),
+        window_s=round(per_window * cells.cell_s, 6) or window_s,
+        cycle_s=cells.cell_s / float(np.median(cells.count)) if len(cells.count) else np.nan,
+        is_integer=cells.is_integer,
+        middle=cells.middle,
+        max_abs=_max_abs(cells),
         info=reader.info if reader else NO_RECORDING,
         since_s=reader.since_s if reader else 0.0,
-        restless=causes.cause(found, still_sd)
-        or ('' if ranges else f'no still interval: {_why_restless(found, n_samples, still_sd)}'),
-        angular_rate='whole' if has_rate else 'part' if found.rate.any() else 'none',
+        restless=restless,
+        angular_rate='whole' if one.has_rate else 'part' if cells.rate.any() else 'none',
     )
 
 
-def _with_shorter_cells(source: FitSource, share: float, **options: Any) -> ReducedBag | None:
+def _with_shorter_cells(
+    source: FitSource, share: float, reduced: Callable[..., ReducedBag]
+) -> ReducedBag | None:
     """
     Reduce a source of slow samples in shorter cells; None if the usual ones serve.
 
     `share`: the part of the bag at rest in usual cells. A bias that changes within minutes looks
     like a motion there, and short rests are lost.
     """
-    if share < _MOSTLY_STILL and source.force is None:
-        closer = reduce_source(source, least=_FEWER_SAMPLES, **options)
-        if closer.n_still_cells / closer.n_cells > share + _MORE_STILL:
-            return closer
+    if share < 0.95 and source.force is None:
+        # The rests are interrupted: shorter cells must add 5 % of the bag.
+        shorter = reduced(least=10)
+        if shorter.n_still_cells / shorter.n_cells > share + 0.05:
+            return shorter
     if share < 0.5:
-        closer = reduce_source(source, least=_FEW_SAMPLES, **options)
-        means = np.array([interval.mean.mean(axis=0) for interval in closer.intervals])
+        # The rests are short: shorter cells must show six attitudes.
+        shorter = reduced(least=5)
+        means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
         means = means.reshape(-1, 3)
         if len(distinct_directions(directions(means, rough_centre(means)))) >= 6:
-            return closer
+            return shorter
     return None
 
 
@@ -268,7 +292,9 @@ def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds at which they determine the triad best."""
     found: list[list[tuple[int, int]]] = []
-    of_ratios = stillness.still_runs(cells, still_sd, _VARIANCE_RATIOS)
+    # Largest ratio of a rest's variance to the quietest one, the strictest first.
+    ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
+    of_ratios = stillness.still_runs(cells, still_sd, ratios)
     for shortest in _MIN_RESTS_S if min_rest_s is None else (min_rest_s,):
         for runs in of_ratios:
             ranges = stillness.long_enough(cells, runs, shortest)

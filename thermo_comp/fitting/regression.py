@@ -17,7 +17,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,15 +25,10 @@ from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats
 from .elimination import Reduced, eliminate, factored, inverse_root, solved
-from .equations import Equations, moved_by, without_inactive
-from .inactive import Inactive
-from .last_result import last_result_kept
+from .equations import Equations, last_result_kept, moved_by, without_inactive
+from .gains import Inactive
 from .tangent import Normal, Tangent
 from .unknowns import Layout, Prior, State
-
-# Prior sd of the mean over all bags of the initial lag states, over that of one bag. A non-zero
-# mean is a response of the unit, which other initial states would show as well.
-_COMMON_START = 0.1
 
 
 @dataclass(frozen=True)
@@ -48,6 +43,7 @@ class Posterior:
     log_evidence: logarithm of the marginal likelihood, without a constant of the data
     """
 
+    prior: Prior
     state: State
     layout: Layout
     determined: Floats
@@ -68,8 +64,199 @@ class Posterior:
         return np.asarray(padded[self.layout.weights].sum(axis=1))
 
 
+@dataclass(frozen=True)
+class Point:
+    """
+    The equations linearised about a state, and Gauss-Newton's step from it under a prior.
+
+    grams: products of the base series in each position, shape (n_positions, n_base, n_base)
+    """
+
+    regression: Regression
+    state: State
+    prior: Prior
+    layout: Layout
+    grams: Floats
+
+    @property
+    def tangent(self) -> Tangent:
+        """The linearised equations."""
+        return self.regression.linearised(self.state, self.layout, self.grams)[0]
+
+    @property
+    def normal(self) -> Normal:
+        """The normal equations."""
+        return self.regression.linearised(self.state, self.layout, self.grams)[1]
+
+    @property
+    def precision(self) -> Floats:
+        """Inverse prior variances, see `Equations.precision`."""
+        return self.regression.precision(self.prior, self.layout)
+
+    @cached_property
+    def away(self) -> Floats:
+        """The unknowns less the mean of the prior, shape (n,)."""
+        return self.regression.away(self.state, self.prior, self.layout)
+
+    @cached_property
+    def square(self) -> Floats:
+        """Sum of squares of the whitened residuals of each axis, shape (3,)."""
+        return self.normal.square
+
+    @cached_property
+    def misfit(self) -> float:
+        """-2 times the log density of the data."""
+        n, sigma = len(self.regression.weight), self.prior.sigma
+        each = self.square / sigma**2 + 2.0 * n * np.log(sigma)
+        return float((each + self.regression.noise_determinant).sum())
+
+    @cached_property
+    def prior_misfit(self) -> float:
+        """-2 times the log density of the state, without the constants of the prior."""
+        size = float(self.precision @ self.away**2)
+        if self.prior.informative is not None:
+            # The precision of the unit's unknowns is 0 in the diagonal form.
+            root = self.prior.informative.root
+            size += float(np.sum((root @ self.away[: self.layout.n_unit]) ** 2))
+        if self._has_common_start:
+            size += float(np.sum(self.state.start.sum(axis=0) ** 2)) / self._common_variance
+        return size
+
+    @property
+    def energy(self) -> float:
+        """-2 times the log density of data and state, without the constants of the prior."""
+        return self.misfit + self.prior_misfit
+
+    @property
+    def _has_common_start(self) -> bool:
+        return self.regression.n_bags > 1 and bool(self.layout.start.size)
+
+    @property
+    def _common_variance(self) -> float:
+        """
+        Prior variance of the sum over the bags of an initial lag state. The sd of their mean is
+        0.1 of that of one bag: a non-zero mean is a response of the unit, which other initial
+        states would show as well.
+        """
+        return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_share
+
+    @cached_property
+    def reduced(self) -> Reduced:
+        """The normal equations of the unit, those of positions and bags eliminated."""
+        return self._reduced(self.normal)
+
+    def _reduced(self, normal: Normal) -> Reduced:
+        in_sigmas = normal.scaled(self.prior.sigma**-2.0)
+        reduced = eliminate(in_sigmas, self.layout, self.precision, self.away)
+        if self._has_common_start:
+            total = self.state.start.sum(axis=0)
+            reduced = reduced.with_prior_of_sum(total, self._common_variance)
+        return reduced
+
+    def without_each(self) -> Iterator[Floats]:
+        """Yield the normal equations of the unit without each position in turn."""
+        base = self.regression.products(self.layout.used).base
+        at_state = self.regression.products_at(self.grams, self.state, base)
+        for p in range(self.regression.windows.n_positions):
+            own = self.tangent.at(p).normal(at_state[[p]])
+            yield self.reduced.without(p, own.scaled(self.prior.sigma**-2.0))
+
+    def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
+        """
+        Return the step of the unit's unknowns, and the Cholesky factor of their Hessian, given
+        their normal equations, see `Reduced.matrix`.
+        """
+        n = self.layout.n_unit
+        information, gradient, away = matrix[:n, :n], matrix[:n, n], self.away[:n]
+        if self.prior.informative is None:
+            precision = self.precision[:n]
+            hessian: Floats = information.copy()
+            hessian[np.diag_indices(n)] += precision
+            factor = factored(hessian)
+            return solved(factor, gradient - precision * away), factor
+        # In units of the prior's standard deviations the system is well conditioned.
+        root = self.prior.informative.root
+        turned = solve_triangular(root, information, trans='T')
+        turned = solve_triangular(root, turned.T, trans='T')
+        factor = factored((turned + turned.T) / 2.0 + np.eye(n))
+        right = solve_triangular(root, gradient, trans='T') - root @ away
+        return solve_triangular(root, solved(factor, right)), root.T @ factor
+
+    @cached_property
+    def solution(self) -> tuple[Floats, Floats]:
+        """The step of all unknowns, and the Cholesky factor of the unit's Hessian."""
+        return self._solution(self.reduced)
+
+    def _solution(self, reduced: Reduced) -> tuple[Floats, Floats]:
+        unit, factor = self.unit_step(reduced.whole)
+        step = np.empty(self.layout.n)
+        step[: self.layout.n_unit] = unit
+        step[self.layout.own], step[self.layout.start] = reduced.follow(unit)
+        return step, factor
+
+    def linear_step(self) -> Floats:
+        """Return the step with the nonlinear unknowns held by a damping factor."""
+        return self._solution(self._reduced(_damped(self.normal, self.layout)))[0]
+
+    def moved(self, step: Floats) -> Point:
+        """Add a step to the state."""
+        return replace(self, state=moved_by(self.state, step, self.layout))
+
+    def stepped(self) -> Point:
+        """
+        Take Gauss-Newton's step.
+
+        If the step increases the energy, fractions of it are tried in the nonlinear unknowns,
+        which enter as products, and the linear unknowns are solved again for each fraction.
+        """
+        step, _ = self.solution
+        result = self.moved(step)
+        if result.energy <= self.energy:
+            return result
+        layout = self.layout
+        is_nonlinear = np.zeros(layout.n, dtype=bool)
+        for places in (layout.kappa, layout.shared, layout.up, layout.stretch, layout.start):
+            is_nonlinear[places] = True
+        for share in (1.0, 0.25, 0.06, 0.015, 0.004, 0.001):
+            turned = self.moved(np.where(is_nonlinear, share * step, 0.0))
+            result = turned.moved(np.where(is_nonlinear, 0.0, turned.linear_step()))
+            if result.energy <= self.energy:
+                break
+        return result
+
+    def posterior(self, end: Point) -> Posterior:
+        """Return the posterior at `end`, a small step away, with the curvature of this point."""
+        layout, prior, precision, reduced = self.layout, self.prior, self.precision, self.reduced
+        _, factor = self.solution
+        n, unit_root = layout.n_unit, inverse_root(factor)
+        variance = np.empty(layout.n)
+        variance[:n] = np.sum(unit_root**2, axis=1)
+        variance[layout.own], variance[layout.start] = reduced.variances(unit_root)
+        determined = 1.0 - precision * variance
+        of_prior = float(np.log(precision[n:][precision[n:] > 0.0]).sum())
+        if prior.informative is None:
+            of_prior += float(np.log(precision[:n]).sum())
+        else:
+            root = prior.informative.root
+            determined[:n] = 1.0 - np.sum(root * (root @ unit_root @ unit_root.T), axis=0)
+            of_prior += 2.0 * float(np.log(np.diag(root)).sum())
+        if reduced.common is not None:
+            of_prior += layout.start.shape[1] * float(np.log(prior.start_share))
+        log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
+        evidence = -0.5 * (self.misfit + end.prior_misfit + log_hessian - of_prior)
+        return Posterior(
+            *(prior, end.state, layout, determined, unit_root, variance, self.square, evidence)
+        )
+
+
 class Regression(Equations):
     """Gauss-Newton on the measurement equations; see `Equations` for the parameters."""
+
+    def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
+        """Return the equations at a state without inactive weights; `grams`: None for all."""
+        layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
+        grams = self.products(layout.used).whole if grams is None else grams
+        return Point(self, without_inactive(state, layout), prior, layout, grams)
 
     @last_result_kept
     def linearised(self, state: State, layout: Layout, grams: Floats) -> tuple[Tangent, Normal]:
@@ -81,199 +268,40 @@ class Regression(Equations):
         tangent = self.tangent(state, layout, base)
         return tangent, tangent.normal(self.products_at(grams, state, base))
 
-    def reduce(self, normal: Normal, prior: Prior, layout: Layout, state: State) -> Reduced:
-        """Eliminate the unknowns of positions and bags from normal equations."""
-        in_sigmas = normal.scaled(prior.sigma**-2.0)
-        precision, away = self.precision(prior, layout), self.away(state, prior, layout)
-        reduced = eliminate(in_sigmas, layout, precision, away)
-        if self.n_bags > 1 and layout.start.size:
-            variance = (_COMMON_START * self.n_bags) ** 2 * prior.start_share
-            reduced = reduced.with_prior_of_sum(state.start.sum(axis=0), variance)
-        return reduced
-
-    def without_each(self, state: State, prior: Prior, layout: Layout) -> Iterator[Floats]:
-        """Yield the normal equations of the unit without each position in turn."""
-        products = self.products(layout.used)
-        tangent, normal = self.linearised(state, layout, products.whole)
-        reduced = self.reduce(normal, prior, layout, state)
-        at_state = self.products_at(products.whole, state, products.base)
-        for p in range(self.windows.n_positions):
-            own = tangent.at(p).normal(at_state[[p]])
-            yield reduced.without(p, own.scaled(prior.sigma**-2.0))
-
-    def unit_step(
-        self, matrix: Floats, prior: Prior, layout: Layout, state: State
-    ) -> tuple[Floats, Floats]:
-        """
-        Return the step of the unit's unknowns, and the Cholesky factor of their Hessian, given
-        their normal equations, see `Reduced.matrix`.
-        """
-        n = layout.n_unit
-        information, pull, away = (
-            matrix[:n, :n],
-            matrix[:n, n],
-            self.away(state, prior, layout)[:n],
-        )
-        if prior.informative is None:
-            known = self.precision(prior, layout)[:n]
-            hessian: Floats = information.copy()
-            hessian[np.diag_indices(n)] += known
-            factor = factored(hessian)
-            return solved(factor, pull - known * away), factor
-        # In units of the prior's standard deviations the system is well conditioned.
-        root = prior.informative.root
-        turned = solve_triangular(root, information, trans='T')
-        turned = solve_triangular(root, turned.T, trans='T')
-        factor = factored((turned + turned.T) / 2.0 + np.eye(n))
-        right = solve_triangular(root, pull, trans='T') - root @ away
-        return solve_triangular(root, solved(factor, right)), root.T @ factor
-
-    def step(
-        self, state: State, prior: Prior, layout: Layout, grams: Floats, *, held: bool = False
-    ) -> tuple[Floats, Reduced, Floats]:
-        """
-        Return the Gauss-Newton step, the reduced equations, and the Cholesky factor of the unit's
-        Hessian. `held`: the nonlinear unknowns are held by a damping factor, so that only the
-        linear ones move.
-        """
-        _, normal = self.linearised(state, layout, grams)
-        if held:
-            normal = _held(normal, layout)
-        reduced = self.reduce(normal, prior, layout, state)
-        unit, factor = self.unit_step(reduced.whole, prior, layout, state)
-        step = np.empty(layout.n)
-        step[: layout.n_unit] = unit
-        step[layout.own], step[layout.start] = reduced.follow(unit)
-        return step, reduced, factor
-
-    def energy(self, state: State, prior: Prior, layout: Layout, grams: Floats) -> float:
-        """Return -2 times the log density of data and state, without the prior's constants."""
-        square = self._square(state, layout, grams)
-        return self._size(square, prior) + self._away(state, prior, layout)
-
-    def _square(self, state: State, layout: Layout, grams: Floats) -> Floats:
-        """Return the sum of squares of the whitened residuals of each axis, shape (3,)."""
-        _, normal = self.linearised(state, layout, grams)
-        return normal.square
-
-    def _size(self, square: Floats, prior: Prior) -> float:
-        n = len(self.weight)
-        each = square / prior.sigma**2 + 2.0 * n * np.log(prior.sigma) + self.noise_determinant
-        return float(each.sum())
-
-    def _away(self, state: State, prior: Prior, layout: Layout) -> float:
-        away, precision = self.away(state, prior, layout), self.precision(prior, layout)
-        size = float(precision @ away**2)
-        if prior.informative is not None:
-            # The precision of the unit's unknowns is 0 in the diagonal form.
-            size += float(np.sum((prior.informative.root @ away[: layout.n_unit]) ** 2))
-        if self.n_bags > 1 and layout.start.size:
-            bound = (_COMMON_START * self.n_bags) ** 2 * prior.start_share
-            size += float(np.sum(state.start.sum(axis=0) ** 2)) / bound
-        return size
-
     def solve(self, state: State, prior: Prior, n_steps: int = 6) -> Posterior:
         """Find the posterior at the mode, in at most `n_steps`; with 0 steps at `state`."""
         self.whiten(prior.noise)
-        layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
-        grams = self.products(layout.used).whole
-        state = without_inactive(state, layout)
-        energy = self.energy(state, prior, layout, grams)
-        for k in range(n_steps + 1):
-            step, reduced, factor = self.step(state, prior, layout, grams)
-            square = self._square(state, layout, grams)
-            if k == n_steps:
+        point = self.at(state, prior)
+        for _ in range(n_steps):
+            end = point.stepped()
+            if end.energy > point.energy:
                 break
-            found, reached = self._descend(state, step, prior, layout, grams, energy)
-            if reached > energy:
-                break
-            gained, energy, state = energy - reached, reached, found
-            if gained < 1e-3:
-                break
-        return self._posterior(state, prior, layout, reduced, factor, square)
+            if point.energy - end.energy < 1e-3:
+                return point.posterior(end)
+            point = end
+        return point.posterior(point)
 
-    def _descend(
-        self,
-        state: State,
-        step: Floats,
-        prior: Prior,
-        layout: Layout,
-        grams: Floats,
-        energy: float,
-    ) -> tuple[State, float]:
-        """
-        Take a step; return the state and its energy.
-
-        If the step increases the energy, fractions of it are tried in the nonlinear unknowns,
-        which enter as products, and the linear unknowns are solved again for each fraction.
-        """
-        found = moved_by(state, step, layout)
-        reached = self.energy(found, prior, layout, grams)
-        if reached <= energy:
-            return found, reached
-        bends = np.zeros(layout.n, dtype=bool)
-        for places in (layout.kappa, layout.shared, layout.up, layout.stretch, layout.start):
-            bends[places] = True
-        for share in (1.0, 0.25, 0.06, 0.015, 0.004, 0.001):
-            turned = moved_by(state, np.where(bends, share * step, 0.0), layout)
-            follow, *_ = self.step(turned, prior, layout, grams, held=True)
-            found = moved_by(turned, np.where(bends, 0.0, follow), layout)
-            reached = self.energy(found, prior, layout, grams)
-            if reached <= energy:
-                break
-        return found, reached
-
-    def _posterior(
-        self,
-        state: State,
-        prior: Prior,
-        layout: Layout,
-        reduced: Reduced,
-        factor: Floats,
-        square: Floats,
-    ) -> Posterior:
-        n, own_root = layout.n_unit, inverse_root(factor)
-        precision = self.precision(prior, layout)
-        everything = np.empty(layout.n)
-        everything[:n] = np.sum(own_root**2, axis=1)
-        everything[layout.own], everything[layout.start] = reduced.variances(own_root)
-        determined = 1.0 - precision * everything
-        of_prior = float(np.log(precision[n:][precision[n:] > 0.0]).sum())
-        if prior.informative is None:
-            of_prior += float(np.log(precision[:n]).sum())
-        else:
-            root = prior.informative.root
-            determined[:n] = 1.0 - np.sum(root * (root @ own_root @ own_root.T), axis=0)
-            of_prior += 2.0 * float(np.log(np.diag(root)).sum())
-        if reduced.common is not None:
-            of_prior += layout.start.shape[1] * float(np.log(prior.start_share))
-        log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
-        size = self._size(square, prior) + self._away(state, prior, layout)
-        evidence = -0.5 * (size + log_hessian - of_prior)
-        return Posterior(state, layout, determined, own_root, everything, square, evidence)
-
-    def inactive(self, posterior: Posterior, prior: Prior, asked: Bools) -> Inactive:
+    def inactive(self, posterior: Posterior, wanted: Bools) -> Inactive:
         """Return sparsity and quality factors of inactive columns, (m,), at the mode."""
-        state, layout, n = posterior.state, posterior.layout, posterior.layout.n_unit
-        part, column = np.nonzero(self.windows.parts & asked & ~layout.used.any(axis=0))
+        point = self.at(posterior.state, posterior.prior)
+        state, layout, sigma, n = point.state, point.layout, point.prior.sigma, point.layout.n_unit
+        part, column = np.nonzero(self.windows.parts & wanted & ~layout.used.any(axis=0))
         if not len(column):
             return Inactive(part, column, np.zeros((0, 0)), np.zeros(0))
-        products = self.products(layout.used)
-        tangent, normal = self.linearised(state, layout, products.whole)
-        reduced = self.reduce(normal, prior, layout, state)
+        base = self.products(layout.used).base
         columns, at = np.unique(column, return_inverse=True)
-        among, beside = self.products_of(columns, products.base)
+        among, beside = self.products_of(columns, base)
         # Derivative of the reading by a unit of a column's effect on the bias and on the scale.
         acts = np.stack((np.ones_like(state.up), state.kappa * self.along_axes(state)))
-        acts /= prior.sigma
-        rows = tangent.of(self.at_starts(beside, state, products.base))[:, :, at]
-        rows *= (acts[part] / prior.sigma).transpose(1, 2, 0)[..., None]
-        gone, cross = reduced.beside(rows)
+        acts /= sigma
+        rows = point.tangent.of(self.at_starts(beside, state, base))[:, :, at]
+        rows *= (acts[part] / sigma).transpose(1, 2, 0)[..., None]
+        gone, cross = point.reduced.beside(rows)
         sums = np.tensordot(np.einsum('api,bpi->iabp', acts, acts), among, 1)
         S = -gone.reshape(len(part), 3, len(part), 3)
         for axis in range(3):
             S[:, axis, :, axis] += sums[axis, part[:, None], part, at[:, None], at]
-        step, factor = self.unit_step(reduced.whole, prior, layout, state)
+        step, factor = point.unit_step(point.reduced.whole)
         S = S.reshape(gone.shape) - cross[:n].T @ solved(factor, cross[:n])
         Q = cross[n] - cross[:n].T @ step
         if self.windows.acts_on is not None:
@@ -282,8 +310,8 @@ class Regression(Equations):
         return Inactive(part, column, S, Q)
 
 
-def _held(normal: Normal, layout: Layout) -> Normal:
-    """Damp the nonlinear unknowns in normal equations."""
+def _damped(normal: Normal, layout: Layout) -> Normal:
+    """Damp the nonlinear unknowns in normal equations by a factor that holds them."""
     local, unit = normal.local.copy(), normal.unit.copy()
     at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
     local[..., at, at] *= 1e9

@@ -3,48 +3,221 @@
 """
 Owns the choice of the model: groups of columns are added to the constants one at a time.
 
-The log evidence ranks the groups to be tried; the score on left-out data decides.
+The log evidence ranks the groups to be tried; the score on left-out data decides. The fit of each
+model begins from that of a smaller one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from .comparison import is_better, is_near, is_undecided
-from .growth import (
-    LAGS,
-    PART_CURVE,
-    TRIAL_GAIN,
+from ..typing import Floats
+from .hyperparameters import (
     Candidates,
-    Growth,
-    Trial,
-    likelier,
+    downweigh,
+    log_density,
     pruned_fit,
-    settled,
+    settle,
+    with_slow_noise,
 )
-from .hyperparameters import downweigh, white_noise
-from .left_out import Score, score_of
+from .left_out import Score, gain, is_better, is_near, is_undecided, score_of
 from .regression import Posterior, Regression
-from .unknowns import InformativePrior, Noise, Prior, State
-from .windows import BEND, CURVE
+from .unknowns import InformativePrior, Prior, State
+from .windows import BEND, CURVE, SET, ThermalWindows
 
-# Largest left-out drift, relative to the noise, of a model that lacks nothing.
-_AT_NOISE = 2.0
-# Largest left-out drift, relative to the chosen model's, of a model of bends that is continued.
-_PROMISING = 3.0
+#: Smallest possible gain in log evidence of a group that is tried: odds of e^4 = 55 to one.
+TRIAL_GAIN = 4.0
+#: Groups that are linear in a temperature difference.
+LAGS = ('gradient', 'board', 'gradient_lag')
+
+
+@dataclass(frozen=True)
+class Trial:
+    """
+    A model that was tried.
+
+    groups: its groups of columns; () for constants
+    score: its left-out errors
+    posterior: its fit
+    typical: typical prior sd of its columns, shape (2, m)
+    is_chosen: whether it is the chosen model
+    is_near: whether its score is within one standard error of that of the chosen model
+    """
+
+    groups: tuple[str, ...]
+    score: Score
+    posterior: Posterior
+    typical: Floats
+    is_chosen: bool = False
+    is_near: bool = False
 
 
 @dataclass(frozen=True)
 class Selected:
-    """The chosen model: its fit, its left-out score, and all models that were tried."""
+    """The chosen model: its completed fit, its left-out score, and all models that were tried."""
 
     posterior: Posterior
-    prior: Prior
     score: Score
     trials: tuple[Trial, ...]
+
+
+class Fit(NamedTuple):
+    """
+    The windows of a fit, their regression, and the chosen model.
+
+    typical: typical prior sd of all columns that could have taken part, shape (2, m); None if the
+        model has no choice of columns
+    """
+
+    windows: ThermalWindows
+    regression: Regression
+    selected: Selected
+    typical: Floats | None = None
+
+    @property
+    def posterior(self) -> Posterior:
+        """The fit of the chosen model."""
+        return self.selected.posterior
+
+    @property
+    def is_at_noise(self) -> bool:
+        """Whether the left-out drift is that of a model that lacks nothing."""
+        return self.selected.score.rms < _complete_rms(self.posterior)
+
+
+def _complete_rms(posterior: Posterior) -> float:
+    """Return the largest left-out drift of a model that lacks nothing [m/s^2]."""
+    return 2.0 * float(posterior.prior.sigma.mean())
+
+
+class Growth:
+    """Fits models of some groups, each begun from the fit of a smaller model."""
+
+    def __init__(self, regression: Regression, candidates: Candidates) -> None:
+        self.regression = regression
+        self._candidates = candidates
+        self._names = np.array(regression.windows.groups)
+        may = candidates.typical.any(axis=0)
+        self.forced = tuple(dict.fromkeys(self._names[candidates.forced & may].tolist()))
+        #: Groups that may be added.
+        names = dict.fromkeys(self._names[may].tolist())
+        self.free = [one for one in names if one not in self.forced]
+
+    def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
+        """Fit a model; columns that a smaller model dropped are tried again."""
+        candidates = replace(self._candidates, typical=typical)
+        initial_sd = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
+        is_wanted = np.isin(self._names, groups)
+        prior = replace(prior, column_sd=np.where(is_wanted, initial_sd, 0.0))
+        posterior = settle(self.regression, state, prior, candidates, 6)
+        posterior = pruned_fit(self.regression, posterior, candidates, 8)
+        return Trial(groups, score_of(self.regression, posterior), posterior, typical)
+
+    def extended(
+        self, before: Trial, groups: tuple[str, ...] = (), typical: Floats | None = None
+    ) -> Trial:
+        """Fit a model with further groups, from the fit of the model before."""
+        typical = before.typical if typical is None else typical
+        posterior = before.posterior
+        return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
+
+    def added(self, chosen: Trial, progress: Callable[[float], None]) -> tuple[Trial, list[Trial]]:
+        """Add groups as long as left-out data confirm it; return the last model and all tried."""
+        trials: list[Trial] = []
+        part = 1.0
+        while True:
+            larger = self.trials(chosen, [one for one in self.free if one not in chosen.groups])
+            trials += larger
+            better = [one for one in larger if is_better(chosen.score, one.score)]
+            part *= 0.6
+            progress(1.0 - part)
+            if not better:
+                return chosen, trials
+            chosen = simplest_of_the_best(chosen, better)
+
+    def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
+        """Fit a model with further groups, and then with the bends that it lacks."""
+        more = tuple(one for one in groups if one in self.free)
+        typical = self._typical(before, more, self._candidates.typical)
+        smooth = self.extended(before, more, typical)
+        return [smooth, *(self.trials(smooth, [BEND]) if BEND in self.free else [])]
+
+    def trials(self, chosen: Trial, absent: list[str]) -> list[Trial]:
+        """Fit the chosen model plus each group with a large possible gain in log evidence."""
+        if not absent:
+            return []
+        typical = self._candidates.typical
+        columns = np.isin(self._names, absent) & typical.any(axis=0)
+        inactive = self.regression.inactive(chosen.posterior, columns)
+        if BEND in absent:
+            # Some of the many bend columns are tried, chosen by forward selection: at most 16 for
+            # all axes with a bank of lags; with the lags of their parts a score for each axis, as
+            # around a bump.
+            is_bend = self._names == BEND
+            most = 60 if self.regression.windows.has_part_lags else 16
+            knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, most)
+            typical = np.where(is_bend & ~knees, 0.0, typical)
+        # Some groups are tried together, because one effect has columns in all of them: the curve
+        # of a part that lags by m, from the board or from the gradient, is
+        # (t - m)^2 = t^2 - 2 t m + m^2.
+        together = ('product', 'square'), (*LAGS, 'product', 'gradient_x_temperature', 'square')
+        sets = [tuple(one for one in groups if one in absent) for groups in together]
+        sets = [*((one,) for one in absent), *(groups for groups in sets if len(groups) > 1)]
+        gains = {groups: inactive.gain(typical, np.isin(self._names, groups)) for groups in sets}
+        likely = [groups for groups in sets if gains[groups] > TRIAL_GAIN]
+        likely.sort(key=gains.__getitem__, reverse=True)
+        tried = likely[:3]
+        if chosen.groups == (CURVE,) and (SET,) in likely[3:]:
+            # The paper's two sets are always tried.
+            tried.append((SET,))
+        return [
+            self.extended(chosen, groups, self._typical(chosen, groups, typical))
+            for groups in tried
+        ]
+
+    def _typical(self, chosen: Trial, groups: tuple[str, ...], most: Floats) -> Floats:
+        """
+        Return the typical prior sd of a model with further groups.
+
+        The sd of a new column corresponds to the RMS residual of the chosen model, up to `most`.
+        """
+        regression, posterior = self.regression, chosen.posterior
+        kelvins = regression.windows.kelvins
+        residual = regression.residual(posterior.state, posterior.layout)
+        slope = float(np.sqrt(np.mean(residual**2))) / (float(kelvins[0]) or 1.0)
+        units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
+        new = np.minimum(slope * units * kelvins, most)
+        return np.where(np.isin(self._names, groups), new, chosen.typical)
+
+
+def better_beginning(fits: Sequence[Trial]) -> Trial:
+    """
+    Choose between fits begun with small and with large mountings: the one better on left-out data.
+
+    If neither is, the large mountings must be likelier by `TRIAL_GAIN`. Both explain the norms of
+    few positions, one by mountings, the other by misalignments; only the second predicts the norm
+    of another position.
+    """
+    small, *others = fits
+    for large in others:
+        more = log_density(large.posterior) - log_density(small.posterior)
+        is_likelier = more > TRIAL_GAIN and not is_better(large.score, small.score)
+        if is_likelier or is_better(small.score, large.score):
+            return large
+    return small
+
+
+def simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
+    """Return the model with the largest gain, or a smaller one that is not significantly worse."""
+    best = max(better, key=lambda one: gain(before.score, one.score))
+    for one in sorted(better, key=lambda one: len(one.groups)):
+        if one is best or not is_better(one.score, best.score):
+            return one
+    return best
 
 
 def select(
@@ -55,54 +228,56 @@ def select(
     progress: Callable[[float], None] = lambda _part: None,
 ) -> Selected:
     """Choose the groups of columns by left-out data, and fit them."""
-    names = np.array(regression.windows.groups)
-    may = candidates.typical.any(axis=0)
-    forced = tuple(dict.fromkeys(names[candidates.forced & may].tolist()))
-    asked = [name for name in dict.fromkeys(names[may].tolist()) if name not in forced]
-    grow = Growth(regression, candidates, names)
-    # Without a curve the drift is attributed to mountings or to noise: start from both.
-    begun = [prior]
+    growth = Growth(regression, candidates)
+    # Without a curve the drift is attributed to mountings or to noise: begin from both.
+    priors = [prior]
     if prior.offset_scale > 0.0:
-        begun.append(replace(prior, offset_sd=float(prior.sigma.mean())))
-    fits = [grow.fit(forced, state, one, candidates.typical) for one in begun]
-    constants = chosen = likelier(fits)
+        priors.append(replace(prior, offset_sd=float(prior.sigma.mean())))
+    fits = [growth.fit(growth.forced, state, one, candidates.typical) for one in priors]
+    constants = first = better_beginning(fits)
     trials = [constants]
-    if CURVE in asked:
+    if CURVE in growth.free:
         # The curve is added without a test: it may improve the score only with other groups.
-        groups = *forced, CURVE
-        curve = likelier(
-            [grow.fit(groups, fit.posterior.state, fit.prior, fit.typical) for fit in fits]
-        )
-        downweigh(regression, curve.posterior, curve.prior)
-        chosen = grow.fit(groups, curve.posterior.state, curve.prior, curve.typical)
-        trials.append(chosen)
-    begin = chosen
-    if regression.windows.has_part_lags:
-        found = grow.bent(begin, asked, PART_CURVE)
-        trials += found
-        for one in found:
+        curve = better_beginning([growth.extended(one, (CURVE,)) for one in fits])
+        downweigh(regression, curve.posterior)
+        first = growth.extended(curve)
+        trials.append(first)
+    chosen, more = _grown(growth, first, progress)
+    trials += more
+    if chosen is not constants and not is_better(constants.score, chosen.score):
+        more_evidence = chosen.posterior.log_evidence - constants.posterior.log_evidence
+        if not is_undecided(constants.score, chosen.score) or more_evidence < TRIAL_GAIN:
+            chosen = constants
+    candidates = replace(candidates, typical=chosen.typical)
+    posterior, score = finish(regression, chosen.posterior, candidates)
+    return Selected(posterior, score, _marked(trials, chosen, score))
+
+
+def _grown(
+    growth: Growth, first: Trial, progress: Callable[[float], None]
+) -> tuple[Trial, list[Trial]]:
+    """Add groups to the curve; return the best model and all that were tried."""
+    chosen, trials = first, []
+    if growth.regression.windows.has_part_lags:
+        # Groups of the curve of parts that lag the board: a polynomial in t - m, m the lag.
+        trials = growth.with_bends(first, ('board', 'product', 'square'))
+        for one in trials:
             if is_better(chosen.score, one.score):
                 chosen = one
-    chosen, found = grow.added(chosen, asked, progress)
-    trials += found
-    noise = float(chosen.prior.sigma.mean())
-    if BEND in asked and BEND not in chosen.groups and chosen.score.rms > _AT_NOISE * noise:
+    chosen, more = growth.added(chosen, progress)
+    trials += more
+    is_without_bends = BEND in growth.free and BEND not in chosen.groups
+    if is_without_bends and chosen.score.rms > _complete_rms(chosen.posterior):
         # The slopes of a part that lags are seen only beside its lag, not beside a stand-in of
-        # products and squares.
-        _, *bent = grow.bent(begin, asked, LAGS)
-        if bent and bent[0].score.rms < _PROMISING * chosen.score.rms:
-            trials += bent
-            more, found = grow.added(bent[0], asked, progress)
-            trials += found
-            if is_better(chosen.score, more.score):
-                chosen = more
-    if chosen is not constants and not is_better(constants.score, chosen.score):
-        gain = chosen.posterior.log_evidence - constants.posterior.log_evidence
-        if not is_undecided(constants.score, chosen.score) or gain < TRIAL_GAIN:
-            chosen = constants
-    settled = replace(candidates, typical=chosen.typical)
-    posterior, prior, score = finish(regression, chosen.posterior, chosen.prior, settled)
-    return Selected(posterior, prior, score, _marked(trials, chosen, score))
+        # products and squares. A model of bends is continued if its drift is less than three times
+        # that of the chosen model.
+        _, *bent = growth.with_bends(first, LAGS)
+        if bent and bent[0].score.rms < 3.0 * chosen.score.rms:
+            last, more = growth.added(bent[0], progress)
+            trials += [*bent, *more]
+            if is_better(chosen.score, last.score):
+                chosen = last
+    return chosen, trials
 
 
 def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
@@ -124,77 +299,40 @@ def fit_all(
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
     """Fit all columns; of several informative priors take that of the largest log evidence."""
-    posterior, prior = settled(regression, state, prior, candidates)
-    downweigh(regression, posterior, prior)
-    posterior, prior = settled(regression, posterior.state, prior, candidates)
+    posterior = settle(regression, state, prior, candidates)
+    downweigh(regression, posterior)
+    posterior = settle(regression, posterior.state, posterior.prior, candidates)
     if informative:
-        tried = [
-            regression.solve(posterior.state, replace(prior, informative=candidate), n_steps=3)
-            for candidate in informative
+        fits = [
+            regression.solve(posterior.state, replace(posterior.prior, informative=one), n_steps=3)
+            for one in informative
         ]
-        best = int(np.argmax([one.log_evidence for one in tried]))
-        prior = replace(prior, informative=informative[best])
-        posterior, prior = settled(regression, tried[best].state, prior, candidates)
-    posterior, prior = _with_slow_noise(regression, posterior, prior, candidates)
-    score = score_of(regression, posterior, prior)
+        best = max(fits, key=lambda one: one.log_evidence)
+        posterior = settle(regression, best.state, best.prior, candidates)
+    posterior = with_slow_noise(regression, posterior, candidates)
+    score = score_of(regression, posterior)
     groups = tuple(dict.fromkeys(regression.windows.groups))
-    trial = Trial(groups, score, posterior, prior, candidates.typical, is_chosen=True)
-    return Selected(posterior, prior, score, (trial,))
+    trial = Trial(groups, score, posterior, candidates.typical, is_chosen=True)
+    return Selected(posterior, score, (trial,))
 
 
 def finish(
-    regression: Regression, posterior: Posterior, prior: Prior, candidates: Candidates
-) -> tuple[Posterior, Prior, Score]:
+    regression: Regression, posterior: Posterior, candidates: Candidates
+) -> tuple[Posterior, Score]:
     """
     Complete the chosen model: weights of outliers, columns with too little gain, slow noise.
 
     Slow noise also absorbs thermal effects that the model lacks, so it is kept only if it does not
     worsen the correction of left-out data.
     """
-    downweigh(regression, posterior, prior)
-    white = pruned_fit(
-        regression, *settled(regression, posterior.state, prior, candidates), candidates
-    )
-    score = score_of(regression, *white)
-    slow = _with_slow_noise(regression, *white, candidates)
-    if slow[1].noise != white[1].noise:
-        slow = pruned_fit(regression, *slow, candidates)
-        found = score_of(regression, *slow)
-        if not is_better(found, score):
-            return *slow, found
-    return *white, score
-
-
-def _with_slow_noise(
-    regression: Regression, posterior: Posterior, prior: Prior, candidates: Candidates
-) -> tuple[Posterior, Prior]:
-    """Estimate the slow noise from the residuals, then by log evidence, and settle with it."""
-    residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
-    best = regression.whitener.estimate(residual, regression.weight)
-    if best == prior.noise:
-        return posterior, prior
-
-    def with_noise(noise: Noise) -> tuple[Posterior, Prior]:
-        trial = replace(prior, noise=noise)
-        for _ in range(2):
-            fitted = regression.solve(posterior.state, trial, n_steps=1)
-            trial = replace(trial, sigma=white_noise(regression, fitted))
-        return fitted, trial
-
-    # The parameters absorb a part of the noise, so residuals underestimate it; the log evidence
-    # does not. Search ratio and time in steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
-    refined, found = with_noise(best)
-    step = 3.0
-    while step > 3.0**0.2:
-        around = [
-            with_noise(Noise(best.ratio * ratio, best.time_s * time))
-            for ratio, time in ((step, 1.0), (1.0 / step, 1.0), (1.0, step), (1.0, 1.0 / step))
-            if regression.whitener.shows(best.time_s * time)
-        ]
-        nearby = max(around, key=lambda one: one[0].log_evidence)
-        if nearby[0].log_evidence > refined.log_evidence:
-            refined, found = nearby
-            best = found.noise
-        else:
-            step = step**0.5
-    return settled(regression, refined.state, found, candidates)
+    downweigh(regression, posterior)
+    white = settle(regression, posterior.state, posterior.prior, candidates)
+    white = pruned_fit(regression, white, candidates)
+    score = score_of(regression, white)
+    slow = with_slow_noise(regression, white, candidates)
+    if slow.prior.noise != white.prior.noise:
+        slow = pruned_fit(regression, slow, candidates)
+        slow_score = score_of(regression, slow)
+        if not is_better(slow_score, score):
+            return slow, slow_score
+    return white, score

@@ -21,9 +21,6 @@ from ..recording.topics import Topics, is_called, shown
 from ..typing import Floats
 from .known_force import USUAL_FORCE, AskedForce, KnownForce, known_force
 
-# Topics that a recording must have.
-_SAMPLES: tuple[Role, ...] = ('accel',)
-
 
 def angular_velocity(block: object) -> Floats | None:
     """Return the angular rate of a block of Imu messages; None for other blocks."""
@@ -83,14 +80,15 @@ def recording_source(
     path: str | Path,
     topics: Topics | None = None,
     *,
-    require: Collection[Role] = _SAMPLES,
+    require: Collection[Role] = ('accel',),
     progress: Callable[[float], None] | None = None,
     force: AskedForce = USUAL_FORCE,
 ) -> tuple[FitSource, RecordingInfo]:
     """
     Make a source of a recording, which is opened here and again for each pass.
 
-    `force`: the user's options about |f|, which replace the bag's metadata
+    `require`: topics that it must have; `force`: the user's options about |f|, which replace the
+    bag's metadata
     """
     path = Path(path)
     with open_recording(path, topics, require=require) as reader:

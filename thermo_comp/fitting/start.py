@@ -35,6 +35,11 @@ class ConstantCalibration:
         """Return the specific force of measured vectors, shape (n, 3)."""
         return np.asarray(((measured - self.bias) / self.scale) @ self.misalignment.T)
 
+    def directions(self, windows: Windows) -> Floats:
+        """Return the direction of the specific force in each position, shape (n_positions, 3)."""
+        up = self.force(position_means(windows))
+        return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
+
 
 def constant_calibration(
     means: Floats, gravity: float | Floats, with_misalignment: bool
@@ -99,7 +104,7 @@ def _refine(
 
 def position_means(windows: Windows) -> Floats:
     """Return the mean raw vector of each position, shape (n_positions, 3)."""
-    first = np.searchsorted(windows.position, np.arange(windows.n_positions))
+    first = windows.edges[:-1]
     total = np.add.reduceat(windows.weight, first)
     weighted = np.add.reduceat(windows.mean * windows.weight[:, None], first, axis=0)
     return np.asarray(weighted / total[:, None])
@@ -110,16 +115,16 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     Return the white noise of the windows of each axis [m/s^2], shape (3,), from their second
     differences, which a drift does not enter; 0 without three windows in a position.
     """
-    same = (windows.position[2:] == windows.position[:-2]).nonzero()[0]
-    if not len(same):
+    inner = windows.inner
+    if not len(inner):
         return np.zeros(3)
-    bend = np.diff(windows.mean / scale, n=2, axis=0)[same]
+    bend = np.diff(windows.mean / scale, n=2, axis=0)[inner]
     return np.asarray(np.median(np.abs(bend), axis=0) / (0.6745 * np.sqrt(6.0)))
 
 
-def within_positions(measured: Floats, position: Ints) -> Floats:
-    """Subtract the mean of each position from the measured vectors of windows, shape (n, 3)."""
+def within_positions(values: Floats, position: Ints) -> Floats:
+    """Subtract from the values of each window, shape (n, k), their mean in its position."""
     _, where, count = np.unique(position, return_inverse=True, return_counts=True)
-    total = np.zeros((len(count), 3))
-    np.add.at(total, where, measured)
-    return np.asarray(measured - (total / count[:, None])[where])
+    total = np.zeros((len(count), values.shape[1]))
+    np.add.at(total, where, values)
+    return np.asarray(values - (total / count[:, None])[where])

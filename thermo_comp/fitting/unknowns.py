@@ -7,12 +7,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
-from .forces import Forces
+
+if TYPE_CHECKING:
+    from .nonlinear import Forces
 
 #: Built-in prior sd of a bias [m/s^2]: 100 mg, above the data sheets of consumer MEMS.
 BIAS_SD = 1.0
@@ -20,10 +22,6 @@ BIAS_SD = 1.0
 SCALE_SD = 0.05
 #: Built-in prior sd of an element of the misalignment [rad].
 MISALIGNMENT_SD = 1e-3
-
-
-# Prior sd of a weight that a column does not have, over that of its other weights.
-_ABSENT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -82,9 +80,12 @@ class Windows:
 
     @cached_property
     def share(self) -> Floats:
-        """Prior sd of the weights of each axis over that of their column, shape (3, m)."""
+        """
+        Prior sd of the weights of each axis over that of their column, shape (3, m); 1e-6 for a
+        weight that the column does not have.
+        """
         every = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
-        return np.where(every.T, 1.0, _ABSENT)
+        return np.where(every.T, 1.0, 1e-6)
 
     @property
     def n_sections(self) -> int:
@@ -96,10 +97,26 @@ class Windows:
         """Masks of the columns that may act on the bias and on the scale, shape (2, m)."""
         return np.stack((np.ones_like(self.in_scale), self.in_scale))
 
+    @cached_property
+    def edges(self) -> Ints:
+        """First window of each position, then the number of windows, shape (n_positions + 1,)."""
+        return np.searchsorted(self.position, np.arange(self.n_positions + 1))
+
     @property
     def bag_of_position(self) -> Ints:
         """Bag of each position."""
-        return self.bag[np.searchsorted(self.position, np.arange(self.n_positions))]
+        return self.bag[self.edges[:-1]]
+
+    @property
+    def inner(self) -> Ints:
+        """Windows that two others of their position follow."""
+        return np.flatnonzero(self.position[2:] == self.position[:-2])
+
+    @property
+    def age(self) -> Floats:
+        """Time since the first window of the bag, shape (n,) [s]."""
+        first = np.searchsorted(self.bag, np.arange(int(self.bag[-1]) + 1))
+        return np.asarray(self.time - self.time[first][self.bag])
 
 
 class Noise(NamedTuple):
@@ -117,10 +134,6 @@ class Noise(NamedTuple):
     def rate(self) -> float:
         """Rate of the equivalent random walk at short times over the white sd [1/sqrt(s)]."""
         return math.sqrt(2.0 * self.ratio / self.time_s)
-
-
-#: White noise alone.
-WHITE = Noise()
 
 
 @dataclass(frozen=True)
@@ -170,7 +183,7 @@ class Prior:
     column_sd: Floats
     offset_sd: float
     sigma: Floats
-    noise: Noise = WHITE
+    noise: Noise = field(default_factory=Noise)
     offset_scale: float = 0.0
     tilt_sd: float = 1e-7
     start_share: float = 1.0

@@ -146,6 +146,11 @@ class ThermalWindows:
     tracks: tuple[Track, ...] = ()
 
     @property
+    def is_dynamic(self) -> Bools:
+        """Windows of the dynamic regime, shape (n,)."""
+        return np.asarray(self.weight > 0.5)
+
+    @property
     def was_measured(self) -> bool:
         """Whether the columns depend on a recorded temperature, even a constant one."""
         return self.has_temperature or bool(self.data.columns[:, 0].any())
@@ -154,6 +159,25 @@ class ThermalWindows:
     def has_temperature(self) -> bool:
         """Whether a change of temperature was recorded."""
         return bool(np.ptp(self.temperature) > 0.0)
+
+
+class _Rows(NamedTuple):
+    """
+    The windows of a rest, or of all rests.
+
+    thermal: board temperature [degC], its rate [K/s], weight of the dynamic set, gradient [K], and
+        the columns of the response without powers of t, as in `ThermalWindows`, shape (n, 4 + k)
+    columns, start: as in `Windows`; `start` has the k columns of the response, shape (n, k)
+    angular_rate: [rad/s], shape (n, 3) or (n, 0)
+    """
+
+    time: Floats
+    n_samples: Floats
+    mean: Floats
+    thermal: Floats
+    columns: Floats
+    start: Floats
+    angular_rate: Floats
 
 
 def thermal_windows(
@@ -167,90 +191,129 @@ def thermal_windows(
     reference, where all columns are 0. `tracks`: known thermal states of this detector
     """
     tracks = tracks or [_track(bag, model) for bag in bags]
-    sets, columns, reference = model.sets, model.columns, model.reference_temperature
-    spec = memory_of(columns, model.sensors)
-    table = ColumnTable(columns, spec, reference)
-    parts: list[tuple[Floats, ...]] = []
-    numbers: list[tuple[Ints, Ints]] = []
-    groups = [group for group, _ in sets.levels()]
+    spec = memory_of(model.columns, model.sensors)
+    table = ColumnTable(model.columns, spec, model.reference_temperature)
+    parts: list[_Rows] = []
     rests: list[tuple[ReducedBag, StillInterval]] = []
+    numbers: list[int] = []
     has_rate = all(one.angular_rate is not None for bag in bags for one in bag.intervals)
-    for bag, (reduced, track) in enumerate(zip(bags, tracks, strict=True)):
-        grid, states, is_known = _with_memory(track, spec)
-        for interval in reduced.intervals:
-            use = np.interp(interval.time, grid, is_known, left=0.0) == 1.0
-            if not use.any():
-                continue
-            time, count = interval.time[use], interval.count[use]
-            at = np.array([np.interp(time, grid, column) for column in states.T])
-            board, weight = at[BOARD], at[WEIGHT]
-            raw = table.raw(at)
-            curves = sets.columns(board - reference, weight)
-            factors, _ = table.factors(board, weight)
-            moved = _moved(table, table.slopes(at) * factors, time - grid[0])
-            rows = np.array(
-                [board, at[RATE], weight, at[GRADIENT], *raw, *curves, *(raw * factors), *moved]
-            ).T
-            if has_rate and interval.angular_rate is not None:
-                rows = np.hstack((rows, interval.angular_rate[use]))
-            merged = _merged(time, count, interval.mean[use], rows)
-            n = len(merged[0])
-            parts.append(merged)
-            numbers.append((np.full(n, len(rests)), np.full(n, bag)))
-            rests.append((reduced, interval))
-        if not rests or rests[-1][0] is not reduced:
-            raise FitError(f'{reduced.source.name}: no temperatures during its rests: two clocks?')
-    time, count, mean, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
-    position, bag_of = (np.concatenate(part) for part in zip(*numbers, strict=True))
-    k, m = len(columns), len(groups) + len(columns)
-    moved_at, end = 4 + k + m, 4 + k + m + len(columns)
-    lag = [
-        spec.lags.index(column.lag) if column.lag and column.kind != 'play' else -1
-        for column in columns
-    ]
-    t, gradient = rows[:, 0] - reference, rows[:, 3]
+    for number, (bag, track) in enumerate(zip(bags, tracks, strict=True)):
+        grid, states = _with_memory(track, spec)
+        for interval in bag.intervals:
+            use = np.interp(interval.time, grid, track.is_known, left=0.0) == 1.0
+            if use.any():
+                at = np.array([np.interp(interval.time[use], grid, one) for one in states.T])
+                parts.append(_rows(interval, has_rate, use, at, grid[0], model, table))
+                rests.append((bag, interval))
+                numbers.append(number)
+        if not rests or rests[-1][0] is not bag:
+            raise FitError(f'{bag.source.name}: no temperatures during its rests: two clocks?')
+    sizes = [len(part.time) for part in parts]
+    rows = _Rows(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    position, bag_of = np.repeat(np.arange(len(parts)), sizes), np.repeat(numbers, sizes)
+    temperature, rate, weight, gradient = rows.thermal[:, :4].T
+    return ThermalWindows(
+        *(model, _windows(model, spec, rows, position, bag_of)),
+        *(temperature, rate, weight, gradient),
+        raw=rows.thermal[:, 4:],
+        angular_rate=rows.angular_rate,
+        typical_count=float(np.median(rows.n_samples)),
+        rests=tuple(rests),
+        tracks=tuple(tracks),
+    )
+
+
+def _rows(
+    interval: StillInterval,
+    has_rate: bool,
+    use: Bools,
+    states: Floats,
+    begin_s: float,
+    model: Model,
+    table: ColumnTable,
+) -> _Rows:
+    """
+    Average the windows of a rest that are used to 60 s, or less in a short rest.
+
+    `states`: their thermal states, shape (width, n); `begin_s`: start of the memory [s]
+    """
+    time, count = interval.time[use], interval.count[use]
+    window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)
+    slot = np.floor((time - time[0]) / window_s * (1.0 + 1e-9))
+    first = np.flatnonzero(np.r_[True, np.diff(slot) != 0])
+    total = np.add.reduceat(count, first)
+
+    def averaged(values: Floats) -> Floats:
+        summed = np.add.reduceat(values * count[:, None], first, axis=0)
+        return np.asarray(summed / total[:, None])
+
+    board, weight = states[BOARD], states[WEIGHT]
+    raw, (factors, _) = table.raw(states), table.factors(board, weight)
+    curves = model.sets.columns(board - model.reference_temperature, weight)
+    # Derivative of each column by the initial state of its lag.
+    by_start = np.zeros_like(raw)
+    slopes = table.slopes(states) * factors
+    for k, column in enumerate(table.columns):
+        if has_start(column):
+            by_start[k] = slopes[k] * np.exp(-(time - begin_s) / column.tau_s)
+    return _Rows(
+        averaged(time[:, None])[:, 0],
+        total,
+        averaged(interval.mean[use]),
+        averaged(np.array([board, states[RATE], weight, states[GRADIENT], *raw]).T),
+        averaged(np.array([*curves, *(raw * factors)]).T),
+        averaged(by_start.T),
+        averaged(
+            np.empty((len(time), 0))
+            if not has_rate or interval.angular_rate is None
+            else interval.angular_rate[use]
+        ),
+    )
+
+
+def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: Ints) -> Windows:
+    """Make the data of the regression."""
+    levels, columns = model.sets.levels(), model.columns
+    groups, n_curves = [group for group, _ in levels], len(levels)
+    t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 3]
     # A support tilts with board and case temperature, linearly and with the square of the latter.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    values = rows[:, 4 + k : moved_at]
-    data = Windows(
+    acts_on = model.acts_on
+    return Windows(
         position=position,
-        bag=bag_of,
-        section=_sections(position, time),
-        time=time,
-        weight=count / float(np.median(count)),
-        mean=mean,
-        columns=values,
+        bag=bag,
+        section=_sections(position, rows.time),
+        time=rows.time,
+        weight=rows.n_samples / float(np.median(rows.n_samples)),
+        mean=rows.mean,
+        columns=rows.columns,
         groups=(*groups, *(column.group for column in columns)),
-        lag=np.array([-1] * len(groups) + lag, dtype=np.int64),
-        kelvins=_kelvins(sets, columns, values, rows[:, 4 : 4 + k], t, gradient),
-        start=np.hstack((np.zeros((len(time), len(groups))), rows[:, moved_at:end])),
+        lag=np.array(
+            [-1] * n_curves
+            + [spec.lags.index(one.lag) if has_start(one) else -1 for one in columns],
+            dtype=np.int64,
+        ),
+        kelvins=_kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient),
+        start=np.hstack((np.zeros((len(t), n_curves)), rows.start)),
         start_covariance=start_covariance(spec.lags),
         # Fc = 1 at the reference temperature in both regimes, so the scale has no level term.
         # Hysteresis and bends of the scale are not modelled.
         in_scale=np.array(
-            [not (group == SET and is_level) for group, is_level in sets.levels()]
+            [not (group == SET and is_level) for group, is_level in levels]
             + [column.kind not in ('play', 'bend') for column in columns]
         ),
         tilt=tilt[:, is_tilting] / tilt_rms[is_tilting],
         acts_on=None
-        if model.acts_on is None
-        else np.vstack((np.ones((len(groups), 3), dtype=bool), model.acts_on)),
+        if acts_on is None
+        else np.vstack((np.ones((n_curves, 3), dtype=bool), acts_on)),
     )
-    return ThermalWindows(
-        model,
-        data,
-        temperature=rows[:, 0],
-        rate=rows[:, 1],
-        weight=rows[:, 2],
-        gradient=rows[:, 3],
-        raw=rows[:, 4 : 4 + k],
-        angular_rate=rows[:, end:],
-        typical_count=float(np.median(count)),
-        rests=tuple(rests),
-        tracks=tuple(tracks),
-    )
+
+
+def has_start(column: Column) -> bool:
+    """Whether a column depends on the unknown initial state of a lag."""
+    return column.lag is not None and column.kind != 'play'
 
 
 def _sections(position: Ints, time: Floats) -> Ints:
@@ -262,9 +325,7 @@ def _sections(position: Ints, time: Floats) -> Ints:
     return np.asarray(np.minimum((part * N_SECTIONS).astype(np.int64), N_SECTIONS - 1))
 
 
-def _kelvins(
-    sets: Sets, columns: Sequence[Column], values: Floats, raw: Floats, t: Floats, gradient: Floats
-) -> Floats:
+def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Floats) -> Floats:
     """
     Return the temperature change that corresponds to the RMS of each column [K], shape (m,): the
     RMS over the largest slope of the column in these data; 0 for a column that is constant.
@@ -272,13 +333,13 @@ def _kelvins(
     farthest = float(np.abs(t).max(initial=0.0))
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
     grid = np.linspace(float(t.min()), float(t.max()) + 1e-9, 100)
-    curves = sets.columns(grid, np.full_like(grid, 0.5))
+    curves = model.sets.columns(grid, np.full_like(grid, 0.5))
     slopes = [float(np.abs(np.gradient(one, grid)).max()) for one in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
     # The level of the dynamic set corresponds to the RMS gradient, which also differs in ramps.
-    levels = [is_level for _, is_level in sets.levels()]
-    steepest = [1.0 / flow if lev else one for lev, one in zip(levels, slopes, strict=True)]
-    for column, series in zip(columns, raw.T, strict=True):
+    levels = zip(model.sets.levels(), slopes, strict=True)
+    steepest = [1.0 / flow if is_level else slope for (_, is_level), slope in levels]
+    for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.steepest(series, flow) * farthest**column.power)
     slope = np.array(steepest)
     return np.where(slope > 0.0, rms / np.where(slope > 0.0, slope, 1.0), 0.0)
@@ -305,37 +366,11 @@ def _track(bag: ReducedBag, model: Model) -> Track:
     return Track(start_s, step_s, states, is_known)
 
 
-def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats, Bools]:
-    """Return a time grid [s], the states on it with their lags, and which of them are known."""
+def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats]:
+    """Return a time grid [s], and the states on it with their lags."""
     states = track.states
     grid = np.asarray(track.start_s + track.step_s * np.arange(len(states)), dtype=np.float64)
     # The lags are evaluated on the whole grid at once, which is much faster than at each reading.
     gradients = [states[:, GRADIENT + 2 * k] for k in range(len(spec.sensors))]
     memory = memory_on_grid(spec, track.step_s, states[:, BOARD], gradients)
-    return grid, np.hstack((states, memory)), track.is_known
-
-
-def _moved(table: ColumnTable, slopes: Floats, age_s: Floats) -> Floats:
-    """Return the derivative of each column by the initial state of its lag, shape (k, n)."""
-    result = np.zeros_like(slopes)
-    for k, column in enumerate(table.columns):
-        if column.lag and column.kind != 'play':
-            _, tau = column.lag
-            result[k] = slopes[k] * np.exp(-age_s / tau)
-    return result
-
-
-def _merged(
-    time: Floats, count: Floats, mean: Floats, rows: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Average neighbouring windows to 60 s, or less in a short rest, weighted by their counts."""
-    window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)
-    slot = np.floor((time - time[0]) / window_s * (1.0 + 1e-9))
-    first = np.flatnonzero(np.r_[True, np.diff(slot) != 0])
-    total = np.add.reduceat(count, first)
-
-    def averaged(values: Floats) -> Floats:
-        summed = np.add.reduceat(values * count[:, None], first, axis=0)
-        return np.asarray(summed / total[:, None])
-
-    return averaged(time[:, None])[:, 0], total, averaged(mean), averaged(rows)
+    return grid, np.hstack((states, memory))

@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the change of the log evidence if columns leave a fit or join it.
+
+References
+----------
+.. [1] J. M. Dickey, The weighted likelihood ratio, linear hypotheses on normal location
+   parameters, Annals of Mathematical Statistics 42 (1971).
+.. [2] M. E. Tipping, A. C. Faul, Fast marginal likelihood maximisation for sparse Bayesian models,
+   AISTATS 2003.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..typing import Bools, Floats, Ints
+
+# Grid of the square of a common factor of the columns' prior sd: the gain is that at the best one.
+_SQUARES = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
+
+
+def log_bayes_factors(mode: Floats, covariance: Floats, places: Ints, prior_sd: Floats) -> Floats:
+    """
+    Return the loss of log evidence if some weights are set to 0 (Savage-Dickey ratio, [1]_).
+
+    `places`, `prior_sd`: places and prior sd of the weights of each of n cases, shape (n, k)
+    """
+    means = mode[places]
+    blocks = covariance[places[:, :, None], places[:, None, :]]
+    root = np.sqrt(np.einsum('nii->ni', blocks))
+    values, vectors = np.linalg.eigh(blocks / (root[:, :, None] * root[:, None, :]))
+    values = np.maximum(values, 1e-12)
+    along = np.einsum('nij,ni->nj', vectors, means / root)
+    determinant = np.log(values).sum(axis=1) + 2.0 * np.log(root).sum(axis=1)
+    square = np.sum(along**2 / values, axis=1)
+    return np.asarray(0.5 * (square + determinant) - np.log(prior_sd).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class Inactive:
+    """
+    Sparsity and quality factors of inactive columns, given the active ones [2]_.
+
+    part, column: part (0: bias, 1: scale) and column of each of k cases, shape (k,)
+    S: sparsity factor, information about their weights, shape (3 k, 3 k), in the order case, axis
+    Q: quality factor, gradient by their weights, shape (3 k,)
+    """
+
+    part: Ints
+    column: Ints
+    S: Floats
+    Q: Floats
+
+    def _in_prior_sd(self, column_sd: Floats, wanted: Bools) -> tuple[Floats, Floats, Ints]:
+        """Return S and Q of the wanted weights in units of their prior sd, and their columns."""
+        sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
+        at = np.flatnonzero(sd > 0.0)
+        S = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at])
+        return S, self.Q[at] * sd[at], np.repeat(self.column, 3)[at]
+
+    def gain(self, column_sd: Floats, wanted: Bools) -> float:
+        """
+        Return the gain in log evidence by the `wanted` columns, shape (m,).
+
+        It is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, S and q in units of the columns' prior sd,
+        shape (2, m), at the best common factor of this sd.
+        """
+        S, Q, _ = self._in_prior_sd(column_sd, wanted)
+        S, along = np.linalg.eigh(S)
+        s, q2 = _SQUARES * np.maximum(S, 0.0), _SQUARES * (along.T @ Q) ** 2
+        return 0.5 * float((q2 / (1.0 + s) - np.log1p(s)).sum(axis=1).max(initial=0.0))
+
+    def chosen(self, column_sd: Floats, wanted: Bools, least: float, most: int) -> Bools:
+        """
+        Choose `most` of the wanted columns at most, by forward selection, shape (m,).
+
+        The next column is that with the largest gain in log evidence given those chosen before;
+        the selection ends when this gain is below `least`.
+        """
+        S, Q, column = self._in_prior_sd(column_sd, wanted)
+        result = np.zeros_like(wanted)
+        for _ in range(most if len(Q) else 0):
+            s, q2 = _SQUARES * np.maximum(np.diag(S), 0.0), _SQUARES * Q**2
+            each = np.zeros((len(_SQUARES), len(wanted)))
+            np.add.at(each.T, column, 0.5 * (q2 / (1.0 + s) - np.log1p(s)).T)
+            factor, best = np.unravel_index(int(np.argmax(each)), each.shape)
+            if each[factor, best] < least:
+                break
+            result[best] = True
+            at = np.flatnonzero(column == best)
+            block = S[np.ix_(at, at)] + np.eye(len(at)) / _SQUARES[factor]
+            solved = np.linalg.solve(block, np.column_stack((S[at], Q[at])))
+            S, Q = S - S[:, at] @ solved[:, :-1], Q - S[:, at] @ solved[:, -1]
+            S[at], S[:, at], Q[at] = 0.0, 0.0, 0.0
+        return result
