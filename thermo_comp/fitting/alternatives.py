@@ -52,8 +52,8 @@ def model_of(
         # columns are combinations of those of the board.
         columns = tuple(column for column in columns if not column.is_of_sensor)
     if options.groups is not None:
-        asked = {*options.groups, *options.forced}
-        columns = tuple(column for column in columns if column.group in asked)
+        groups = {*options.groups, *options.forced}
+        columns = tuple(column for column in columns if column.group in groups)
     sets = sets_of(options, bags)
     return Model(options.model, sets, columns, sensors, detector, reference, part_taus)
 
@@ -128,5 +128,8 @@ def _may_have_sets(selected: Selected) -> bool:
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
     """Return the thermometers that all bags have, without the board's; the case is first."""
-    seen = ({name for name, one in bag.temperatures.items() if len(one.value)} for bag in bags)
+    seen = (
+        {name for name, readings in bag.temperatures.items() if len(readings.value)}
+        for bag in bags
+    )
     return 'case', *sorted(set.intersection(*seen) - {'board', 'case'})

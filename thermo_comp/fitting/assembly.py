@@ -198,11 +198,11 @@ def parameters_of(calibration: Calibration) -> Floats:
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):
-        for one in sets:
-            values += [reference.bias + one.delta, *one.bias_function.free_coefficients]
+        for curves in sets:
+            values += [reference.bias + curves.delta, *curves.bias_function.free_coefficients]
         values += [term.bias[axis] for term in calibration.response]
-        for one in sets:
-            values += [0.0, *one.scale_function.free_coefficients]
+        for curves in sets:
+            values += [0.0, *curves.scale_function.free_coefficients]
         values += [term.scale[axis] for term in calibration.response]
     terms = calibration.nonlinearity.terms if calibration.nonlinearity else ()
     for axis in range(3):
@@ -225,28 +225,30 @@ def with_parameters(
     for k, regime in enumerate(calibration.regime_sets()):
         x, y, z = (
             replace(
-                own,
-                bias_function=own.bias_function.with_free(
+                axis,
+                bias_function=axis.bias_function.with_free(
                     _numbers(values[bias[k] + 1 : bias[k + 1]]), 0.0
                 ),
-                scale_function=own.scale_function.with_free(
+                scale_function=axis.scale_function.with_free(
                     _numbers(values[scale[k] + 1 : scale[k + 1]]), 1.0
                 ),
                 delta=float(values[bias[k]] - values[bias.static]),
             )
-            for own, bias, scale in zip(regime.axes(), layout.bias, layout.scale, strict=True)
+            for axis, bias, scale in zip(regime.axes(), layout.bias, layout.scale, strict=True)
         )
         regimes.append(replace(regime, x=x, y=y, z=z))
     a, b, c = _triple(values[-3:])
-    biases, scales = (np.array([one.response for one in part]) for part in layout[:2])
+    biases, scales = (np.array([block.response for block in part]) for part in layout[:2])
     nonlinearity = calibration.nonlinearity
     if nonlinearity is not None:
         each = values[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
         nonlinearity = replace(
             nonlinearity,
             terms=tuple(
-                replace(one, coefficient=_triple(each[:, 0, k]), per_kelvin=_triple(each[:, 1, k]))
-                for k, one in enumerate(nonlinearity.terms)
+                replace(
+                    term, coefficient=_triple(each[:, 0, k]), per_kelvin=_triple(each[:, 1, k])
+                )
+                for k, term in enumerate(nonlinearity.terms)
             ),
         )
     return replace(

@@ -185,8 +185,8 @@ def _candidates(
     """Return the columns that may take part, with the typical and largest sd of their weights."""
     data = windows.data
     groups = np.array(data.groups)
-    asked = {*data.groups} if options.groups is None else {*options.groups, *options.forced}
-    may = np.isin(groups, list(asked)) & (data.kelvins > 0.0)
+    allowed = {*data.groups} if options.groups is None else {*options.groups, *options.forced}
+    may = np.isin(groups, list(allowed)) & (data.kelvins > 0.0)
     may &= windows.has_temperature
     parts = np.stack((may, may & data.in_scale))
     within = within_positions(data.mean / start.scale, data.position)
@@ -213,7 +213,9 @@ def _candidates(
     if options.model == 'golovach':
         # The paper's sets are not selected: their prior, ten times the largest sd, is flat.
         slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
-    typical, largest = (np.outer(one, data.kelvins) * parts for one in (slopes, STEEPEST))
+    typical, largest = (
+        np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, STEEPEST)
+    )
     if not windows.was_measured:
         # Without a thermometer the slope is unknown: its whole prior goes into the covariance.
         typical[:, 0] = largest[:, 0] = STEEPEST

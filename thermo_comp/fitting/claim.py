@@ -114,9 +114,9 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(seen, 1e-300))
     for group in LAGS:
         # The lags of a group share one prior variance: their sum is bounded by that of one lag.
-        own = np.isin(groups, group) & (sd > 0.0)
-        share = np.sqrt(np.maximum(own.sum(axis=1, keepdims=True), 1))
-        sd = np.where(own, np.minimum(sd, typical / share), sd)
+        is_lag = np.isin(groups, group) & (sd > 0.0)
+        share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
+        sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
     kelvins = regression.windows.kelvins
     # A column is called still if it moved by less than 1 % of the change of temperature.
@@ -147,9 +147,9 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     n = posterior.layout.n_unit
     here = as_vector(posterior.state, posterior.layout)[:n]
     covariance = np.zeros((n, n))
-    for share, one in zip(weight, fits, strict=True):
-        away = as_vector(one.state, one.layout)[:n] - here
-        covariance += share * (one.covariance + np.outer(away, away))
+    for share, fit in zip(weight, fits, strict=True):
+        away = as_vector(fit.state, fit.layout)[:n] - here
+        covariance += share * (fit.covariance + np.outer(away, away))
     return covariance, float(np.sqrt(weight @ tried**2))
 
 
@@ -179,8 +179,8 @@ def drift_variance(
     """Return the variance of the drift of each window by a covariance of the unit, (n, 3)."""
     in_bias, in_scale = (np.flatnonzero(mask) for mask in layout.used)
     on_bias, on_scale = (
-        within_positions(regression.columns[:, one], regression.windows.position)
-        for one in (in_bias, in_scale)
+        within_positions(regression.columns[:, column], regression.windows.position)
+        for column in (in_bias, in_scale)
     )
     force = regression.along_axes(state)
     result = np.zeros((len(on_bias), 3))
@@ -211,4 +211,4 @@ def _points(
         celsius = float(temperature[part].mean())
         if not points or celsius > points[-1].temperature_c:
             points.append(LackOfFit(celsius, (x, y, z)))
-    return tuple(points) if any(any(one.sd_m_s2) for one in points) else ()
+    return tuple(points) if any(any(point.sd_m_s2) for point in points) else ()

@@ -147,7 +147,7 @@ def best_rests(candidates: list[Floats]) -> int:
     better by 2 %, or if no set has six attitudes.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
-    enough = [len(distinct_directions(one)) for one in ups]
+    enough = [len(distinct_directions(up)) for up in ups]
     n_most = max(enough, default=0)
     costs = np.full(len(candidates), np.inf)
     for number, means in enumerate(candidates):
@@ -220,11 +220,11 @@ def spoken_direction(up: Floats) -> str:
     """Describe an attitude for a user: the axes that point up, and the readings in g."""
     signs = [f'{"-" if value < 0.0 else "+"}{name}' for name, value in zip('xyz', up, strict=True)]
     size = np.abs(up)
-    axes = [sign for sign, one in zip(signs, size, strict=True) if one > 0.1]
+    axes = [sign for sign, share in zip(signs, size, strict=True) if share > 0.1]
     reading = ', '.join(f'{name} {value:+.2f} g' for name, value in zip('xyz', up, strict=True))
-    said = ' and '.join(filter(None, (', '.join(axes[:-1]), axes[-1])))
+    names = ' and '.join(filter(None, (', '.join(axes[:-1]), axes[-1])))
     how = ' in part' if np.ptp(size[size > 0.1]) > 0.1 else ' alike' if len(axes) > 1 else ''
-    return f'{said} up{how}: {reading}'
+    return f'{names} up{how}: {reading}'
 
 
 def _cube() -> Floats:

@@ -126,10 +126,10 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
     jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
     if jumps:
         per_mg = 1e-3 * (STANDARD_GRAVITY if options.input == 'm/s^2' else size)
-        said = '; '.join(
+        jumped = '; '.join(
             f'{bag.source.name}: {describe(event, per_mg, bag.since_s)}' for bag, event in jumps
         )
-        text = f'{said}: leave out such a bag, or end before it with --to'
+        text = f'{jumped}: leave out such a bag, or end before it with --to'
         yield Finding('jump', 'refusal', text)
     if not all(bag.angular_rate == bags[0].angular_rate != 'part' for bag in bags):
         names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
@@ -139,14 +139,16 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
 
 def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[str]:
     """Describe axes that are constant throughout a rest, but not in most of the rests."""
-    rests = [(bag.source.name, one) for bag in bags for one in bag.intervals]
-    alive = np.array([one.sample_sd > 0.0 for _, one in rests])
-    for (name, one), row in zip(rests, alive, strict=True):
-        is_dead = ~row & (2 * alive.sum(axis=0) >= len(rests)) & (np.ptp(one.mean, axis=0) == 0.0)
+    rests = [(bag.source.name, rest) for bag in bags for rest in bag.intervals]
+    alive = np.array([rest.sample_sd > 0.0 for _, rest in rests])
+    usual = 2 * alive.sum(axis=0) >= len(rests)
+    for (name, rest), is_alive in zip(rests, alive, strict=True):
+        is_dead = ~is_alive & usual & (np.ptp(rest.mean, axis=0) == 0.0)
         # A working axis shows noise or drift within a thousand samples.
-        for axis in np.flatnonzero(is_dead & (one.count.sum() >= 1000)):
-            hours = (one.end_ns - one.start_ns) / 3600e9
-            yield f'{name}: {"xyz"[axis]} reads {one.mean[0, axis]:g} to the bit for {hours:.2g} h'
+        for axis in np.flatnonzero(is_dead & (rest.count.sum() >= 1000)):
+            hours = (rest.end_ns - rest.start_ns) / 3600e9
+            letter, value = 'xyz'[axis], rest.mean[0, axis]
+            yield f'{name}: {letter} reads {value:g} to the bit for {hours:.2g} h'
 
 
 def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
@@ -180,10 +182,10 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
         text = 'no temperature was recorded: the calibration holds at the temperature of the test'
         yield _advice('temperature', text)
         return
-    found = {id(bag): bag for bag, _ in windows.rests}.values()
-    n_still = sum(one.count.sum() for bag in found for one in bag.intervals)
+    used_bags = {id(bag): bag for bag, _ in windows.rests}.values()
+    n_still = sum(interval.count.sum() for bag in used_bags for interval in bag.intervals)
     part = 1.0 - windows.data.weight.sum() * windows.typical_count / max(n_still, 1.0)
-    if found and part > 0.1:
+    if used_bags and part > 0.1:
         yield _advice(
             'unmeasured',
             f'{100.0 * part:.0f} % of the time at rest has no temperatures and is left out: do '

@@ -43,7 +43,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
         except np.linalg.LinAlgError:
             if matrix.ndim > 2:
                 # Only the matrices that need more jitter get it.
-                return np.stack([factored(*one) for one in zip(matrix, square, strict=True)])
+                return np.stack([factored(*pair) for pair in zip(matrix, square, strict=True)])
             if jitter == jitters[-1]:
                 raise
         else:
@@ -135,7 +135,7 @@ class Reduced:
     def log_determinant(self) -> float:
         """Sum of the log determinants of all blocks."""
         blocks = [self.positions, self.bags, *([self.common] if self.common else [])]
-        return sum(one.log_determinant for one in blocks)
+        return sum(block.log_determinant for block in blocks)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
         """Add the prior on the sum of the initial lag states, now `total`, about 0."""
@@ -151,9 +151,9 @@ class Reduced:
         if self.common is not None:
             excess = self.common.solved[0, :, -1] - self.common.solved[0, :, :-1] @ step
             starts -= self.bags.inverse @ excess
-        own = solved[..., -1] - solved[..., r:-1] @ step
-        own -= np.einsum('pkr,pr->pk', solved[..., :r], starts[self.layout.bag])
-        return own, starts
+        positions = solved[..., -1] - solved[..., r:-1] @ step
+        positions -= np.einsum('pkr,pr->pk', solved[..., :r], starts[self.layout.bag])
+        return positions, starts
 
     def variances(self, root: Floats) -> tuple[Floats, Floats]:
         """
@@ -164,9 +164,9 @@ class Reduced:
         by_unit, by_starts = self.bags.solved[..., :-1], solved[..., :r]
         starts = np.sum(self.bags.root**2, axis=1) + _variance(by_unit, root)
         of_starts = by_starts @ np.swapaxes(self.bags.root[bag], 1, 2)
-        own = np.sum(self.positions.root**2, axis=1) + np.sum(of_starts**2, axis=2)
-        own += _variance(solved[..., r:-1] - by_starts @ by_unit[bag], root)
-        return own, starts
+        positions = np.sum(self.positions.root**2, axis=1) + np.sum(of_starts**2, axis=2)
+        positions += _variance(solved[..., r:-1] - by_starts @ by_unit[bag], root)
+        return positions, starts
 
     @cached_property
     def _rest(self) -> Blocks:
@@ -175,11 +175,11 @@ class Reduced:
         others = (bag[:, None] == bag) - np.eye(len(bag))
         return _of_bags(others, self.shares, self.starts_prior[:, bag])
 
-    def without(self, p: int, own: Normal) -> Floats:
-        """Return `whole` without a position, given the normal equations of this position."""
+    def without(self, p: int, normal: Normal) -> Floats:
+        """Return `whole` without a position, given its normal equations."""
         turned = self.positions.turned[p, :, len(self.bags.root[0]) :]
         before, after = self.bags.turned[self.layout.bag[p]], self._rest.turned[p]
-        gone = _of_unit(own.unit, self.layout) - turned.T @ turned
+        gone = _of_unit(normal.unit, self.layout) - turned.T @ turned
         return np.asarray(self.whole - gone + before.T @ before - after.T @ after)
 
     def beside(self, rows: Floats) -> tuple[Floats, Floats]:
@@ -201,12 +201,12 @@ class Reduced:
             local[..., axis][:, at[:n_local]] = each[:, :n_local]
             unit[layout.unit[axis], :, axis] = each[:, n_local:].sum(axis=0)
         local = local.reshape(n_positions, n_own + r, 3 * m)
-        own = self.positions.root @ local[:, :n_own]
-        starts = local[:, n_own:] - np.swapaxes(turned[..., :r], 1, 2) @ own
+        of_positions = self.positions.root @ local[:, :n_own]
+        starts = local[:, n_own:] - np.swapaxes(turned[..., :r], 1, 2) @ of_positions
         of_bags = self.bags.root @ np.tensordot(_membership(layout), starts, 1)
         cross = unit.reshape(-1, 3 * m)
-        cross -= _summed(turned[..., r:], own) + _summed(self.bags.turned, of_bags)
-        return _square(own, of_bags), cross
+        cross -= _summed(turned[..., r:], of_positions) + _summed(self.bags.turned, of_bags)
+        return _square(of_positions, of_bags), cross
 
 
 def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -> Reduced:
@@ -249,8 +249,8 @@ def _membership(layout: Layout) -> Floats:
 def _of_unit(normal: Floats, layout: Layout) -> Floats:
     """Arrange the equations of the unit's unknowns of each axis, shape (3, k, k)."""
     result = np.zeros((layout.n_unit + 1, layout.n_unit + 1))
-    for own, at in zip(normal, layout.unit, strict=True):
-        result[at[:, None], at] += own
+    for equations, at in zip(normal, layout.unit, strict=True):
+        result[at[:, None], at] += equations
     return result
 
 
@@ -275,7 +275,7 @@ def _variance(derivatives: Floats, root: Floats) -> Floats:
 
 def _square(*turned: Floats) -> Floats:
     """Return what the elimination of blocks subtracts from the remaining equations, (k, k)."""
-    rows = np.concatenate([one.reshape(-1, one.shape[2]) for one in turned])
+    rows = np.concatenate([block.reshape(-1, block.shape[2]) for block in turned])
     return np.asarray(rows.T @ rows)
 
 

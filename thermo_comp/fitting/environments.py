@@ -103,7 +103,7 @@ def bags_contradicting_prior(
     drift = within_positions(regression.residual(fitted.state, fitted.layout), data.position)
     inverse = np.linalg.inv(first.root)
     claimed = drift_variance(regression, state, fitted.layout, inverse @ inverse.T)
-    lacks = [point.sd_m_s2 for one in known.regime_sets() for point in one.lack_of_fit]
+    lacks = [point.sd_m_s2 for regime in known.regime_sets() for point in regime.lack_of_fit]
     lack = np.square(lacks).max(axis=0) if lacks else np.zeros(3)
     ratio = np.sum(drift**2, axis=1) / np.sum(claimed + prior.sigma**2 + lack, axis=1)
     mean = np.bincount(data.bag, ratio) / np.maximum(np.bincount(data.bag), 1)

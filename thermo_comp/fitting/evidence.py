@@ -96,8 +96,8 @@ def tables_of(
 ) -> list[dict[str, ResidualStatistics]]:
     """Return the statistics by regime of some residuals, shape (n,), where they are known."""
     return [
-        statistics_by_regime(one[np.isfinite(one)], is_dynamic[np.isfinite(one)])
-        for one in residuals
+        statistics_by_regime(values[np.isfinite(values)], is_dynamic[np.isfinite(values)])
+        for values in residuals
     ]
 
 

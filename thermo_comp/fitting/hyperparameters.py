@@ -204,7 +204,7 @@ def with_slow_noise(
             )
             if regression.whitener.shows(time_s * by_time)
         ]
-        nearby = max(around, key=lambda one: one.log_evidence)
+        nearby = max(around, key=lambda posterior: posterior.log_evidence)
         if nearby.log_evidence > best.log_evidence:
             best = nearby
         else:

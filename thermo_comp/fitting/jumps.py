@@ -80,8 +80,8 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     wider = _near(bag, [gaps[place] for place in slow], [margins[place] for place in slow])
     for place, part in zip(slow, wider, strict=True):
         near[place] = part
-    found = (_examine(part, gap, quiet_sd, bag) for part, gap in zip(near, gaps, strict=True))
-    return tuple(jump for jump in found if jump is not None)
+    jumps = (_examine(part, gap, quiet_sd, bag) for part, gap in zip(near, gaps, strict=True))
+    return tuple(jump for jump in jumps if jump is not None)
 
 
 def _near(
@@ -141,7 +141,7 @@ def _examine(
         return None
     sides = accel[:at], accel[at:]
     # The noise is estimated from differences of neighbours, which do not depend on a drift.
-    spread = np.sqrt(0.25 * sum(np.mean(np.diff(one, axis=0) ** 2, axis=0) for one in sides))
+    spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
     along = float(np.linalg.norm(middle + 0.5 * step) - np.linalg.norm(middle - 0.5 * step))

@@ -84,9 +84,9 @@ class KnownForce:
         """Return |f| of a rest, given its stamps and the stamp of the bag's first sample."""
         if self.stamp_ns is None or self.rate is None:
             middle_s = (0.5 * (start_ns + end_ns) - first_ns) * 1e-9
-            for one in self.sections:
-                if one.begin_s <= middle_s < one.end_s:
-                    return Magnitude(one.size, sd=one.sd)
+            for section in self.sections:
+                if section.begin_s <= middle_s < section.end_s:
+                    return Magnitude(section.size, sd=section.sd)
             return Magnitude(None)
         inside = (self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns)
         n, needed = int(inside.sum()), 3  # fewer readings give no standard error of their mean
@@ -157,7 +157,8 @@ def parse_sections(text: str) -> tuple[Section, ...]:
     sample and m/s^2. A semicolon also ends a line; a # begins a comment.
     """
     lines = [
-        one.split('#')[0].replace(',', ' ').split() for one in text.replace(';', '\n').split('\n')
+        line.split('#')[0].replace(',', ' ').split()
+        for line in text.replace(';', '\n').split('\n')
     ]
     rows = [_numbers(line) for line in lines if line]
     if len(rows) == 1 and len(rows[0]) < 3:
@@ -208,7 +209,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
             mine.append(line)
         elif fnmatch(path.name, first):
             mine.append(rest)
-    if not any(one.split('#')[0].strip() for one in mine):
+    if not any(line.split('#')[0].strip() for line in mine):
         return ()
     try:
         return parse_sections('\n'.join(mine))

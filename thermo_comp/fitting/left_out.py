@@ -78,7 +78,7 @@ class Folds:
         n = int(known.sum())
         if not n:
             return None
-        before, after = ((one.square * one.windows)[known] + 1e-300 for one in (self, other))
+        before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         whole = float(np.log(before.sum() / after.sum()))
         if n == 1:
             # One fold has no scatter.
@@ -89,7 +89,7 @@ class Folds:
         estimates = [(whole, spread), (float(each.mean()), float(each.std(ddof=1) / np.sqrt(n)))]
         if estimates[0][0] * estimates[1][0] < 0.0:
             return 0.0, max(error for _, error in estimates)
-        return max(estimates, key=lambda one: abs(one[0]) / max(one[1], 1e-12))
+        return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Score:
     @property
     def rms(self) -> float:
         """RMS of the left-out drift: the larger of that of positions and of sections."""
-        known = [one.rms for one in (self.positions, self.sections) if np.isfinite(one.rms)]
+        known = [folds.rms for folds in (self.positions, self.sections) if np.isfinite(folds.rms)]
         return max(known, default=float('nan'))
 
 
@@ -141,7 +141,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     positions decide with a gain of two standard errors.
     """
     positions, sections, norms = _gains(before, after)
-    drift = [one for one in (positions, sections) if one]
+    drift = [gain for gain in (positions, sections) if gain]
     # The RMS error of halves may rise by a quarter, as two folds scatter by that.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
@@ -158,12 +158,12 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 def is_undecided(before: Score, after: Score) -> bool:
     """Whether left-out data do not decide: equal drifts, and no norms scored in both models."""
     *drift, norms = _gains(before, after)
-    return norms is None and all(abs(one[0]) < _EQUAL for one in drift if one)
+    return norms is None and all(abs(gain[0]) < _EQUAL for gain in drift if gain)
 
 
 def is_near(chosen: Score, other: Score) -> bool:
     """Whether a model is at most one standard error worse than the chosen one."""
-    gains = [one for one in _gains(chosen, other) if one]
+    gains = [gain for gain in _gains(chosen, other) if gain]
     return bool(gains) and all(gain > -error for gain, error in gains)
 
 

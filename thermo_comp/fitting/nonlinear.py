@@ -125,7 +125,7 @@ def with_forces(
     if is_usual and prior is None and options.k2_sd is None and options.k3_sd is None:
         return windows
     rotating = [bag.source.force for bag in bags if bag.source.force and bag.source.force.radius]
-    radii = {(one.radius, one.radius_sd) for one in rotating}
+    radii = {(force.radius, force.radius_sd) for force in rotating}
     if len(radii) > 1:
         raise FitError(f'the bags state different radii: {sorted(radii)}')
     radius, radius_sd = next(iter(radii), (1.0, 0.0))
@@ -227,8 +227,8 @@ def choose(
             used -= per_kelvin
     posterior, score = fits.posterior(used), fits.score(used)
     trials = tuple(
-        replace(one, posterior=posterior, score=score) if one.is_chosen else one
-        for one in selected.trials
+        replace(trial, posterior=posterior, score=score) if trial.is_chosen else trial
+        for trial in selected.trials
     )
     terms = []
     for at, of_term in evidence.items():
@@ -305,9 +305,9 @@ def judge_terms(calibration: Calibration) -> list[Finding]:
     if nonlinearity is None:
         return []
     open_ones = [
-        f'{one.kind} (effective parameters {one.effective_parameters:.1f} of 6)'
-        for one in nonlinearity.terms
-        if one.effective_parameters < 3.0 * _DETERMINED
+        f'{term.kind} (effective parameters {term.effective_parameters:.1f} of 6)'
+        for term in nonlinearity.terms
+        if term.effective_parameters < 3.0 * _DETERMINED
     ]
     if not open_ones:
         return []

@@ -40,7 +40,11 @@ _POLYNOMIALS = _CURVES[:3]
 #: Groups of columns that the fit selects: the curve, the difference of the two sets, the response.
 GROUPS = tuple(
     dict.fromkeys(
-        ('curve', 'set', *(one.group for one in bank(at_rest={'case': 1.0}, span_k=(-9.0, 9.0))))
+        (
+            'curve',
+            'set',
+            *(column.group for column in bank(at_rest={'case': 1.0}, span_k=(-9.0, 9.0))),
+        )
     )
 )
 #: Names of the refusals that a user can allow.

@@ -48,22 +48,22 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     Returns None if curves of one part per axis do not explain the drift or do not determine a lag.
     """
     data, columns = windows.data, windows.model.columns
-    lags = [k for k, one in enumerate(columns) if one.group == 'board']
+    lags = [k for k, column in enumerate(columns) if column.group == 'board']
     if not lags or not windows.has_temperature:
         return None
     curves = _PartCurves(windows, start, lags)
-    found = [curves.time_constant(axis) for axis in range(3)]
-    if not all(curves.is_determined(tau, axis) for axis, tau in enumerate(found)):
+    taus = [curves.time_constant(axis) for axis in range(3)]
+    if not all(curves.is_determined(tau, axis) for axis, tau in enumerate(taus)):
         return None
-    residual = np.column_stack([curves.residual(tau, axis) for axis, tau in enumerate(found)])
+    residual = np.column_stack([curves.residual(tau, axis) for axis, tau in enumerate(taus)])
     factors = undisturbed(residual, data.weight, data.position)
     square = np.average(residual**2, axis=0, weights=data.weight * factors)
     # An RMS residual up to 1.5 times the white noise is noise alone. With a larger one the lags
     # must explain most, 7/8 of the RMS without them: slow noise or another effect remains.
     is_at_noise = (square <= (1.5 * white_noise_of(data, start.scale)) ** 2).all()
-    if not is_at_noise and min(map(curves.reduction, found, range(3))) < 8.0:
+    if not is_at_noise and min(map(curves.reduction, taus, range(3))) < 8.0:
         return None
-    x, y, z = (round(float(tau), 1) for tau in found)
+    x, y, z = (round(float(tau), 1) for tau in taus)
     return Parts((x, y, z), factors)
 
 

@@ -56,7 +56,7 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
 
 def prior_model(calibration: Calibration) -> Model:
     """Return the model of a calibration, with one curve for each regime."""
-    static, dynamic = (one.x.bias_function for one in calibration.regime_sets())
+    static, dynamic = (regime.x.bias_function for regime in calibration.regime_sets())
     return Model(
         name=calibration.provenance.model,
         sets=Sets(static, dynamic, is_shared=False),
@@ -82,7 +82,7 @@ def with_calibration(calibration: Calibration, regression: Regression, state: St
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError('the curves of the prior differ from axis to axis, or from bias to scale')
     # Per axis: the level of the static set, then the other coefficients relative to this level.
-    both = np.array([[values[one.static : one.end] for one in part] for part in layout[:2]])
+    both = np.array([[values[block.static : block.end] for block in part] for part in layout[:2]])
     both[..., layout.bias[0].dynamic] -= both[..., 0]
     both[0] /= regression.nominal_scale[:, None]
     return replace(state, bias=both[0, :, 0], weights=both[..., 1:] * regression.rms)
@@ -162,30 +162,30 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     serials = {calibration.unit.serial for calibration in calibrations}
     if len(serials) < len(calibrations):
         raise FitError('two of the calibrations are of one unit: a population needs one of each')
-    for one in calibrations:
-        alike = (one.unit.input, one.reference_temperature_c, one.sensors)
+    for calibration in calibrations:
+        serial, unit = calibration.unit.serial, calibration.unit
+        alike = (unit.input, calibration.reference_temperature_c, calibration.sensors)
         if alike != (first.unit.input, first.reference_temperature_c, first.sensors):
             raise FitError(
-                f'{one.unit.serial} differs from {first.unit.serial} in its input, reference '
-                'temperature or sensors: they are not of one type'
+                f'{serial} differs from {first.unit.serial} in its input, reference temperature '
+                'or sensors: they are not of one type'
             )
-        if _shape(one) != _shape(first):
+        if _shape(calibration) != _shape(first):
             raise FitError(
-                f'{one.unit.serial} has other curves than {first.unit.serial}: fit both with the '
-                'same model'
+                f'{serial} has other curves than {first.unit.serial}: fit both with the same model'
             )
     keys: dict[Column, list[Column]] = {}
-    for one in calibrations:
-        for column in prior_columns(one):
+    for calibration in calibrations:
+        for column in prior_columns(calibration):
             for common, _ in _on_common_lags(column):
                 keys.setdefault(_alike(common), []).append(common)
     columns = [
         replace(
             key,
-            range=union(one.range for one in own),
-            rest_k=float(np.mean([one.rest_k for one in own])),
+            range=union(column.range for column in columns),
+            rest_k=float(np.mean([column.rest_k for column in columns])),
         )
-        for key, own in keys.items()
+        for key, columns in keys.items()
     ]
     like = _like(calibrations, columns)
     K = np.array([constants_of(calibration).scale for calibration in calibrations])
@@ -270,10 +270,12 @@ def _relative_to(
     others = np.arange(layout.nonlinear, len(values))
     placed[others - len(values) + into.n_parameters, others] = 1.0
     blocks = zip((*layout.bias, *layout.scale), (*into.bias, *into.scale), strict=True)
-    for own, block in blocks:
-        n = own.response - own.static
-        placed[block.static : block.response, own.static : own.response] = np.eye(n)
-        placed[block.response : block.end, own.response : own.end] = terms
+    for block_of_unit, block in blocks:
+        n = block_of_unit.response - block_of_unit.static
+        placed[block.static : block.response, block_of_unit.static : block_of_unit.response] = (
+            np.eye(n)
+        )
+        placed[block.response : block.end, block_of_unit.response : block_of_unit.end] = terms
     placed = placed * factor
     return placed @ values, placed @ calibration.posterior.covariance() @ placed.T
 
@@ -290,16 +292,19 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
     """Return a calibration with the union of the ranges and these columns, all weights 0."""
     first = calibrations[0]
-    slow = [[axis.residual_sd_m_s2 for axis in one.static.axes()] for one in calibrations]
+    slow = [
+        [axis.residual_sd_m_s2 for axis in calibration.static.axes()]
+        for calibration in calibrations
+    ]
     regimes = []
     for k, regime in enumerate(first.regime_sets()):
         each = [calibration.regime_sets()[k] for calibration in calibrations]
         x, y, z = (
-            replace(own, residual_sd_m_s2=float(sd))
-            for own, sd in zip(regime.axes(), np.median(slow, axis=0), strict=True)
+            replace(axis, residual_sd_m_s2=float(sd))
+            for axis, sd in zip(regime.axes(), np.median(slow, axis=0), strict=True)
         )
-        temperatures = union([one.temperature_range_c for one in each])
-        rates = union([one.rate_range_k_min for one in each])
+        temperatures = union([regime.temperature_range_c for regime in each])
+        rates = union([regime.rate_range_k_min for regime in each])
         regimes.append(RegimeSet(temperatures, rates, x, y, z))
     return replace(
         first,

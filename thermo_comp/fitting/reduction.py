@@ -182,9 +182,9 @@ def reduce_source(
     variance of a rest is chosen in the same way. A cell has `least` samples, or 5 if the samples
     are slow and the unit rarely rests as long.
     """
-    one = _Pass(source, CellAccumulator(min(cell_s, window_s), full_scale, window_s, least))
+    reading = _Pass(source, CellAccumulator(min(cell_s, window_s), full_scale, window_s, least))
     # The norms at rest choose the thresholds only if they are those of gravity.
-    cells = one.cells if source.force is None else stillness.without_rotation(one.cells)
+    cells = reading.cells if source.force is None else stillness.without_rotation(reading.cells)
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
@@ -204,15 +204,15 @@ def reduce_source(
         shorter = _with_shorter_cells(source, still_part, in_shorter_cells)
         if shorter is not None:
             return shorter
-    restless = one.causes.cause(cells, still_sd)
+    restless = reading.causes.cause(cells, still_sd)
     if not ranges and not restless:
-        restless = f'no still interval: {_why_restless(cells, one.n_samples, still_sd)}'
-    return _bag(source, one, cells, ranges, window_s, fewest_windows, restless)
+        restless = f'no still interval: {_why_restless(cells, reading.n_samples, still_sd)}'
+    return _bag(source, reading, cells, ranges, window_s, fewest_windows, restless)
 
 
 def _bag(
     source: FitSource,
-    one: _Pass,
+    reading: _Pass,
     cells: Cells,
     ranges: Sequence[tuple[int, int]],
     window_s: float,
@@ -228,11 +228,11 @@ def _bag(
         start_ns=cells.start_ns,
         end_ns=cells.start_ns + (round(cells.time[-1] * 1e9) if len(cells.time) else 0),
         intervals=tuple(
-            _windows(cells, *edges, size, one.has_rate)
+            _windows(cells, *edges, size, reading.has_rate)
             for edges, size in zip(ranges, sizes, strict=True)
         ),
-        temperatures=one.temperatures,
-        n_samples=one.n_samples,
+        temperatures=reading.temperatures,
+        n_samples=reading.n_samples,
         n_dropped=cells.n_dropped,
         n_saturated=cells.n_saturated,
         n_cells=len(cells.count),
@@ -246,7 +246,7 @@ def _bag(
         info=reader.info if reader else NO_RECORDING,
         since_s=reader.since_s if reader else 0.0,
         restless=restless,
-        angular_rate='whole' if one.has_rate else 'part' if cells.rate.any() else 'none',
+        angular_rate='whole' if reading.has_rate else 'part' if cells.rate.any() else 'none',
     )
 
 
@@ -305,7 +305,7 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
         np.array([weighted[a:b].sum(axis=0) / cells.count[a:b].sum() for a, b in ranges])
         for ranges in found
     ]
-    return _joined(cells, found[best_rests([one.reshape(-1, 3) for one in means])], still_sd)
+    return _joined(cells, found[best_rests([rests.reshape(-1, 3) for rests in means])], still_sd)
 
 
 def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> list[tuple[int, int]]:

@@ -158,8 +158,8 @@ class Point:
         base = self.regression.products(self.layout.used).base
         at_state = self.regression.products_at(self.grams, self.state, base)
         for p in range(self.regression.windows.n_positions):
-            own = self.tangent.at(p).normal(at_state[[p]])
-            yield self.reduced.without(p, own.scaled(self.prior.sigma**-2.0))
+            normal = self.tangent.at(p).normal(at_state[[p]])
+            yield self.reduced.without(p, normal.scaled(self.prior.sigma**-2.0))
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
         """

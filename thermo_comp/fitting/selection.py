@@ -105,7 +105,7 @@ class Growth:
         self.forced = tuple(dict.fromkeys(self._names[candidates.forced & may].tolist()))
         #: Groups that may be added.
         names = dict.fromkeys(self._names[may].tolist())
-        self.free = [one for one in names if one not in self.forced]
+        self.free = [group for group in names if group not in self.forced]
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
         """Fit a model; columns that a smaller model dropped are tried again."""
@@ -130,9 +130,11 @@ class Growth:
         trials: list[Trial] = []
         part = 1.0
         while True:
-            larger = self.trials(chosen, [one for one in self.free if one not in chosen.groups])
+            larger = self.trials(
+                chosen, [group for group in self.free if group not in chosen.groups]
+            )
             trials += larger
-            better = [one for one in larger if is_better(chosen.score, one.score)]
+            better = [trial for trial in larger if is_better(chosen.score, trial.score)]
             part *= 0.6
             progress(1.0 - part)
             if not better:
@@ -141,7 +143,7 @@ class Growth:
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
         """Fit a model with further groups, and then with the bends that it lacks."""
-        more = tuple(one for one in groups if one in self.free)
+        more = tuple(group for group in groups if group in self.free)
         typical = self._typical(before, more, self._candidates.typical)
         smooth = self.extended(before, more, typical)
         return [smooth, *(self.trials(smooth, [BEND]) if BEND in self.free else [])]
@@ -165,8 +167,8 @@ class Growth:
         # of a part that lags by m, from the board or from the gradient, is
         # (t - m)^2 = t^2 - 2 t m + m^2.
         together = ('product', 'square'), (*LAGS, 'product', 'gradient_x_temperature', 'square')
-        sets = [tuple(one for one in groups if one in absent) for groups in together]
-        sets = [*((one,) for one in absent), *(groups for groups in sets if len(groups) > 1)]
+        sets = [tuple(group for group in groups if group in absent) for groups in together]
+        sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
         gains = {groups: inactive.gain(typical, np.isin(self._names, groups)) for groups in sets}
         likely = [groups for groups in sets if gains[groups] > TRIAL_GAIN]
         likely.sort(key=gains.__getitem__, reverse=True)
@@ -213,10 +215,10 @@ def better_beginning(fits: Sequence[Trial]) -> Trial:
 
 def simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
     """Return the model with the largest gain, or a smaller one that is not significantly worse."""
-    best = max(better, key=lambda one: gain(before.score, one.score))
-    for one in sorted(better, key=lambda one: len(one.groups)):
-        if one is best or not is_better(one.score, best.score):
-            return one
+    best = max(better, key=lambda trial: gain(before.score, trial.score))
+    for trial in sorted(better, key=lambda trial: len(trial.groups)):
+        if trial is best or not is_better(trial.score, best.score):
+            return trial
     return best
 
 
@@ -233,12 +235,12 @@ def select(
     priors = [prior]
     if prior.offset_scale > 0.0:
         priors.append(replace(prior, offset_sd=float(prior.sigma.mean())))
-    fits = [growth.fit(growth.forced, state, one, candidates.typical) for one in priors]
+    fits = [growth.fit(growth.forced, state, initial, candidates.typical) for initial in priors]
     constants = first = better_beginning(fits)
     trials = [constants]
     if CURVE in growth.free:
         # The curve is added without a test: it may improve the score only with other groups.
-        curve = better_beginning([growth.extended(one, (CURVE,)) for one in fits])
+        curve = better_beginning([growth.extended(fit, (CURVE,)) for fit in fits])
         downweigh(regression, curve.posterior)
         first = growth.extended(curve)
         trials.append(first)
@@ -261,9 +263,9 @@ def _grown(
     if growth.regression.windows.has_part_lags:
         # Groups of the curve of parts that lag the board: a polynomial in t - m, m the lag.
         trials = growth.with_bends(first, ('board', 'product', 'square'))
-        for one in trials:
-            if is_better(chosen.score, one.score):
-                chosen = one
+        for trial in trials:
+            if is_better(chosen.score, trial.score):
+                chosen = trial
     chosen, more = growth.added(chosen, progress)
     trials += more
     is_without_bends = BEND in growth.free and BEND not in chosen.groups
@@ -271,10 +273,10 @@ def _grown(
         # The slopes of a part that lags are seen only beside its lag, not beside a stand-in of
         # products and squares. A model of bends is continued if its drift is less than three times
         # that of the chosen model.
-        _, *bent = growth.with_bends(first, LAGS)
-        if bent and bent[0].score.rms < 3.0 * chosen.score.rms:
-            last, more = growth.added(bent[0], progress)
-            trials += [*bent, *more]
+        _, *with_bends = growth.with_bends(first, LAGS)
+        if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
+            last, more = growth.added(with_bends[0], progress)
+            trials += [*with_bends, *more]
             if is_better(chosen.score, last.score):
                 chosen = last
     return chosen, trials
@@ -304,10 +306,12 @@ def fit_all(
     posterior = settle(regression, posterior.state, posterior.prior, candidates)
     if informative:
         fits = [
-            regression.solve(posterior.state, replace(posterior.prior, informative=one), n_steps=3)
-            for one in informative
+            regression.solve(
+                posterior.state, replace(posterior.prior, informative=candidate), n_steps=3
+            )
+            for candidate in informative
         ]
-        best = max(fits, key=lambda one: one.log_evidence)
+        best = max(fits, key=lambda fit: fit.log_evidence)
         posterior = settle(regression, best.state, best.prior, candidates)
     posterior = with_slow_noise(regression, posterior, candidates)
     score = score_of(regression, posterior)

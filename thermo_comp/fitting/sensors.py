@@ -82,11 +82,11 @@ def learn_thermometer(
     # At the beginning of a ramp the lagged temperature has the second derivative ramp / lag. It is
     # estimated from the difference of two rates one minute apart.
     lags = []
-    for one in clear:
-        bend = np.abs(one.rate[_BINS_PER_SIDE:] - one.rate[:-_BINS_PER_SIDE])
+    for course in clear:
+        bend = np.abs(course.rate[_BINS_PER_SIDE:] - course.rate[:-_BINS_PER_SIDE])
         steepest = float(np.quantile(bend, 0.995)) / (_BIN_S * _BINS_PER_SIDE)
         if steepest > 0.0:
-            lags.append(one.fastest / steepest)
+            lags.append(course.fastest / steepest)
     lag = float(np.clip(np.median(lags), 30.0, 3600.0)) if lags else base.lag_s
     return replace(
         base,
@@ -150,12 +150,12 @@ def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list
 def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
     """Return 0.7 times the slowest ramp longer than 10 min, at least `RAMP_K_MIN` [K/min]."""
     slowest = usual / 0.7
-    for one in courses:
-        clear = np.abs(one.rate) > max(_CLEAR * one.rate_sd, 0.1 / 60.0)
+    for course in courses:
+        clear = np.abs(course.rate) > max(_CLEAR * course.rate_sd, 0.1 / 60.0)
         edges = np.flatnonzero(np.diff(np.concatenate(([0], clear.astype(np.int8), [0]))))
         for start, stop in zip(edges[::2], edges[1::2], strict=True):
             if (stop - start) * _BIN_S > 600.0:
-                middle = float(np.quantile(np.abs(one.rate[start:stop]), 0.9)) * 60.0
+                middle = float(np.quantile(np.abs(course.rate[start:stop]), 0.9)) * 60.0
                 slowest = min(slowest, middle)
     return max(0.7 * slowest, RAMP_K_MIN)
 
@@ -187,7 +187,8 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
             last = min(board.stamp_ns[-1], other.stamp_ns[-1])
             grid = np.arange(0.0, (last - first) * 1e-9, 60.0)
             at, beside = (
-                np.interp(grid, (one.stamp_ns - first) * 1e-9, one.value) for one in (board, other)
+                np.interp(grid, (readings.stamp_ns - first) * 1e-9, readings.value)
+                for readings in (board, other)
             )
             if len(grid) > 2:
                 rate.append(np.gradient(at, 60.0))
@@ -231,11 +232,13 @@ def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str,
 
     Readings with equal stamps are in the order of `inputs`.
     """
-    found: list[tuple[str, int, float]] = []
+    rows: list[tuple[str, int, float]] = []
     for name in inputs:
-        one = bag.temperatures.get(name, NO_READINGS)
-        found += zip(repeat(name), one.stamp_ns.tolist(), one.value.tolist(), strict=False)
-    return sorted(found, key=itemgetter(1))
+        readings = bag.temperatures.get(name, NO_READINGS)
+        rows += zip(
+            repeat(name), readings.stamp_ns.tolist(), readings.value.tolist(), strict=False
+        )
+    return sorted(rows, key=itemgetter(1))
 
 
 def thermal_states(
@@ -261,6 +264,6 @@ def thermal_states(
         rows.append(tracker.sample(stamp_ns))
         is_heard.append(
             board.beyond(stamp_ns) <= limit_s
-            and all(one.beyond(stamp_ns) <= other_limit_s for one in others)
+            and all(sensor.beyond(stamp_ns) <= other_limit_s for sensor in others)
         )
     return (begin - bag.start_ns) * 1e-9, np.array(rows), np.array(is_heard)

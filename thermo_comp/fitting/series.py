@@ -327,9 +327,9 @@ class Series:
 
     def of(self, base: Base) -> Floats:
         """Return the series of a base, shape (n, n_base)."""
-        one, others = self._others[:, :1], self._others[:, 1:]
+        constant, others = self._others[:, :1], self._others[:, 1:]
         at_start = self._starts[:, base.columns[base.moved]]
-        return np.hstack((one, self.columns[:, base.columns], at_start, others))
+        return np.hstack((constant, self.columns[:, base.columns], at_start, others))
 
     def starts(self, state: State, base: Base) -> Floats:
         """Return the initial state of the lag of each moved column, (n_positions, n_moved) [K]."""

@@ -107,7 +107,7 @@ def recording_source(
 
     wanted = topics or Topics()
     name = f'{shown_name(path)}{wanted.part}'
-    if topic and not any(is_called(topic, one) for one in (wanted.counts, wanted.imu)):
+    if topic and not any(is_called(topic, usual) for usual in (wanted.counts, wanted.imu)):
         name += f' ({shown(topic)})'  # messages about this source then contain the topic
     serial = info.metadata.get('serial')
     known = known_force(path, info, force)

@@ -51,10 +51,12 @@ def constant_calibration(
     """
     if isinstance(gravity, np.ndarray):
         scale = np.full(3, float(np.median(np.linalg.norm(means, axis=1) / gravity)))
-        found, rms = _refine(means, gravity, np.zeros(3), scale, with_misalignment)
-        if not np.all(found.scale > 0.0) or not rms < _LARGEST_RMS * float(np.median(gravity)):
+        calibration, rms = _refine(means, gravity, np.zeros(3), scale, with_misalignment)
+        if not np.all(calibration.scale > 0.0) or not rms < _LARGEST_RMS * float(
+            np.median(gravity)
+        ):
             raise FitError('the readings contradict the stated |f|: are its values right?')
-        return found
+        return calibration
     bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
     half = 0.5 * (means.max(axis=0) - means.min(axis=0))
     if not np.all(half > 0.0):
@@ -64,7 +66,7 @@ def constant_calibration(
         scale = np.full(3, float(np.max(half)) * spread / gravity)
         scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
         tried.append(_refine(means, gravity, bias, scale, with_misalignment))
-    calibration, rms = min(tried, key=lambda found: found[1])
+    calibration, rms = min(tried, key=lambda fitted: fitted[1])
     # The best ellipsoid of scattered points can be very large, with a remote centre: reject it.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < _LARGEST_RMS * gravity:
@@ -91,15 +93,15 @@ def _refine(
     def residual(parameters: Floats) -> Floats:
         return np.asarray(np.linalg.norm(unpack(parameters).force(means), axis=1) / gravity - 1.0)
 
-    found = least_squares(
+    solution = least_squares(
         residual,
         np.zeros(9 if with_misalignment else 6),
         loss='soft_l1',
         f_scale=0.01,
         x_scale=0.1,
     )
-    rms = float(np.sqrt(np.mean(residual(found.x) ** 2)))
-    return unpack(found.x), float(np.median(gravity)) * rms
+    rms = float(np.sqrt(np.mean(residual(solution.x) ** 2)))
+    return unpack(solution.x), float(np.median(gravity)) * rms
 
 
 def position_means(windows: Windows) -> Floats:

@@ -79,7 +79,10 @@ class Tangent:
         unit = np.empty((3, n, n))
         for rows, columns, k in ((bias, bias, 0), (bias, scale, 1), (scale, scale, 2)):
             block = sums[:, k, self.place[rows, None], self.place[columns]]
-            at, beside = (slice(one.start - first, one.stop - first) for one in (rows, columns))
+            at, beside = (
+                slice(columns_of.start - first, columns_of.stop - first)
+                for columns_of in (rows, columns)
+            )
             unit[:, at, beside] = block
             unit[:, beside, at] = np.swapaxes(block, 1, 2)
         others = np.array([0, *range(scale.stop - first, n)])
@@ -116,6 +119,6 @@ class Tangent:
         (n_positions, m, n_base); return their derivatives, shape (n_positions, 3, m, k + 1).
         """
         combined = rows[:, None] @ self.combined
-        own = np.broadcast_to(rows[:, None], (*combined.shape[:3], rows.shape[2]))
-        every = np.concatenate((own, combined), axis=3)
+        of_base = np.broadcast_to(rows[:, None], (*combined.shape[:3], rows.shape[2]))
+        every = np.concatenate((of_base, combined), axis=3)
         return np.asarray(every[..., self.place] * self.factor[:, :, None])

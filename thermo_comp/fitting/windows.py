@@ -94,10 +94,10 @@ class Model:
         return np.array(
             [
                 [
-                    one.tau_s == tau or not (one.kind in ('bend', 'play') or one.lag)
+                    column.tau_s == tau or not (column.kind in ('bend', 'play') or column.lag)
                     for tau in self.part_taus
                 ]
-                for one in self.columns
+                for column in self.columns
             ]
         )
 
@@ -196,13 +196,13 @@ def thermal_windows(
     parts: list[_Rows] = []
     rests: list[tuple[ReducedBag, StillInterval]] = []
     numbers: list[int] = []
-    has_rate = all(one.angular_rate is not None for bag in bags for one in bag.intervals)
+    has_rate = all(interval.angular_rate is not None for bag in bags for interval in bag.intervals)
     for number, (bag, track) in enumerate(zip(bags, tracks, strict=True)):
         grid, states = _with_memory(track, spec)
         for interval in bag.intervals:
             use = np.interp(interval.time, grid, track.is_known, left=0.0) == 1.0
             if use.any():
-                at = np.array([np.interp(interval.time[use], grid, one) for one in states.T])
+                at = np.array([np.interp(interval.time[use], grid, number) for number in states.T])
                 parts.append(_rows(interval, has_rate, use, at, grid[0], model, table))
                 rests.append((bag, interval))
                 numbers.append(number)
@@ -292,7 +292,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         groups=(*groups, *(column.group for column in columns)),
         lag=np.array(
             [-1] * n_curves
-            + [spec.lags.index(one.lag) if has_start(one) else -1 for one in columns],
+            + [spec.lags.index(column.lag) if has_start(column) else -1 for column in columns],
             dtype=np.int64,
         ),
         kelvins=_kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient),
@@ -334,7 +334,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
     grid = np.linspace(float(t.min()), float(t.max()) + 1e-9, 100)
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
-    slopes = [float(np.abs(np.gradient(one, grid)).max()) for one in curves]
+    slopes = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
     # The level of the dynamic set corresponds to the RMS gradient, which also differs in ramps.
     levels = zip(model.sets.levels(), slopes, strict=True)
@@ -361,8 +361,8 @@ def _track(bag: ReducedBag, model: Model) -> Track:
     )
     step_s = max(shortest / 5.0, 0.1)
     start_s, states, is_known = thermal_states(bag, tracker, step_s)
-    settled = states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])
-    is_known[: int(np.argmax(settled))] = False
+    is_settled = states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])
+    is_known[: int(np.argmax(is_settled))] = False
     return Track(start_s, step_s, states, is_known)
 
 
