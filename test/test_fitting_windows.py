@@ -200,13 +200,14 @@ def test_curves(bags, options, static, dynamic, is_shared):
     assert dynamic is None or found.dynamic.n_free == dynamic
     t = np.linspace(-5.0, 15.0, 9)
     weight = np.linspace(0.0, 1.0, 9)
-    columns, levels = found.columns(t, weight), found.levels()
-    assert len(columns) == len(levels) == found.static.n_free + 1 + found.dynamic.n_free
+    columns = found.columns(t, weight)
+    assert len(columns) == len(found.groups) == found.static.n_free + 1 + found.dynamic.n_free
     # No effect at the reference temperature, and no effect of the dynamic set in the static
     # regime.
     nothing = found.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
-    for column, (_, is_level) in zip(nothing, levels, strict=True):
-        np.testing.assert_allclose(column, [0.0, 0.5, 1.0] if is_level else 0.0, atol=1e-12)
+    for k, column in enumerate(nothing):
+        expected = [0.0, 0.5, 1.0] if k == found.level else 0.0
+        np.testing.assert_allclose(column, expected, atol=1e-12)
     assert all(column[0] == 0.0 for column in columns[found.static.n_free :])
 
 

@@ -65,7 +65,7 @@ def build_calibration(
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
     # Places of the response columns that are in use, or that only the covariance has.
-    weights = layout.weights[:, 0, len(model.sets.levels()) :]
+    weights = layout.weights[:, 0, len(model.sets.groups) :]
     used = np.flatnonzero((weights >= 0).any(axis=0)).tolist()
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_parameters(regression, layout, state, model.sets, used, kinds)
@@ -138,7 +138,7 @@ def _valid_columns(
 ) -> list[Column]:
     """Return the response columns in use with their valid ranges."""
     lower, upper = _temperature_range(windows)
-    n_curves = len(windows.model.sets.levels())
+    n_curves = len(windows.model.sets.groups)
     result = []
     for k in used:
         column = windows.model.columns[k]

@@ -163,7 +163,7 @@ class Equations(Series):
             ([by_force] * 2, across),
             ([by_force] * n_stretches, along),
             ([0], 1.0),
-            (np.repeat(base.tilts, 2), np.tile(across, base.n_tilts)),
+            (np.repeat(base.tilts, 2), np.tile(across, len(base.tilts))),
             (starts, 1.0),
             ([by_kappa, 0], 1.0),
             (in_bias, 1.0),

@@ -170,40 +170,30 @@ class Base:
 
     columns: the active columns; moved: those of them with a lag, as places in `columns`
     lag: number of that lag
-    has_t: whether t, for the nonlinear terms, is a base series
-    n_tilts: number of temperatures of the support
+    at_start, t, tilts, measured: places of the derivatives by the initial lag states, of t for the
+        nonlinear terms, shape (1,) or (0,), of the temperatures, and of the measured values
     """
 
     columns: Ints
     moved: Ints
     lag: Ints
-    has_t: bool
-    n_tilts: int
+    at_start: Ints
+    t: Ints
+    tilts: Ints
+    measured: Ints
 
-    @cached_property
-    def at_start(self) -> Ints:
-        """Places of the derivatives by the initial lag states."""
-        return 1 + len(self.columns) + np.arange(len(self.moved))
+    @classmethod
+    def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
+        """Lay out the series, given the lag of every column, -1 for none."""
+        moved = np.flatnonzero(lags[columns] >= 0)
+        counts = 1 + len(columns), len(moved), n_t, n_tilts, 3
+        _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        return cls(columns, moved, lags[columns[moved]], *places)
 
-    @cached_property
-    def t(self) -> Ints:
-        """Place of t, shape (1,) or (0,)."""
-        return 1 + len(self.columns) + len(self.moved) + np.arange(int(self.has_t))
-
-    @cached_property
-    def tilts(self) -> Ints:
-        """Places of the temperatures of the support."""
-        return 1 + len(self.columns) + len(self.moved) + len(self.t) + np.arange(self.n_tilts)
-
-    @cached_property
-    def measured(self) -> Ints:
-        """Places of the measured values of the axes, shape (3,)."""
-        return self.size - 3 + np.arange(3)
-
-    @cached_property
+    @property
     def size(self) -> int:
         """Number of base series."""
-        return 1 + len(self.columns) + len(self.moved) + len(self.t) + self.n_tilts + 3
+        return int(self.measured[-1]) + 1
 
 
 @dataclass(frozen=True)
@@ -266,7 +256,7 @@ class Series:
         self.level = self._averaged(self.measured)
         others = (t, windows.tilt, self.measured - self.level[windows.position])
         self._others = np.hstack((np.ones((len(t), 1)), *others))
-        self._has_t = bool(t.shape[1])
+        self._n_t = t.shape[1]
         new_cell = np.diff(windows.position, prepend=-1) != 0
         new_cell |= np.diff(windows.section, prepend=-1) != 0
         self._cells = np.flatnonzero(new_cell)
@@ -293,10 +283,8 @@ class Series:
         taken: Bools = np.any(used, axis=0)
         if self._products and np.array_equal(self._products[0], taken):
             return self._products[1]
-        columns = np.flatnonzero(taken)
-        moved = np.flatnonzero(self.windows.lag[columns] >= 0)
-        lag, n_tilts = self.windows.lag[columns[moved]], self.windows.tilt.shape[1]
-        base = Base(columns, moved, lag, self._has_t, n_tilts)
+        n_tilts = self.windows.tilt.shape[1]
+        base = Base.of(np.flatnonzero(taken), self.windows.lag, self._n_t, n_tilts)
         series = self.of(base)
         filtered = self.whitener.filter(series, self._gains)
         result = Products(

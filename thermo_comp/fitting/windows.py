@@ -62,10 +62,15 @@ class Sets:
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
-    def levels(self) -> list[tuple[str, bool]]:
-        """Return the group of each column, and whether it is a level."""
-        curve = [(CURVE, False)] * self.static.n_free
-        return [*curve, (SET, True), *[(SET, False)] * self.dynamic.n_free]
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Group of each column."""
+        return (CURVE,) * self.static.n_free + (SET,) * (1 + self.dynamic.n_free)
+
+    @property
+    def level(self) -> int:
+        """Place of the column of the dynamic set's level."""
+        return self.static.n_free
 
 
 @dataclass(frozen=True)
@@ -273,14 +278,17 @@ def _rows(
 
 def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: Ints) -> Windows:
     """Make the data of the regression."""
-    levels, columns = model.sets.levels(), model.columns
-    groups, n_curves = [group for group, _ in levels], len(levels)
+    groups, columns, acts_on = model.sets.groups, model.columns, model.acts_on
+    n_curves = len(groups)
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 3]
     # A support tilts with board and case temperature, linearly and with the square of the latter.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    acts_on = model.acts_on
+    # Hysteresis and bends of the scale are not modelled, and it has no level of the dynamic set:
+    # Fc = 1 at the reference temperature in both regimes.
+    in_scale = [*[True] * n_curves, *(column.kind not in ('play', 'bend') for column in columns)]
+    in_scale[model.sets.level] = False
     return Windows(
         position=position,
         bag=bag,
@@ -298,12 +306,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         kelvins=_kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient),
         start=np.hstack((np.zeros((len(t), n_curves)), rows.start)),
         start_covariance=start_covariance(spec.lags),
-        # Fc = 1 at the reference temperature in both regimes, so the scale has no level term.
-        # Hysteresis and bends of the scale are not modelled.
-        in_scale=np.array(
-            [not (group == SET and is_level) for group, is_level in levels]
-            + [column.kind not in ('play', 'bend') for column in columns]
-        ),
+        in_scale=np.array(in_scale),
         tilt=tilt[:, is_tilting] / tilt_rms[is_tilting],
         acts_on=None
         if acts_on is None
@@ -334,11 +337,10 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
     grid = np.linspace(float(t.min()), float(t.max()) + 1e-9, 100)
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
-    slopes = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
+    steepest = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
     # The level of the dynamic set corresponds to the RMS gradient, which also differs in ramps.
-    levels = zip(model.sets.levels(), slopes, strict=True)
-    steepest = [1.0 / flow if is_level else slope for (_, is_level), slope in levels]
+    steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.steepest(series, flow) * farthest**column.power)
     slope = np.array(steepest)
