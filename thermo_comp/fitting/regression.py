@@ -209,9 +209,10 @@ class Point:
         If the step increases the energy, fractions of it are tried in the nonlinear unknowns,
         which enter as products, and the linear unknowns are solved again for each fraction.
         """
-        step, _ = self.solution
+        # The energy of this point comes first: the regression keeps only its last linearisation.
+        energy, (step, _) = self.energy, self.solution
         result = self.moved(step)
-        if result.energy <= self.energy:
+        if result.energy <= energy:
             return result
         layout = self.layout
         is_nonlinear = np.zeros(layout.n, dtype=bool)
@@ -220,7 +221,7 @@ class Point:
         for share in (1.0, 0.25, 0.06, 0.015, 0.004, 0.001):
             turned = self.moved(np.where(is_nonlinear, share * step, 0.0))
             result = turned.moved(np.where(is_nonlinear, 0.0, turned.linear_step()))
-            if result.energy <= self.energy:
+            if result.energy <= energy:
                 break
         return result
 
