@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the estimation of prior standard deviations and noises in a model with given columns.
+Owns the estimation of prior standard deviations and noises, without columns of too little gain.
 
 Each column has one prior standard deviation for the bias of all axes and one for the scale. They
 follow MacKay's fixed point with a log-normal hyperprior per kelvin: the mode of log evidence plus

@@ -34,9 +34,9 @@ from .windows import Sets
 
 #: Largest code of the converter of the paper's unit: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0
-# Families of the curve over temperature; the first three are polynomials of order 1, 2, 3.
-_CURVES = ('linear', 'quadratic', 'cubic', 'spline', 'exponential')
-_POLYNOMIALS = _CURVES[:3]
+# Families of the curve over temperature: polynomials of order 1, 2 and 3, and others.
+_POLYNOMIALS = ('linear', 'quadratic', 'cubic')
+_CURVES = (*_POLYNOMIALS, 'spline', 'exponential')
 #: Groups of columns that the fit selects: the curve, the difference of the two sets, the response.
 GROUPS = tuple(
     dict.fromkeys(
@@ -49,14 +49,6 @@ GROUPS = tuple(
 )
 #: Names of the refusals that a user can allow.
 REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compensated')
-# Allowed words of each option.
-_WORDS: dict[str, tuple[str, ...]] = {
-    'input': ('counts', 'm/s^2'),
-    'model': ('response', 'golovach'),
-    **dict.fromkeys(('static_curve', 'dynamic_curve'), _CURVES),
-    **dict.fromkeys(('groups', 'forced'), GROUPS),
-    'allow': REFUSALS,
-}
 
 
 @dataclass(frozen=True)
@@ -131,7 +123,14 @@ class FitOptions:
         known = self.prior and self.prior.unit.input
         if known and known != self.input:
             raise ValueError(f'`prior` is in {known}, the samples are in {self.input}')
-        for name, words in _WORDS.items():
+        allowed: dict[str, tuple[str, ...]] = {
+            'input': ('counts', 'm/s^2'),
+            'model': ('response', 'golovach'),
+            **dict.fromkeys(('static_curve', 'dynamic_curve'), _CURVES),
+            **dict.fromkeys(('groups', 'forced'), GROUPS),
+            'allow': REFUSALS,
+        }
+        for name, words in allowed.items():
             given = getattr(self, name)
             for word in given if isinstance(given, tuple) else (given,):
                 if word is not None and word not in words:

@@ -103,8 +103,8 @@ class Growth:
         self._names = np.array(regression.windows.groups)
         may = candidates.typical.any(axis=0)
         self.forced = tuple(dict.fromkeys(self._names[candidates.forced & may].tolist()))
-        #: Groups that may be added.
         names = dict.fromkeys(self._names[may].tolist())
+        #: Groups that may be added.
         self.free = [group for group in names if group not in self.forced]
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:

@@ -259,7 +259,7 @@ def _rows(
     by_start = np.zeros_like(raw)
     slopes = table.slopes(states) * factors
     for k, column in enumerate(table.columns):
-        if has_start(column):
+        if _has_start(column):
             by_start[k] = slopes[k] * np.exp(-(time - begin_s) / column.tau_s)
     return _Rows(
         averaged(time[:, None])[:, 0],
@@ -300,7 +300,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         groups=(*groups, *(column.group for column in columns)),
         lag=np.array(
             [-1] * n_curves
-            + [spec.lags.index(column.lag) if has_start(column) else -1 for column in columns],
+            + [spec.lags.index(column.lag) if _has_start(column) else -1 for column in columns],
             dtype=np.int64,
         ),
         kelvins=_kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient),
@@ -314,7 +314,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     )
 
 
-def has_start(column: Column) -> bool:
+def _has_start(column: Column) -> bool:
     """Whether a column depends on the unknown initial state of a lag."""
     return column.lag is not None and column.kind != 'play'
 
