@@ -103,7 +103,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     model = model_of(bags, options, parts.taus)
     of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
     fit = regress(of_parts, problem)
-    if not fit.is_at_noise:
+    if fit.is_above_noise:
         with_bank = regress(windows, problem)
         if is_better(fit.selected.score, with_bank.selected.score):
             return with_bank

@@ -84,9 +84,9 @@ class Fit(NamedTuple):
         return self.selected.posterior
 
     @property
-    def is_at_noise(self) -> bool:
-        """Whether the left-out drift is that of a model that lacks nothing."""
-        return self.selected.score.rms < _complete_rms(self.posterior)
+    def is_above_noise(self) -> bool:
+        """Whether the left-out drift is above that of a model that lacks nothing."""
+        return self.selected.score.rms > _complete_rms(self.posterior)
 
 
 def _complete_rms(posterior: Posterior) -> float:
