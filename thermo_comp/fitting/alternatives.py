@@ -103,7 +103,8 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     model = model_of(bags, options, parts.taus)
     of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
     fit = regress(of_parts, problem)
-    if fit.is_above_noise:
+    # The noise of the fit contains what the lags of the parts do not explain.
+    if fit.selected.score.rms > 2.0 * parts.noise:
         with_bank = regress(windows, problem)
         if is_better(fit.selected.score, with_bank.selected.score):
             return with_bank

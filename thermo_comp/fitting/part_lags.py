@@ -35,10 +35,12 @@ class Parts:
 
     taus: the time constant of each axis [s]; 0 without a lag
     undisturbed: factors of the weights of the windows, see `Windows`, shape (n,)
+    noise: mean over the axes of the windows' white noise [m/s^2]
     """
 
     taus: tuple[float, float, float]
     undisturbed: Floats
+    noise: float
 
 
 def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | None:
@@ -60,11 +62,12 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     square = np.average(residual**2, axis=0, weights=data.weight * factors)
     # An RMS residual up to 1.5 times the white noise is noise alone. With a larger one the lags
     # must explain most, 7/8 of the RMS without them: slow noise or another effect remains.
-    is_at_noise = (square <= (1.5 * white_noise_of(data, start.scale)) ** 2).all()
+    noise = white_noise_of(data, start.scale)
+    is_at_noise = (square <= (1.5 * noise) ** 2).all()
     if not is_at_noise and min(map(curves.reduction, taus, range(3))) < 8.0:
         return None
     x, y, z = (round(float(tau), 1) for tau in taus)
-    return Parts((x, y, z), factors)
+    return Parts((x, y, z), factors, float(noise.mean()))
 
 
 class _PartCurves:

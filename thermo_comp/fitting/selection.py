@@ -83,11 +83,6 @@ class Fit(NamedTuple):
         """The fit of the chosen model."""
         return self.selected.posterior
 
-    @property
-    def is_above_noise(self) -> bool:
-        """Whether the left-out drift is above that of a model that lacks nothing."""
-        return self.selected.score.rms > _complete_rms(self.posterior)
-
 
 def _complete_rms(posterior: Posterior) -> float:
     """Return the largest left-out drift of a model that lacks nothing [m/s^2]."""
