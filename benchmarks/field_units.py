@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the ageing units of the benchmark `field.py`: their physics, their rests, and the best filter.
+Owns the ageing units of the benchmark `field.py`: physics, rests, reference filter.
 
 A unit leaves the laboratory with a calibration whose error is drawn from the covariance that the
 calibration states. From then on bias and scale walk at random, each start has a bias of its own,

@@ -9,9 +9,9 @@ name one of its studies: ``--cases 'turn-on:9 at 30 ug'``.
 
 Units and recordings come from `strangers_units.py` and `strangers_cases.py`, which share no code
 with the package; the package is used only through its fit and its correction of arrays. Every row
-corrects recordings that the fit has not seen, except a row which says so. Errors are RMS of means
-over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio is the
-RMS of error over claimed sd. Figures are RMS over the units. MISS marks a limit of
+is measured on recordings that were not fitted, unless the row states otherwise. Errors are RMS of
+means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
+is the RMS of error over claimed sd. Figures are RMS over the units. MISS marks a limit of
 `strangers_limits.py` that a row misses; the exit code is then 1. Most of the time goes into the
 baselines by the package; ``--baselines strangers.json`` takes them from an earlier run.
 """

@@ -344,7 +344,8 @@ def quadratic(number: int) -> Iterator[Study]:
 
 def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60.0) -> Floats:
     """
-    Give the Cramer-Rao bound of the bias of a unit of parabolas at the reference, shape (3,).
+    Give the Cramer-Rao bound of the bias at the reference temperature, shape (3,), for a unit
+    whose bias and scale factor are parabolas.
 
     The unknowns are the constants, both parabolas, and the direction of each position; data are
     the three axes in windows that are short against the program.

@@ -99,7 +99,7 @@ def test_products_and_determinant_are_those_of_the_dense_matrix(rng, noise):
     white = whitener.filter(series, gains)
     covariance = dense(position, time, weight, noise)
     expected = series.T @ np.linalg.solve(covariance, series)
-    # Rounding only, of a matrix with a condition below 1e6.
+    # The tolerance allows for rounding with a covariance of condition number below 1e6.
     np.testing.assert_allclose(white.T @ white, expected, rtol=1e-9, atol=1e-10)
     determinant = np.linalg.slogdet(covariance)[1]
     assert whitener.log_determinant(gains) == pytest.approx(determinant, abs=1e-9)

@@ -248,7 +248,7 @@ def reduced(unit, records):
 
 def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, held_out)
-    # A third of it has enough ramps and soaks to show an error.
+    # The first third of the bag has enough ramps and soaks to show an error.
     thirds = [replace(one, n_whole=one.n_whole // 3) for one in bags[0].intervals]
     short = [replace(bags[0], intervals=tuple(thirds))]
     judged = judge_bags(bags, calibration)

@@ -105,7 +105,8 @@ STAMPED = NodeTopic(
 )
 STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz, hardware_id = serial', 10)
 
-#: Topics of the samples by the value of the parameter `input`; all inputs by name in `Topics`.
+#: Topics of the samples, by the value of the parameter `input`; below, the topics of all inputs,
+#: by their names in `Topics`.
 SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}
 INPUTS = {**SAMPLES, 'board': BOARD, 'case': CASE}
 #: The regime flags with their packers; all topics of the bag that `replay` writes.

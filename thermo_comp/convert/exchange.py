@@ -156,7 +156,7 @@ def _thermal(
 
 
 def _constant(calibration: Calibration, curves: _Curves) -> Content:
-    """Return bias, scale and misalignment at the reference, for tools of tumble tests."""
+    """Return bias, scale and misalignment at the reference temperature, for tumble tests."""
     drift = 'the calibration has no correction for temperature'
     if calibration.needs_temperature:
         drift = (

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the alternatives that need other columns: the lags of the parts of the axes or a bank of lags,
-and the end condition of the dynamic regime.
+Owns the choice between models whose columns differ: in their lags (one time constant per axis, or
+a bank of time constants for all axes) and in the condition that ends the dynamic regime.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def model_of(
     part_taus: tuple[float, float, float] | None = None,
 ) -> Model:
     """
-    Return curves, columns and detector: those of the prior, or else all that the bags allow.
+    Return the model of the prior, or else one with all columns that the bags can determine.
 
-    `part_taus`: see `Model`
+    `part_taus`: time constant of each axis [s], see `Model`; None for the bank of time constants
     """
     prior, reference = options.prior, options.reference_temperature
     if prior is not None:
@@ -48,8 +48,8 @@ def model_of(
         rests = gradients_at_rest(bags, sensors)
         columns = bank(sensors, rests, board_span(bags, reference), part_taus)
     if not any(len(bag.case.value) for bag in bags):
-        # Without a case thermometer the gradient is estimated from the board's rate, and its
-        # columns are combinations of those of the board.
+        # Without a case thermometer the gradient is estimated from the board's rate, and the
+        # columns of the gradient are linear combinations of those of the board.
         columns = tuple(column for column in columns if not column.is_of_sensor)
     if options.groups is not None:
         groups = {*options.groups, *options.forced}
@@ -59,20 +59,20 @@ def model_of(
 
 
 def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
-    """Fit the windows, with the better of the alternatives; the fit has the windows used."""
+    """Fit the windows with the alternative models; return the best fit, with its windows."""
     bags, options = problem.bags, problem.options
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
     if not has_choice or not _may_have_sets(fit.selected):
         return fit
-    # The dynamic regime ends at constant temperatures of case and board, or of the case alone.
-    # This affects only the sets.
+    # The alternative detector ends the dynamic regime once the case temperature is constant, and
+    # not only once those of case and board are. Only models with two sets depend on the regime.
     model = fit.windows.model
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
     other = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Both have the same columns: halves of the program, which limit their number, say nothing.
+    # Left-out halves of the program limit the number of columns; both models have the same.
     return other if is_better(fit.selected.score, other.selected.score, by_halves=False) else fit
 
 
@@ -83,17 +83,22 @@ def windows_of(
     tracks: Sequence[Track] | None = None,
     undisturbed: Floats | None = None,
 ) -> ThermalWindows:
-    """Return the windows of bags with |f|; `tracks`: known thermal states of the detector."""
+    """
+    Return the windows of bags, with |f| of each position.
+
+    `tracks`: thermal states of the bags, if they were computed before
+    `undisturbed`: factors of the weights of the windows, see `Parts`
+    """
     windows = with_forces(thermal_windows(bags, model, tracks), bags, options)
     return replace(windows, data=replace(windows.data, undisturbed=undisturbed))
 
 
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
-    Fit the windows with the lags of the parts, if the axes are curves of one part each.
+    Fit the windows with one time constant per axis, or with a bank of time constants.
 
-    A bank of lags is used if there are no such parts. It is tried as well if the model of the
-    parts is not at the noise, and taken if it is better on left-out data.
+    The bank is fitted if no time constants per axis are found, or if they leave more left-out
+    drift than noise explains; of both fits that with the smaller left-out errors is returned.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -115,8 +120,8 @@ def _may_have_sets(selected: Selected) -> bool:
     """
     Whether the chosen model has two sets, or a model with two sets is similarly good.
 
-    Similarly good: within one standard error of the chosen model on left-out data, with less than
-    80 % of its noise.
+    Similarly good: its left-out error is within one standard error of that of the chosen model,
+    and its white noise is less than 80 % of that of the chosen model, on every axis.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -128,7 +133,7 @@ def _may_have_sets(selected: Selected) -> bool:
 
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Return the thermometers that all bags have, without the board's; the case is first."""
+    """Name the case thermometer, then all others, except the board's, that every bag has."""
     seen = (
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags

@@ -27,8 +27,8 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     Return the lower Cholesky factors of matrices that are positive definite except for rounding,
     shape (..., n, n).
 
-    The smallest jitter that suffices is added to the matrix scaled to a unit diagonal; with
-    `diagonal`, shape (..., n), to the matrix scaled by its root.
+    The matrix is scaled to a unit diagonal, or by the root of `diagonal`, shape (..., n), if it is
+    given; then the smallest jitter that suffices is added to the diagonal.
     """
     square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
     root = np.sqrt(square)

@@ -57,7 +57,8 @@ class Effects(NamedTuple):
     force: specific force along each axis in each position, shape (n_positions, 3)
     across: derivative of the reading by a rotation of the attitude, shape (n_positions, 3, 2)
     read: reading without the bias, shape (n_positions, 3)
-    bends: sums of the nonlinear terms at the reference and per kelvin, shape (2, n_positions, 3)
+    bends: sums of nonlinear terms at the reference temperature and per kelvin,
+        shape (2, n_positions, 3)
     slopes: their derivatives by the force, of the same shape
     """
 
@@ -316,7 +317,7 @@ def as_vector(state: State, layout: Layout) -> Floats:
 
 
 def without_inactive(state: State, layout: Layout) -> State:
-    """Set inactive weights and coefficients to 0; the same state if all of them are 0."""
+    """Set inactive weights and coefficients to 0; `state` itself if all of them are 0."""
     kept = {name: getattr(layout, name) >= 0 for name in ('weights', 'nonlinear')}
     if not any(getattr(state, name)[~active].any() for name, active in kept.items()):
         return state

@@ -144,7 +144,7 @@ def is_beyond(windows: ThermalWindows) -> bool:
 
 
 def prior_sd(forces: Forces, options: FitOptions) -> Floats:
-    """Return the prior sd of the coefficients at the reference, then per kelvin, (2 k,)."""
+    """Return the prior sd of the coefficients c, then of c' [per kelvin], shape (2 k,)."""
     sd = np.array([options.nonlinear_sd(kind) for kind in forces.kinds])
     return np.concatenate((sd, _SLOPE_RATIO * sd))
 

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the time constants of the parts: one lag per axis.
+Owns the search for the thermal time constant of each axis.
 
-The bias and the scale factor of an axis are functions of the temperature of its part, which lags
-the board: ``x = t - m``, m the lag of the board by one time constant. The time constant is that at
-which a spline of the bias and a cubic of the scale factor, both over x, leave the smallest
-residuals.
+The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
+temperature of one part of the unit: t is the board temperature less the reference temperature, and
+m = T - L_tau(T) the difference between the board temperature T and its first-order lag. The time
+constant tau of an axis minimises the RMS residual of a spline of the bias and a cubic of the scale
+factor, both over x.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from .hyperparameters import undisturbed
 from .start import ConstantCalibration, position_means, white_noise_of
 from .windows import ThermalWindows
 
-# Time constants that are shorter than those of the columns [s].
+# Time constants tried in addition to those of the columns, all of which are longer [s].
 _SHORT_TAUS = (15.0, 21.0, 30.0, 42.0)
-# Ratio of neighbouring time constants of the columns.
+# Ratio of a time constant of the columns to the next smaller one: half an octave.
 _STEP = 2.0**0.5
 
 
 @dataclass(frozen=True)
 class Parts:
     """
-    The parts of a unit.
+    The thermal time constants of the axes of a unit.
 
-    taus: the time constant of each axis [s]; 0 without a lag
-    undisturbed: factors of the weights of the windows, see `Windows`, shape (n,)
+    taus: the time constant of each axis [s]; 0 if the axis follows the board without a lag
+    undisturbed: factors, up to 1, that reduce the weights of outlying windows, shape (n,)
     noise: mean over the axes of the windows' white noise [m/s^2]
     """
 
@@ -45,9 +46,10 @@ class Parts:
 
 def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | None:
     """
-    Find the lag of each axis, and the windows that no curve of its part describes.
+    Find the time constant of each axis, and reduce the weights of windows that do not fit it.
 
-    Returns None if curves of one part per axis do not explain the drift or do not determine a lag.
+    Returns None if the model with one time constant per axis does not explain the drift of all
+    axes, or if the data do not determine a time constant.
     """
     data, columns = windows.data, windows.model.columns
     lags = [k for k, column in enumerate(columns) if column.group == 'board']
@@ -60,8 +62,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     residual = np.column_stack([curves.residual(tau, axis) for axis, tau in enumerate(taus)])
     factors = undisturbed(residual, data.weight, data.position)
     square = np.average(residual**2, axis=0, weights=data.weight * factors)
-    # An RMS residual up to 1.5 times the white noise is noise alone. With a larger one the lags
-    # must explain most, 7/8 of the RMS without them: slow noise or another effect remains.
+    # An RMS residual of up to 1.5 times the white noise is attributed to noise. A larger one has
+    # another cause, e.g. slow noise: the time constants are then accepted only if they reduce the
+    # RMS residual of each axis to an eighth or less of that without a lag.
     noise = white_noise_of(data, start.scale)
     is_at_noise = (square <= (1.5 * noise) ** 2).all()
     if not is_at_noise and min(map(curves.reduction, taus, range(3))) < 8.0:
@@ -72,9 +75,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
 
 class _PartCurves:
     """
-    The curves of each axis over the temperature of its part, for any time constant.
+    Bias and scale factor of each axis as functions of x (see the module), for any time constant.
 
-    `lags`: the columns of the board's lags
+    `lags`: indices of the columns of group `board`, the lags of the board temperature
     """
 
     def __init__(
@@ -86,19 +89,19 @@ class _PartCurves:
         self._first = data.edges[:-1]
         self._t = windows.temperature - windows.model.reference_temperature
         self._taus = np.array([windows.model.columns[k].tau_s for k in lags])
-        # Lags between those of the columns are interpolated: their ratio to the time constant is
-        # smooth, and the rate at 0.
+        # The lag m at a time constant tau between those of the columns is interpolated: m / tau
+        # is a smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
         ratios = np.column_stack((windows.rate, windows.raw[:, lags] / self._taus))
         self._ratio = CubicSpline(_even(np.append(0.0, self._taus)), ratios, axis=1)
         self._age = data.age
         force = (position_means(data) - start.bias) / start.scale
         self._force = force[data.position]
         self._measured = self._centred(data.mean / start.scale)
-        # 3000 windows are sufficient to find a time constant.
+        # Every k-th window: 3000 to 6000 of them are sufficient to find a time constant.
         self._some = slice(None, None, max(len(data.time) // 3000, 1))
 
     def time_constant(self, axis: int) -> float:
-        """Return the time constant with the smallest residuals [s]; 0 without a lag."""
+        """Return the time constant with the smallest RMS residual [s]; 0 if none reduces it."""
         tried = np.array([*_SHORT_TAUS, *self._taus])
         squares = [self._square(tau, axis) for tau in tried]
         best = float(tried[int(np.argmin(squares))])
@@ -112,47 +115,47 @@ class _PartCurves:
         return tau if self._square(tau, axis) < self._square(0.0, axis) else 0.0
 
     def is_determined(self, tau_s: float, axis: int) -> bool:
-        """Whether the RMS residual rises by 5 % if the time constant changes by `_STEP`."""
+        """Whether a time constant larger, or smaller, by `_STEP` adds 5 % to the RMS residual."""
         others = (tau_s / _STEP, tau_s * _STEP) if tau_s else (_SHORT_TAUS[0] * _STEP,)
         limit = 1.05**2 * self._square(tau_s, axis)
         return all(self._square(other, axis) > limit for other in others)
 
     def reduction(self, tau_s: float, axis: int) -> float:
-        """Return the RMS residual of an axis without a lag over that with it."""
+        """Return the ratio of the RMS residual of an axis without a lag to that with `tau_s`."""
         return float(np.sqrt(self._square(0.0, axis) / self._square(tau_s, axis)))
 
     def residual(self, tau_s: float, axis: int) -> Floats:
-        """Return the residuals of all windows, shape (n,) [m/s^2]."""
+        """Return the residuals of one axis in all windows, shape (n,) [m/s^2]."""
         series = self._series(tau_s, axis)
         left = self._measured[:, axis] - series @ _solved(series, self._measured[:, axis])
         return np.asarray(left / np.sqrt(self._weight[:, 0]))
 
     def _square(self, tau_s: float, axis: int) -> float:
-        """Return the sum of squares of the residuals of an axis [(m/s^2)^2]."""
+        """Return the weighted sum of squared residuals of an axis over every k-th window."""
         series = self._series(tau_s, axis)[self._some]
         measured = self._measured[self._some, axis]
         left = measured - series @ _solved(series, measured)
         return max(float(left @ left), 1e-30)
 
     def _series(self, tau_s: float, axis: int) -> Floats:
-        """Return the series of bias, scale factor and initial temperatures, shape (n, k)."""
+        """Return the weighted regressors of bias, scale factor and initial lags, shape (n, k)."""
         x: Floats = self._t - tau_s * self._ratio(_even(np.asarray(tau_s)))
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
-        # The spline of the bias has a node every 0.6 K, and at most 60 of them.
+        # The spline of the bias has a node every 0.6 K, but at least 4 and at most 60 nodes.
         n_nodes = int(np.clip(span / 0.6, 4, 60))
         inner = np.linspace(low, low + span, n_nodes)
         knots = np.pad(inner, 3, mode='edge')
         bias = BSpline.design_matrix(np.clip(x, low, low + span), knots, 3).toarray()
         rows = np.arange(len(x))
         scale = self._force[:, [axis]] * ((x / span)[:, None] ** np.arange(1, 4))
-        # The part's own temperature at the start of a bag is not known.
+        # The lag of the part at the start of each bag is unknown and decays with `tau_s`.
         begin = np.zeros((len(x), int(self._bag[-1]) + 1))
         begin[rows, self._bag] = np.exp(-self._age / max(tau_s, 1.0))
         return self._centred(np.hstack((bias, scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
-        """Subtract the mean of each position, and multiply by the root of the weight."""
+        """Subtract the weighted mean over each position; multiply by the root of the weight."""
         every = np.hstack((values, np.ones_like(self._weight))) * self._weight
         sums = np.add.reduceat(every, self._first, axis=0)
         level = sums[:, :-1] / sums[:, -1:]
@@ -160,14 +163,14 @@ class _PartCurves:
 
 
 def _even(tau_s: Floats) -> Floats:
-    """Spread time constants [s] evenly over 0 .. 1, 200 s in the middle."""
+    """Map time constants [s] to 0 .. 1, for the interpolation; 200 s become 0.5."""
     return np.asarray(tau_s / (tau_s + 200.0))
 
 
 def _solved(series: Floats, measured: Floats) -> Floats:
-    """Return the least-squares weights of series of any size."""
+    """Return the least-squares coefficients of regressors of any magnitude."""
     normal, right = series.T @ series, series.T @ measured
     size = np.sqrt(np.diag(normal)) + 1e-12
     normal = normal / np.outer(size, size)
-    normal[np.diag_indices_from(normal)] += 1e-7  # nearly equal series have a solution, too
+    normal[np.diag_indices_from(normal)] += 1e-7  # ridge, for nearly collinear regressors
     return np.asarray(np.linalg.solve(normal, right / size) / size)

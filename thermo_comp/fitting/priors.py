@@ -161,7 +161,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     first = calibrations[0]
     serials = {calibration.unit.serial for calibration in calibrations}
     if len(serials) < len(calibrations):
-        raise FitError('two of the calibrations are of one unit: a population needs one of each')
+        raise FitError('two of the calibrations are of one unit: give one of each unit')
     for calibration in calibrations:
         serial, unit = calibration.unit.serial, calibration.unit
         alike = (unit.input, calibration.reference_temperature_c, calibration.sensors)

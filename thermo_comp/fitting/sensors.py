@@ -123,7 +123,7 @@ def _noise_of(values: Sequence[Floats], quantum: float) -> float:
 
 
 def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list[Course]:
-    """Return the rates of each bag that is long enough."""
+    """Return the rates of temperature in each bag of 30 readings and 6 spans, or more."""
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:

@@ -67,7 +67,7 @@ def fit_sources(
         sources.append(replace(source, sha256=digest(path)))
         twin = names.setdefault(str(sources[-1].sha256), str(path))
         if len(names) < len(sources):
-            raise FitError(f'{path}: is {twin} once more, and nothing may count twice')
+            raise FitError(f'{path}: is {twin} once more (same content): give it once')
     if len(kinds) > 1:
         raise FitError(
             f'{kinds["counts"]} has counts, {kinds["imu"]} has Imu messages: give recordings of '

@@ -77,7 +77,7 @@ def open_bags(
         source = replace(source, sha256=digest(Path(path)))
         for other, twin in zip(bags, paths, strict=False):
             if other.source.sha256 == source.sha256:
-                raise RecordingError(f'is {twin} once more, and nothing may count twice', path)
+                raise RecordingError(f'is {twin} once more (same content): give it once', path)
         bag = reduce_source(source, window_s=sum_length(window_s), **(usual | known))
         if 'board' in require and not len(bag.board.value):
             raise RecordingError('no board temperature in it', path=str(path))

@@ -66,7 +66,7 @@ class Model:
 
 
 class ThermalSide:
-    """The part common to stream and batch: readings, thermal state, segments."""
+    """The code that streaming and batch share: queued readings, thermal state, segments."""
 
     def __init__(self, model: Model, config: CompensatorConfig, counters: Counters) -> None:
         self.counters = counters

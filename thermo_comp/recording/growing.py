@@ -168,7 +168,7 @@ class PositionBags:
                 self._writer.write_raw(topic, kind, one.log_ns, one)
 
     def close(self, before_ns: int = _NEVER_NS) -> None:
-        """End the bag before a stamp, by default with all messages held back."""
+        """Write the held messages stamped before `before_ns`, by default all; close the bag."""
         self.release(before_ns)
         writer, self._writer = self._writer, None
         if writer is not None:

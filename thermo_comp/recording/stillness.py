@@ -249,7 +249,7 @@ def still_intervals(
 ) -> list[tuple[int, int]]:
     """
     Find the runs of still cells: half-open ranges of cell numbers, in order. `still_sd` is the
-    largest scatter at rest [g], `ratio` that of a cell's variance to the quiet level.
+    largest scatter at rest [g], `ratio` the largest variance of a still cell / quiet level.
     """
     return long_enough(cells, still_runs(cells, still_sd, (ratio,))[0], min_rest_s)
 
@@ -299,8 +299,8 @@ def still_runs(
 
 def without_rotation(cells: Cells) -> Cells:
     """
-    Take from the angular rate of each cell the median of the last cells: in a constant rotation a
-    unit rests, while its rate changes it does not.
+    Subtract from the angular rate of each cell the median rate of the cells before it, so that a
+    unit at a constant angular rate counts as at rest, and one whose rate changes does not.
     """
     n = max(1, round(_ROTATION_S / cells.cell_s)) if cells.cell_s else 1
     if len(cells.rate) <= n or not cells.rate.any():

@@ -29,9 +29,9 @@ from .reader import LoadedCalibration
 
 #: Messages that are summed at a time, unless a report comes first.
 BLOCK = 1024
-#: Largest size of a day, and of the folder [bytes]: 10 MB a month at most.
+#: Largest size of the file of a day, and of the folder [bytes]: 10 MB a month at most.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
-#: Days are not thinned below this size [bytes].
+#: Files of a day that are not larger than this [bytes] are not thinned to bound the folder.
 _FLOOR = 16_000
 #: Largest number of lines that wait for the disk.
 _WAITING = 1000

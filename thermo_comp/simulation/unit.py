@@ -163,9 +163,9 @@ class UnitModel:
 
     Per axis, ``counts = K * scale(T) * s + bias(T) + noise`` summed into whole counts, where ``s =
     inverse(M) @ f`` is the specific force along the sensitivity axes, plus the nonlinear `bend`.
-    K [counts/cycle per m/s^2] and bias [counts/cycle] are those at the reference. `noise_density`
-    is in ug/sqrt(Hz): the mean over T seconds has the deviation ``noise_density / sqrt(T)``;
-    `bias_walk` in ug/sqrt(h).
+    K [counts/cycle per m/s^2] and bias [counts/cycle] are those at the reference temperature.
+    `noise_density` is in ug/sqrt(Hz): the mean over T seconds has the standard deviation
+    ``noise_density / sqrt(T)``; `bias_walk` is in ug/sqrt(h).
     """
 
     serial: str

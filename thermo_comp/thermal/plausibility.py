@@ -45,7 +45,8 @@ LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
 _SIGMAS: Final = 6.0
-#: Rates start at 0, so a unit that heats itself after switch-on seems calm for this time [ns].
+#: Time [ns] for which both rates must be low before the temperatures count as constant: estimates
+#: of rates start at 0, also in a unit that heats itself after switch-on.
 _CALM_NS: Final = 120 * 10**9
 
 

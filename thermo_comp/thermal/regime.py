@@ -178,7 +178,8 @@ class _Watch:
             self._stamp_ns = None
             return False
         change = self.change
-        # Unlike the third-order thermometer, the detector's filters do not overshoot a ripple.
+        # When the temperature ripples, the rate of the detector's filters does not overshoot, but
+        # that of the third-order thermometer does.
         rate = change.rate if change.is_following(stamp_ns) else sensor.rate
         doubt = sqrt(sensor.var_rate)
         relaxed = self._relaxed

@@ -86,12 +86,12 @@ class DetectorSettings:
     dwell_s: Annotated[
         float,
         QUANTITIES['dwell'],
-        'Time for which every rate must have been below it, and the shortest dynamic state, s.',
+        'Time for which every rate must be below the relaxed rate; shortest dynamic state, s.',
     ] = 60.0
     closes: Annotated[
         Closes,
-        'Sensors that must settle before the dynamic state ends: the leading one (`case`, the '
-        'end of the change as in the paper), or the board, too (`board`).',
+        'Sensors that must settle before the dynamic state ends: the leading one alone (`case`, '
+        'as in the paper), or the leading one and the board (`board`).',
     ] = 'board'
     case: Annotated[ThermometerSettings, 'The two sensors.'] = field(
         default_factory=ThermometerSettings

@@ -111,7 +111,7 @@ class Thermometer:
             self._start(stamp_ns, reading_c)
             return True
 
-        # Interaction: each mode starts from a mixture of both.
+        # Interaction step of the IMM filter [1]: each mode starts from a mixture of both modes.
         to_bending = dt / (dt + SOAK_S)
         to_quiet = dt / (dt + lag)
         bending = self.bending

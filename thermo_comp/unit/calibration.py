@@ -80,7 +80,7 @@ class AxisReference:
     """One axis at the reference temperature."""
 
     scale_factor: Annotated[float, 'K: input units per m/s^2 at the reference temperature.']
-    bias: Annotated[float, 'dNs(0): zero offset at the reference, in input units.']
+    bias: Annotated[float, 'dNs(0): zero offset at the reference temperature, in input units.']
 
     def __post_init__(self) -> None:
         bounds = QUANTITIES['scale factor']

@@ -30,7 +30,7 @@ from .nonlinearity import ForceCorrection
 GENTLE_RATE = MICRO_G
 #: ... unless blending would then take more than this number of transition times.
 LONGEST_TRANSITION = 10.0
-#: Number of temperatures at which the difference of the sets is evaluated for that time.
+#: Number of board temperatures at which curves and differences of the sets are evaluated.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter carries the remainder on.
 ROUNDING_VARIANCE = 1.0 / 6.0

@@ -31,10 +31,10 @@ Kelvins: TypeAlias = float | Floats
 #: Length of the tangent that continues a curve beyond its range, in spans of that range. There
 #: a parabola is a sixteenth as far from that tangent as it is at the other end of the range.
 TANGENT_SPANS = 0.25
-#: Largest error of a function at the reference.
+#: Largest error of a function at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
-#: Smallest distance of knots, and largest distance of a knot from the reference [K]; the spline
-#: would overflow beyond them.
+#: Smallest distance of knots, and largest distance of a knot from the reference temperature [K];
+#: the spline would overflow beyond them.
 _KNOT_STEP = 1e-3
 _FARTHEST_KNOT = 2000.0
 
@@ -87,7 +87,7 @@ class Polynomial(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """All coefficients except the value at the reference."""
+        """All coefficients except the value at the reference temperature."""
         return self.coefficients[1:]
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Polynomial:
@@ -135,7 +135,7 @@ class CubicSpline(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """The values at all knots except the reference, less the value at the reference."""
+        """The values at all knots except t = 0 (the reference), less the value at t = 0."""
         at = self.knots_k.index(0.0)
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
@@ -174,8 +174,9 @@ class CubicSpline(_Family):
 @dataclass(frozen=True)
 class Exponential(_Family):
     """
-    ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``, which at the reference is 0 (bias) or
-    1 (scale); an e-fold is the change that multiplies a term by e [K], of any sign.
+    ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``, whose value at the
+    reference temperature is 0 (bias) or 1 (scale). An e-fold [K], of any sign, is the change that
+    multiplies a term by e.
     """
 
     constant: float
@@ -253,7 +254,7 @@ def _horner(coefficients: Floats | tuple[float, ...], t: Floats) -> Floats:
 
 
 def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:
-    """Raise ValueError, with the key's name, if a function has another value at the reference."""
+    """Raise ValueError, with the key's name, if a function is not `expected` at t = 0."""
     with np.errstate(all='ignore'):
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:

@@ -101,7 +101,7 @@ def _check_axes(calibration: Calibration, most: float) -> None:
 
 
 def _largest(column: Column, farthest_k: float) -> float:
-    """Return the largest value of a column within `farthest_k` [K] of the reference."""
+    """Return a column's largest value within `farthest_k` [K] of the reference temperature."""
     physical = {'gradient_even': 1.0, 'rate': _RATE_K_S}.get(
         column.kind, (_DIFFERENCE_K + abs(column.rest_k)) ** column.order
     )
