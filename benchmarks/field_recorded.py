@@ -3,9 +3,9 @@
 """
 Owns updates on real recordings, for the benchmark `field.py`.
 
-None of the recordings spans days, so each is cut: a fit of its first part takes the place of the
-laboratory's calibration, each further part that of a start of the node. An update by the parts so
-far is judged on the next part, against the fit of the first.
+None of the recordings spans days, so each is cut into sections: a fit of the first section
+replaces the calibration of a laboratory, and each further section counts as one start of the node.
+An update by all sections so far and the fit of the first section are compared on the next section.
 """
 
 from __future__ import annotations

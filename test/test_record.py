@@ -79,7 +79,7 @@ def check_positions(result):
         assert np.array(found['up']) @ up > np.cos(np.radians(1.0))
         assert found['reason'] == ''
         assert set(found['thermometers']) == {'board', 'case', 'lid'}
-        # Without the cells next to a motion, of three seconds at this rate.
+        # Cells next to a motion, of three seconds at this sample rate, do not count as still.
         assert found['still_s'] == pytest.approx(SOAK_S, abs=20.0)
 
 

@@ -135,7 +135,8 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
     found, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in found:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # The slowest: steps of 1 K in a ramp of 0.2 K/min, two edges 5 min apart behind 15 min.
+        # The slowest detection is that of a ramp of 0.2 K/min by a thermometer with steps of 1 K
+        # behind a lag of 15 min: it needs two changes of the reading, 5 min apart.
         assert each[-1][0] < 0.5 * end_s
 
 

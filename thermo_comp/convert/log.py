@@ -88,7 +88,7 @@ class Stillness:
 
 @dataclass(frozen=True)
 class Finding:
-    """A property of `count` rows; `lines` are the lines of the first few."""
+    """Number of rows of a log with some property, and the line numbers of the first few."""
 
     count: int
     lines: tuple[int, ...] = ()

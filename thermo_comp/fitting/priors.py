@@ -116,7 +116,8 @@ def informative_priors(
     stated = options.ageing_bias, options.ageing_scale
     tried = [(grown(*stated), more) for more in _INFLATIONS]
     if not any(stated):
-        # Candidates of the ageing: of biases in units of g, of scales relative to that of biases.
+        # Candidates of the sd of ageing: of the biases in g; of the relative scale factors, as a
+        # multiple (0, 0.01 or 1) of the number for the biases.
         tried += [
             (grown(ageing * options.gravity, share * ageing), 0.0)
             for share in (0.0, 0.01, 1.0)

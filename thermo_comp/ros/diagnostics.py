@@ -63,7 +63,9 @@ _FAULTS = {
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
 }
 
-_BEYOND_FORCE = 'above the largest of the fit: nonlinear terms continued, the covariance grows'
+_BEYOND_FORCE = (
+    'above the largest of the fit: the nonlinear terms are extrapolated, the covariance grows'
+)
 
 Finding = tuple[int, str]  # level and text
 

@@ -66,7 +66,7 @@ class RestLog:
         self._thread.start()
 
     def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
-        """Queue the line of a rest, and that of the start it belongs to."""
+        """Queue the line of a rest, and the line of the start of the node before it."""
         day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
         try:
             self._lines.put_nowait((str(day), start, rest))

@@ -4,8 +4,8 @@
 Owns the thermal state of a unit at any stamp: its thermometers, regime, memory, set weight.
 
 The compensator, the fit and the report all run this class, so a regressor means the same when it
-is fitted and when it is applied. It is causal and has no clock: readings enter with a stamp, a
-state is returned for a stamp.
+is fitted and when it is applied. The class is causal and reads no clock: each reading has a
+stamp, and the thermal state is requested for a stamp.
 """
 
 from copy import copy

@@ -62,7 +62,7 @@ def naming(key: str) -> Iterator[None]:
 
 
 def check_ranges(value: object, **spans: Bounds) -> None:
-    """Raise ValueError, with the key's name, if a range of a dataclass spans too little."""
+    """Raise ValueError, with the key's name, if a range is reversed or narrower than its bound."""
     for key, span in spans.items():
         lower, upper = getattr(value, key)
         if not lower < upper:
