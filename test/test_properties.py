@@ -129,7 +129,7 @@ def edited(draw):
             branch[last] = base64.b64encode(scaled.tobytes()).decode()
         elif isinstance(value, int | float) and not isinstance(value, bool):
             branch[last] = draw(magnitudes | edges | factors.map(lambda f, v=value: f * v))
-        elif isinstance(value, list) and value and isinstance(value[0], float):
+        elif isinstance(value, list) and value and all(isinstance(v, float) for v in value):
             branch[last] = draw(
                 st.permutations(value)
                 | st.lists(magnitudes | edges, max_size=20)

@@ -98,7 +98,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     Fit the windows with one time constant per axis, or with a bank of time constants.
 
     The bank is fitted if no time constants per axis are found, or if they leave more left-out
-    drift than noise explains; of both fits that with the smaller left-out errors is returned.
+    drift than noise explains; then it is taken if it is better on left-out data, see `is_better`.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'

@@ -151,12 +151,10 @@ class Growth:
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self.regression.inactive(chosen.posterior, columns)
         if BEND in absent:
-            # Some of the many bend columns are tried, chosen by forward selection: at most 16 for
-            # all axes with a bank of lags; with the lags of their parts a score for each axis, as
-            # around a bump.
+            # Some of the many bend columns are tried, chosen by forward selection: at most 60, a
+            # score for each axis, as around a bump of its curve.
             is_bend = self._names == BEND
-            most = 60 if self.regression.windows.has_part_lags else 16
-            knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, most)
+            knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
         # Some groups are tried together, because one effect has columns in all of them: the curve
         # of a part that lags by m, from the board or from the gradient, is

@@ -74,7 +74,7 @@ BANK_TAUS: Final = FINE_TAUS[::2]
 #: Widths of the even columns [K], half-widths of the plays [K], and the lags that they follow [s].
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
-PLAY_TAUS: Final = (0.0, 450.0, 900.0, 1800.0)
+PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
 #: Lags of the parts whose slope changes at a knee [s]; distance [K] and number of the knees.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
@@ -195,15 +195,14 @@ def bank(
 ) -> tuple[Column, ...]:
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
-    of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K]. With
-    `part_taus`, the time constants of the three axes' parts [s] (0: none), all lags have these.
+    of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K],
+    `part_taus` the only time constants of lags [s], one for the part of each axis (0: none).
     """
-    fine, coarse, bend_taus, most_knees = FINE_TAUS, BANK_TAUS, BEND_TAUS, MOST_KNEES
-    play_taus: tuple[float, ...] = PLAY_TAUS
+    fine, coarse, play_taus, bend_taus = FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS
+    most_knees = MOST_KNEES if part_taus is None else MOST_PART_KNEES
     if part_taus is not None:
-        bend_taus, most_knees = tuple(sorted({*part_taus})), MOST_PART_KNEES
+        play_taus = bend_taus = tuple(sorted({*part_taus}))
         fine = coarse = tuple(tau for tau in bend_taus if tau)
-        play_taus = bend_taus
     gradient = _family('gradient', ['gradient'], sensors)
     board = _family('board', ['board'], taus=fine)
     gradient_lag = _family('gradient_lag', ['gradient_lag'], sensors, taus=fine)
