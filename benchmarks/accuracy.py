@@ -99,6 +99,8 @@ class Corrected:
         Bias [counts/cycle] and ln K at the reference, and their claimed standard deviations.
     fit_s : float
         What the fit took, s.
+    calibration : Calibration
+        The result of the fit.
 
     """
 
@@ -107,6 +109,7 @@ class Corrected:
     constants: Floats
     constants_sd: Floats
     fit_s: float
+    calibration: Calibration
 
 
 def fitted(records: Sequence[SimulatedRun], **options: Any) -> Calibration:
@@ -145,6 +148,7 @@ def fit_and_correct(
         np.array([[a.bias for a in axes], np.log([a.scale_factor for a in axes])]),
         known[[[one.static for one in part] for part in (layout.bias, layout.scale)]],
         took,
+        calibration,
     )
 
 

@@ -75,8 +75,9 @@ def test_what_the_bank_needs_remembered():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
     # Separate lags for the plays that follow a lag.
-    assert spec.taus('board') == tuple(sorted((*FINE_TAUS, 450.0, 900.0, 1800.0)))
-    assert spec.taus('case') == spec.taus('tip') == FINE_TAUS
+    taus = {name: tuple(lag.tau_s for lag in spec.lags_of(name)) for name in spec.inputs}
+    assert taus['board'] == tuple(sorted((*FINE_TAUS, 450.0, 900.0, 1800.0)))
+    assert taus['case'] == taus['tip'] == FINE_TAUS
     assert len(spec.plays) == 20
     assert memory_of(()) == MemorySpec()
     with pytest.raises(ValueError, match="one of \\('case',\\), got tip"):
@@ -127,7 +128,7 @@ def test_a_bend_moves_with_the_board_and_its_lag():
     spec = memory_of(columns)
     table = ColumnTable(columns, spec, 20.0)
     state = np.zeros((Layout(spec).width, 1))
-    lag = Layout(spec).lags['board', 60.0]
+    lag = Layout(spec).lags['board', 60.0, 0.0]
     state[BOARD], state[lag] = 24.0, 0.5
     # By the number that it is computed from, and by the board at a given lag.
     assert table.slopes(state)[:, 0].tolist() == [1.0, -1.0]

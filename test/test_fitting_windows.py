@@ -125,7 +125,7 @@ def test_sets_and_start_states_by_hand(bags):
     np.testing.assert_allclose(data.columns[:, 3], w, atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
     # The uncertainty of a lag's start decays with its time constant; in products t multiplies it.
-    taus = [tau for _, tau in memory_of(bank()).lags]
+    taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]
         if lag < 0:
@@ -239,9 +239,9 @@ def states_of(windows, calibration):
     states[:, 0], states[:, 3] = windows.temperature, windows.weight
     raw = dict(zip(windows.model.columns, windows.raw.T, strict=True))
     plain = {(c.kind, c.sensor, c.tau_s, c.width_k): value for c, value in raw.items()}
-    for (tau, width), place in layout.plays.items():
+    for (tau, width, _), place in layout.plays.items():
         states[:, place] = plain['play', 'case', tau, width]
-    for (name, tau), place in layout.lags.items():
+    for (name, tau, _), place in layout.lags.items():
         kind = 'board' if name == 'board' else 'gradient_lag'
         states[:, place] = plain.get((kind, 'case', tau, 0.0), 0.0)
     for place in layout.gradients.values():

@@ -9,12 +9,15 @@ import math
 import numpy as np
 import pytest
 from builders import SECOND_NS
+from scipy.integrate import solve_ivp
 
 from thermo_comp.thermal.memory import (
     START_JITTER,
+    Lag,
     LagBank,
     MemorySpec,
     ThermalMemory,
+    memory_on_grid,
     start_covariance,
 )
 
@@ -74,6 +77,78 @@ def test_a_guess_that_stays_wrong_adds_up_to_its_own_error():
     for second in range(2000):
         bank.step(second * SECOND_NS, 0.0, 0.5 if second else 0.0)
     assert bank.extra == pytest.approx([0.25], rel=1e-6)
+
+
+TWO_STAGES = Lag('board', 900.0, 150.0)
+
+
+def after_two_stages(times, board):
+    """Integrate a part that lags another part, which lags the board, at rest at the start."""
+
+    def slope(t, parts):
+        u = np.interp(t, times, board)
+        return [(u - parts[0]) / 900.0, (parts[0] - parts[1]) / 150.0]
+
+    start = [board[0], board[0]]
+    solved = solve_ivp(slope, (times[0], times[-1]), start, t_eval=times, rtol=1e-9, atol=1e-9,
+                       max_step=5.0)  # fmt: skip
+    return solved.y[1]
+
+
+def test_a_lag_of_two_stages_is_that_of_two_parts_in_series(rng):
+    times = np.arange(0.0, 7200.0, 30.0)
+    board = 20.0 + np.cumsum(0.2 * rng.standard_normal(len(times)))
+    spec = MemorySpec(lags=(TWO_STAGES, ('case', 900.0, 150.0)), plays=((900.0, 0.4, 150.0),))
+    memory = ThermalMemory(spec)
+    streamed = []
+    for time, celsius in zip(times, board, strict=True):
+        stamp = round(time * 1e9)
+        memory.board_step(stamp, celsius)
+        memory.banks['case'].step(stamp, celsius)
+        streamed.append(memory.at(stamp, celsius, [celsius]))
+    streamed = np.array(streamed)
+    part = after_two_stages(times, board)
+    # The solver steps over the corners of the input, with an error of some microkelvin.
+    np.testing.assert_allclose(streamed[:, 0], board - part, atol=1e-5)
+    np.testing.assert_allclose(streamed[:, 2], part, atol=1e-5)
+    # The play follows the part, and not the board.
+    assert np.abs(streamed[:, 4]).max() <= 0.4 + 1e-12
+    held = streamed[:, 4] + part
+    is_inside = np.abs(streamed[:, 4]) < 0.4 - 1e-9
+    still = np.diff(held)[is_inside[1:] & is_inside[:-1]]
+    np.testing.assert_allclose(still, 0.0, atol=1e-5)
+    on_grid = memory_on_grid(spec, 30.0, board, [board])
+    np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
+
+
+def test_the_unknown_start_of_a_lag_of_two_stages(rng):
+    # A board in a long random walk, which then stands still.
+    D, step, n = 0.005, 6.0, 4000
+    tau = np.array([900.0, 150.0])
+    parts = np.zeros((n, 2))
+    for _ in range(900):
+        board = math.sqrt(D * step) * rng.standard_normal((n, 1))
+        parts -= board
+        parts[:, 0] *= math.exp(-step / tau[0])
+        parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
+    P = start_covariance([TWO_STAGES])
+    # n draws: relative sd sqrt(2 / n) = 2.2 %; a step is 4 % of 150 s.
+    assert np.mean(parts[:, 1] ** 2) == pytest.approx(P[0, 0], rel=0.11)
+    for age in (150.0, 900.0, 2700.0):
+        first = parts[:, 0] * math.exp(-age / tau[0])
+        a, b = TWO_STAGES.shares
+        late = a * first + (parts[:, 1] - a * parts[:, 0]) * math.exp(-age / tau[1])
+        share = math.sqrt(np.mean(late**2) / np.mean(parts[:, 1] ** 2))
+        assert TWO_STAGES.start_share(age) == pytest.approx(share, rel=0.05)
+        assert b < 0.0 < share < 1.0
+
+
+def test_a_second_stage_adds_the_errors_of_both():
+    bank = LagBank((900.0,), (150.0,))
+    bank.step(0, 0.0)
+    bank.note_jump(2.0)
+    # (900 + 150) / (900 - 150): at most, were the errors of both stages of opposite sign.
+    assert bank.at(0, 0.0)[1] == pytest.approx([(2.0 * 1.4) ** 2])
 
 
 def plays(*widths):

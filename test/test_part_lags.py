@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import second_simulator
 import strangers
+from accuracy import errors, fit_and_correct
 from strangers_baselines import minutes
 from strangers_cases import (
     FULL_SCALE,
@@ -83,6 +85,28 @@ def test_a_bump_is_no_disturbance_and_no_motion():
     # The bends are a polygon with corners every 0.5 K in a bell of 0.85 K sd.
     assert found.norm < 60.0
     assert found.norm_ratio < 1.5
+
+
+def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
+    # Another simulator: heads that lag the board, pendulums that lag the heads, and an error
+    # proportional to the stress between board and pendulum.
+    unit = second_simulator.unit_of('products', 2)
+    _, program, *_, held = second_simulator.PLANS['mild']
+    records = second_simulator.runs_of(unit, program, second_simulator.directions(9, 5), 5)
+    tests = second_simulator.runs_of(unit, held[0], second_simulator.directions(2, 7), 7,
+                                     soaked_s=21600.0, soaked_c=20.0)  # fmt: skip
+    found = fit_and_correct(records, tests, full_scale=second_simulator.FULL_SCALE)
+    least, _ = second_simulator.floor_of(tests)
+    assert errors(found.specific_force, found.sd, tests).norm < 2.0 * least
+    stages = {(one.tau_s, one.second_tau_s) for one in found.calibration.response if one.tau_s}
+    for head, pendulum in zip(unit.head_s, unit.pendulum_s, strict=True):
+        # The network is integrated in steps of 2 s, which adds a second to a time constant.
+        near = [
+            (tau, second)
+            for tau, second in stages
+            if tau == pytest.approx(head, rel=0.02) and second == pytest.approx(pendulum, rel=0.05)
+        ]
+        assert near, (head, pendulum, stages)
 
 
 @pytest.mark.parametrize('case', [soaks, third_node])

@@ -184,7 +184,9 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     if verbose:
         _say_positions(out, result)
     _say_models(out, result.fit.selected.trials)
-    taus = result.fit.windows.model.part_taus
+    parts = result.fit.windows.model.parts
+    # Behind a steady ramp a lag of two stages is the sum of their time constants.
+    taus = None if parts is None else [sum(stages) for stages in parts]
     if taus is not None:
         out.line(
             'each axis is a curve of the temperature of its part, which lags the board by '

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import astuple, dataclass
 from typing import Any
 
-from ..thermal.memory import MemorySpec
+from ..thermal.memory import Lag, MemorySpec, Play
 from ..thermal.state import Layout
 
 #: Ending of the files of a log; their names are the days, 2026-11-25.rests.
@@ -96,8 +96,8 @@ def _start(data: dict[str, Any]) -> Start:
     sensors, lags, plays = data['memory']
     memory = MemorySpec(
         tuple(map(str, sensors)),
-        tuple((str(name), _number(tau)) for name, tau in lags),
-        tuple((_number(tau), _number(width)) for tau, width in plays),
+        tuple(Lag(str(name), *map(_number, taus)) for name, *taus in lags),
+        tuple(Play(*map(_number, play)) for play in plays),
     )
     start = Start(**{**data, 'memory': memory})
     _whole(start.start_ns)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the choice between models whose columns differ: in their lags (one time constant per axis, or
-a bank of time constants for all axes) and in the condition that ends the dynamic regime.
+Owns the choice between models whose columns differ: in their lags (one lag per axis, or a bank of
+time constants for all axes) and in the condition that ends the dynamic regime.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ..typing import Floats
-from ..unit.columns import Column, bank
+from ..unit.columns import Column, Stages, bank
 from .beginning import Problem, regress
 from .left_out import is_better
 from .nonlinear import with_forces
@@ -27,12 +27,12 @@ from .windows import SET, Model, ThermalWindows, Track, thermal_windows
 def model_of(
     bags: Sequence[ReducedBag],
     options: FitOptions,
-    part_taus: tuple[float, float, float] | None = None,
+    parts: tuple[Stages, Stages, Stages] | None = None,
 ) -> Model:
     """
     Return the model of the prior, or else one with all columns that the bags can determine.
 
-    `part_taus`: time constant of each axis [s], see `Model`; None for the bank of time constants
+    `parts`: time constants of each axis, see `Model`; None for the bank of time constants
     """
     prior, reference = options.prior, options.reference_temperature
     if prior is not None:
@@ -46,7 +46,7 @@ def model_of(
     columns: tuple[Column, ...] = ()
     if options.model != 'golovach':
         rests = gradients_at_rest(bags, sensors)
-        columns = bank(sensors, rests, board_span(bags, reference), part_taus)
+        columns = bank(sensors, rests, board_span(bags, reference), parts)
     if not any(len(bag.case.value) for bag in bags):
         # Without a case thermometer the gradient is estimated from the board's rate, and the
         # columns of the gradient are linear combinations of those of the board.
@@ -55,7 +55,7 @@ def model_of(
         groups = {*options.groups, *options.forced}
         columns = tuple(column for column in columns if column.group in groups)
     sets = sets_of(options, bags)
-    return Model(options.model, sets, columns, sensors, detector, reference, part_taus)
+    return Model(options.model, sets, columns, sensors, detector, reference, parts)
 
 
 def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
@@ -95,17 +95,17 @@ def windows_of(
 
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
-    Fit the windows with one time constant per axis, or with a bank of time constants.
+    Fit the windows with one lag per axis, or with a bank of time constants.
 
-    The bank is fitted if no time constants per axis are found, or if they leave more left-out
-    drift than noise explains; then it is taken if it is better on left-out data, see `is_better`.
+    The bank is fitted if no lag per axis is found, or if the lags leave more left-out drift than
+    noise explains; then it is taken if it is better on left-out data, see `is_better`.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
     parts = find_parts(windows, problem.start) if is_free else None
     if parts is None:
         return regress(windows, problem)
-    model = model_of(bags, options, parts.taus)
+    model = model_of(bags, options, parts.stages)
     of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
     fit = regress(of_parts, problem)
     # The noise of the fit contains what the lags of the parts do not explain.

@@ -1,24 +1,27 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the search for the thermal time constant of each axis.
+Owns the search for the thermal lag of each axis.
 
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
 temperature of one part of the unit: t is the board temperature less the reference temperature, and
-m = T - L_tau(T) the difference between the board temperature T and its first-order lag. The time
-constant tau of an axis minimises the RMS residual of a spline of the bias and a cubic of the scale
-factor, both over x.
+m = T - L(T) the difference between the board temperature T and its lag. The lag has one stage or,
+where a part hangs on another part, two stages in series. Their time constants minimise the RMS
+residual of a spline of the bias and a cubic of the scale factor, both over x.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
+from ..thermal.memory import Lag
 from ..typing import Floats
+from ..unit.columns import Stages
 from .hyperparameters import undisturbed
 from .start import ConstantCalibration, position_means, white_noise_of
 from .windows import ThermalWindows
@@ -32,114 +35,152 @@ _STEP = 2.0**0.5
 @dataclass(frozen=True)
 class Parts:
     """
-    The thermal time constants of the axes of a unit.
+    The thermal lags of the axes of a unit.
 
-    taus: the time constant of each axis [s]; 0 if the axis follows the board without a lag
+    stages: the time constants of each axis; 0 if the axis follows the board without a lag
     undisturbed: factors, up to 1, that reduce the weights of outlying windows, shape (n,)
     noise: mean over the axes of the windows' white noise [m/s^2]
     """
 
-    taus: tuple[float, float, float]
+    stages: tuple[Stages, Stages, Stages]
     undisturbed: Floats
     noise: float
 
 
 def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | None:
     """
-    Find the time constant of each axis, and reduce the weights of windows that do not fit it.
+    Find the lag of each axis, and reduce the weights of windows that do not fit it.
 
-    Returns None if the model with one time constant per axis does not explain the drift of all
-    axes, or if the data do not determine a time constant.
+    Returns None if the model with one lag per axis does not explain the drift of all axes, or if
+    the data do not determine a time constant.
     """
     data, columns = windows.data, windows.model.columns
-    lags = [k for k, column in enumerate(columns) if column.group == 'board']
-    if not lags or not windows.has_temperature:
+    of_board = [k for k, column in enumerate(columns) if column.group == 'board']
+    if not of_board or not windows.has_temperature:
         return None
-    curves = _PartCurves(windows, start, lags)
-    taus = [curves.time_constant(axis) for axis in range(3)]
-    if not all(curves.is_determined(tau, axis) for axis, tau in enumerate(taus)):
-        return None
-    residual = np.column_stack([curves.residual(tau, axis) for axis, tau in enumerate(taus)])
-    factors = undisturbed(residual, data.weight, data.position)
-    square = np.average(residual**2, axis=0, weights=data.weight * factors)
-    # An RMS residual of up to 1.5 times the white noise is attributed to noise. A larger one has
-    # another cause, e.g. slow noise: the time constants are then accepted only if they reduce the
-    # RMS residual of each axis to an eighth or less of that without a lag.
     noise = white_noise_of(data, start.scale)
-    is_at_noise = (square <= (1.5 * noise) ** 2).all()
-    if not is_at_noise and min(map(curves.reduction, taus, range(3))) < 8.0:
-        return None
-    x, y, z = (round(float(tau), 1) for tau in taus)
-    return Parts((x, y, z), factors, float(noise.mean()))
+    accepted = None
+    for has_stress in (False, True):
+        curves = _PartCurves(windows, start, of_board, has_stress=has_stress)
+        lags = [curves.stages(axis, noise[axis]) for axis in range(3)]
+        if not all(curves.is_determined(lag, axis) for axis, lag in enumerate(lags)):
+            continue
+        residual = np.column_stack([curves.residual(lag, axis) for axis, lag in enumerate(lags)])
+        factors = undisturbed(residual, data.weight, data.position)
+        square = np.average(residual**2, axis=0, weights=data.weight * factors)
+        x, y, z = ((round(tau, 1), round(second, 1)) for tau, second in lags)
+        parts = Parts((x, y, z), factors, float(noise.mean()))
+        # An RMS residual of up to 1.5 times the white noise is attributed to noise.
+        if (square <= (1.5 * noise) ** 2).all():
+            return parts
+        # A larger one has another cause, e.g. slow noise: the lags are then accepted only if they
+        # reduce the RMS residual of each axis to an eighth or less of that without a lag.
+        if accepted is None and min(map(curves.reduction, lags, range(3))) >= 8.0:
+            accepted = parts
+    return accepted
 
 
 class _PartCurves:
     """
-    Bias and scale factor of each axis as functions of x (see the module), for any time constant.
+    Bias and scale factor of each axis as functions of x (see the module), for any time constants.
 
-    `lags`: indices of the columns of group `board`, the lags of the board temperature
+    `columns`: indices of the columns of group `board`, the lags of the board temperature
+    `has_stress`: whether both also depend on m, by a coefficient that is linear in x: the stress
+        between a part and the board
     """
 
     def __init__(
-        self, windows: ThermalWindows, start: ConstantCalibration, lags: list[int]
+        self,
+        windows: ThermalWindows,
+        start: ConstantCalibration,
+        columns: list[int],
+        *,
+        has_stress: bool,
     ) -> None:
         data = windows.data
         self._position, self._bag = data.position, data.bag
         self._weight = data.weight[:, None]
         self._first = data.edges[:-1]
         self._t = windows.temperature - windows.model.reference_temperature
-        self._taus = np.array([windows.model.columns[k].tau_s for k in lags])
+        self._taus = np.array([windows.model.columns[k].tau_s for k in columns])
         # The lag m at a time constant tau between those of the columns is interpolated: m / tau
         # is a smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
-        ratios = np.column_stack((windows.rate, windows.raw[:, lags] / self._taus))
+        ratios = np.column_stack((windows.rate, windows.raw[:, columns] / self._taus))
         self._ratio = CubicSpline(_even(np.append(0.0, self._taus)), ratios, axis=1)
-        self._age = data.age
+        self._age, self._has_stress = data.age, has_stress
         force = (position_means(data) - start.bias) / start.scale
         self._force = force[data.position]
         self._measured = self._centred(data.mean / start.scale)
         # Every k-th window: 3000 to 6000 of them are sufficient to find a time constant.
         self._some = slice(None, None, max(len(data.time) // 3000, 1))
 
-    def time_constant(self, axis: int) -> float:
-        """Return the time constant with the smallest RMS residual [s]; 0 if none reduces it."""
+    def stages(self, axis: int, noise: float) -> Stages:
+        """
+        Return the time constants with the smallest RMS residual; 0 if none reduces it.
+
+        A second stage must reduce a residual above the white noise (`noise`) by 5 %.
+        """
+        tau = self._time_constant(axis)
+        single = self._square((tau, 0.0), axis)
+        if single <= 1.1**2 * noise**2 * len(self._t[self._some]):
+            return tau, 0.0
+
+        def log_square(logs: Floats) -> float:
+            return float(np.log(self._square(_in_order(*np.exp(logs)), axis)))
+
+        # The residual has a valley along a constant sum of both time constants.
+        first = np.log([0.8 * tau + 1.0, 0.2 * tau + 1.0])
+        options: Any = {'xatol': 2e-3, 'fatol': 1e-4, 'maxfev': 150}
+        both = _in_order(
+            *np.exp(minimize(log_square, first, method='Nelder-Mead', options=options).x)
+        )
+        return both if self._square(both, axis) < single / 1.05**2 else (tau, 0.0)
+
+    def _time_constant(self, axis: int) -> float:
+        """Return the single time constant with the smallest RMS residual [s]; 0 for none."""
         tried = np.array([*_SHORT_TAUS, *self._taus])
-        squares = [self._square(tau, axis) for tau in tried]
+        squares = [self._square((tau, 0.0), axis) for tau in tried]
         best = float(tried[int(np.argmin(squares))])
         found = minimize_scalar(
-            lambda log_tau: float(np.log(self._square(float(np.exp(log_tau)), axis))),
+            lambda log_tau: float(np.log(self._square((float(np.exp(log_tau)), 0.0), axis))),
             bounds=(float(np.log(best / _STEP)), float(np.log(best * _STEP))),
             method='bounded',
             options={'xatol': 1e-3},
         )
         tau = float(np.exp(found.x))
-        return tau if self._square(tau, axis) < self._square(0.0, axis) else 0.0
+        return tau if self._square((tau, 0.0), axis) < self._square((0.0, 0.0), axis) else 0.0
 
-    def is_determined(self, tau_s: float, axis: int) -> bool:
-        """Whether a time constant larger, or smaller, by `_STEP` adds 5 % to the RMS residual."""
-        others = (tau_s / _STEP, tau_s * _STEP) if tau_s else (_SHORT_TAUS[0] * _STEP,)
-        limit = 1.05**2 * self._square(tau_s, axis)
+    def is_determined(self, lag: Stages, axis: int) -> bool:
+        """Whether time constants larger, or smaller, by `_STEP` add 5 % to the RMS residual."""
+        tau, second = lag
+        others = [(ratio * tau, ratio * second) for ratio in (1.0 / _STEP, _STEP)]
+        if not tau:
+            others = [(_SHORT_TAUS[0] * _STEP, 0.0)]
+        limit = 1.05**2 * self._square(lag, axis)
         return all(self._square(other, axis) > limit for other in others)
 
-    def reduction(self, tau_s: float, axis: int) -> float:
-        """Return the ratio of the RMS residual of an axis without a lag to that with `tau_s`."""
-        return float(np.sqrt(self._square(0.0, axis) / self._square(tau_s, axis)))
+    def reduction(self, lag: Stages, axis: int) -> float:
+        """Return the ratio of the RMS residual of an axis without a lag to that with `lag`."""
+        return float(np.sqrt(self._square((0.0, 0.0), axis) / self._square(lag, axis)))
 
-    def residual(self, tau_s: float, axis: int) -> Floats:
+    def residual(self, lag: Stages, axis: int) -> Floats:
         """Return the residuals of one axis in all windows, shape (n,) [m/s^2]."""
-        series = self._series(tau_s, axis)
+        series = self._series(lag, axis)
         left = self._measured[:, axis] - series @ _solved(series, self._measured[:, axis])
         return np.asarray(left / np.sqrt(self._weight[:, 0]))
 
-    def _square(self, tau_s: float, axis: int) -> float:
+    def _square(self, lag: Stages, axis: int) -> float:
         """Return the weighted sum of squared residuals of an axis over every k-th window."""
-        series = self._series(tau_s, axis)[self._some]
+        series = self._series(lag, axis)[self._some]
         measured = self._measured[self._some, axis]
         left = measured - series @ _solved(series, measured)
         return max(float(left @ left), 1e-30)
 
-    def _series(self, tau_s: float, axis: int) -> Floats:
+    def _series(self, lag: Stages, axis: int) -> Floats:
         """Return the weighted regressors of bias, scale factor and initial lags, shape (n, k)."""
-        x: Floats = self._t - tau_s * self._ratio(_even(np.asarray(tau_s)))
+        x: Floats = self._t.copy()
+        for tau_s, share in zip(lag, Lag('board', *lag).shares if lag[0] else (), strict=False):
+            x -= share * tau_s * self._ratio(_even(np.asarray(tau_s)))
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
         # The spline of the bias has a node every 0.6 K, but at least 4 and at most 60 nodes.
@@ -148,11 +189,13 @@ class _PartCurves:
         knots = np.pad(inner, 3, mode='edge')
         bias = BSpline.design_matrix(np.clip(x, low, low + span), knots, 3).toarray()
         rows = np.arange(len(x))
-        scale = self._force[:, [axis]] * ((x / span)[:, None] ** np.arange(1, 4))
-        # The lag of the part at the start of each bag is unknown and decays with `tau_s`.
+        u = (x / span)[:, None]
+        stress = (self._t - x)[:, None] * u ** np.arange(2.0 * self._has_stress)
+        scale = self._force[:, [axis]] * np.hstack((u ** np.arange(1, 4), stress))
+        # The lag of the part at the start of each bag is unknown and decays.
         begin = np.zeros((len(x), int(self._bag[-1]) + 1))
-        begin[rows, self._bag] = np.exp(-self._age / max(tau_s, 1.0))
-        return self._centred(np.hstack((bias, scale, begin)))
+        begin[rows, self._bag] = np.exp(-self._age / max(lag[0], 1.0))
+        return self._centred(np.hstack((bias, stress, scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
         """Subtract the weighted mean over each position; multiply by the root of the weight."""
@@ -160,6 +203,12 @@ class _PartCurves:
         sums = np.add.reduceat(every, self._first, axis=0)
         level = sums[:, :-1] / sums[:, -1:]
         return np.asarray((values - level[self._position]) * np.sqrt(self._weight))
+
+
+def _in_order(tau_s: float, second_tau_s: float) -> Stages:
+    """Return two time constants, the longer first, the shorter at most 0.9 of it."""
+    longer, shorter = max(tau_s, second_tau_s), min(tau_s, second_tau_s)
+    return float(longer), float(min(shorter, 0.9 * longer))
 
 
 def _even(tau_s: Floats) -> Floats:

@@ -217,8 +217,19 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     Return the columns of the bank whose sum is a column, each with its share.
 
     The parts of two units of a type differ in their time constants. A lag is interpolated between
-    those of the bank, which all units have; a lag of 0 s has the value 0.
+    those of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages is a
+    sum of two lags; its powers are approximated by those of one lag with the sum of the time
+    constants.
     """
+    if column.lag and column.second_tau_s:
+        tau, second = column.tau_s, column.second_tau_s
+        if column.kind not in ('board', 'gradient_lag'):
+            return _on_common_lags(replace(column, tau_s=tau + second, second_tau_s=0.0))
+        return [
+            (common, share * part)
+            for tau_s, share in zip((tau, second), column.lag.shares, strict=True)
+            for common, part in _on_common_lags(replace(column, tau_s=tau_s, second_tau_s=0.0))
+        ]
     if not column.lag or column.kind == 'play' or column.tau_s in FINE_TAUS:
         return [(column, 1.0)]
     at = bisect(FINE_TAUS, column.tau_s)

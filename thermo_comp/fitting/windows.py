@@ -21,7 +21,7 @@ from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Layout
 from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats, Ints
-from ..unit.columns import Column, ColumnTable, memory_of
+from ..unit.columns import Column, ColumnTable, Stages, memory_of
 from ..unit.functions import TemperatureFunction
 from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
@@ -79,7 +79,7 @@ class Model:
     The model of a fit: curves and columns, and the settings of the thermal state.
 
     name: name of the model in the provenance
-    part_taus: time constants of the part of each axis [s], 0 for none; None if not known
+    parts: time constants of the lag of the part of each axis; None if not known
     sensors: thermometers other than the board's; the first is the case's
     """
 
@@ -89,18 +89,19 @@ class Model:
     sensors: tuple[str, ...]
     detector: DetectorSettings
     reference_temperature: float
-    part_taus: tuple[float, float, float] | None = None
+    parts: tuple[Stages, Stages, Stages] | None = None
 
     @property
     def acts_on(self) -> Bools | None:
         """Axes that each column of the response acts on, shape (k, 3); None for all."""
-        if self.part_taus is None:
+        if self.parts is None:
             return None
         return np.array(
             [
                 [
-                    column.tau_s == tau or not (column.kind in ('bend', 'play') or column.lag)
-                    for tau in self.part_taus
+                    (column.tau_s, column.second_tau_s) == stages
+                    or not (column.kind in ('bend', 'play') or column.lag)
+                    for stages in self.parts
                 ]
                 for column in self.columns
             ]
@@ -259,8 +260,8 @@ def _rows(
     by_start = np.zeros_like(raw)
     slopes = table.slopes(states) * factors
     for k, column in enumerate(table.columns):
-        if _has_start(column):
-            by_start[k] = slopes[k] * np.exp(-(time - begin_s) / column.tau_s)
+        if column.lag and _has_start(column):
+            by_start[k] = slopes[k] * column.lag.start_share(time - begin_s, np.exp)
     return _Rows(
         averaged(time[:, None])[:, 0],
         total,

@@ -6,13 +6,17 @@ Owns the thermal memory: lags of the board, lags of the gradients, play operator
 A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The state stored is ``m = u - L``; with u
 linear between two readings (first-order hold) its exact step over dt is
 ``m' = m e + (u' - u) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
+
+A part may hang on another part that lags the board: the lag then has two stages in series, of time
+constants ``tau_1 > tau_2``. By partial fractions its ``m`` is a sum of those of two single lags,
+``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -34,30 +38,77 @@ SPARSE_SHARE: Final = 0.1
 _FADED: Final = 1e-18
 
 
+class Lag(NamedTuple):
+    """
+    A lag of an input, ``'board'`` or the sensor of a gradient, with the time constants of its two
+    stages [s]; the second is shorter, or 0 for a lag of one stage.
+    """
+
+    input: str
+    tau_s: float
+    second_tau_s: float = 0.0
+
+    @property
+    def shares(self) -> tuple[float, float]:
+        """Shares of the single lags of both time constants in this lag."""
+        difference = self.tau_s - self.second_tau_s
+        return self.tau_s / difference, -self.second_tau_s / difference
+
+    def start_share(self, age_s: Any, exp: Any = math.exp) -> Any:
+        """Return the remaining share of the start value at an age [s], 1 to 0, in the RMS."""
+        first = exp(-age_s / self.tau_s)
+        if not self.second_tau_s:
+            return first
+        # The variance of the sum, by the covariance of the single lags: see `start_covariance`.
+        second = exp(-age_s / self.second_tau_s)
+        a, b = self.shares
+        tau, tau_2 = self.tau_s, self.second_tau_s
+        both = 4.0 * a * b * tau * tau_2 / (tau + tau_2)
+        remaining = a * a * tau * first * first + both * first * second
+        remaining = remaining + b * b * tau_2 * second * second
+        return (remaining / (a * a * tau + both + b * b * tau_2)) ** 0.5
+
+
+class Play(NamedTuple):
+    """A play of half-width `width_k` that follows a lag of the board; 0 s: the board itself."""
+
+    tau_s: float
+    width_k: float
+    second_tau_s: float = 0.0
+
+
 @dataclass(frozen=True)
 class MemorySpec:
     """
     Contents of a tracker's memory. `sensors`: thermometers by name, the first leads the detector.
-    `lags`: (input, time constant [s]), the input being ``'board'`` or the sensor of a gradient, in
-    the order of `inputs`. `plays`: (time constant of the board lag that the play follows, 0 for
-    the board itself; half-width [K]).
+    `lags`: in the order of `inputs`.
     """
 
     sensors: tuple[str, ...] = ('case',)
-    lags: tuple[tuple[str, float], ...] = ()
-    plays: tuple[tuple[float, float], ...] = ()
+    lags: tuple[Lag, ...] = ()
+    plays: tuple[Play, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'lags', tuple(Lag(*lag) for lag in self.lags))
+        object.__setattr__(self, 'plays', tuple(Play(*play) for play in self.plays))
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """The board and the sensors, in the order of their lags."""
         return (BOARD_INPUT, *self.sensors)
 
-    def taus(self, name: str) -> tuple[float, ...]:
-        """Return the time constants of the lags of one input [s]."""
-        return tuple(tau for owner, tau in self.lags if owner == name)
+    def lags_of(self, name: str) -> tuple[Lag, ...]:
+        """Return the lags of one input."""
+        return tuple(lag for lag in self.lags if lag.input == name)
 
 
-def start_covariance(lags: Sequence[tuple[str, float]]) -> Floats:
+def _single(lags: Iterable[Lag]) -> dict[tuple[str, float], int]:
+    """Return the number of each single lag that the lags contain, by input and time constant."""
+    taus = [(lag.input, tau) for lag in lags for tau in (lag.tau_s, lag.second_tau_s) if tau]
+    return {key: k for k, key in enumerate(dict.fromkeys(taus))}
+
+
+def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
     """
     Return the covariance of lags at their start, before any input was seen, (n, n) [K^2].
 
@@ -65,24 +116,44 @@ def start_covariance(lags: Sequence[tuple[str, float]]) -> Floats:
     D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0 for lags of different
     inputs. From then on it decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
     """
-    tau = np.array([tau for _, tau in lags])
-    names = np.array([name for name, _ in lags])
+    every = [Lag(*lag) for lag in lags]
+    single = _single(every)
+    tau = np.array([tau for _, tau in single])
+    names = np.array([name for name, _ in single])
     sd = np.where(names == BOARD_INPUT, BOARD_START_SD, GRADIENT_START_SD)
     with np.errstate(invalid='ignore'):
         shape = tau[:, np.newaxis] * tau / (tau[:, np.newaxis] + tau)
     is_same = names[:, np.newaxis] == names
     shape[np.diag_indices_from(shape)] *= 1.0 + START_JITTER
-    result: Floats = np.where(is_same, 2.0 / START_TAU_S * sd * sd * shape, 0.0)
-    return result
+    covariance = np.where(is_same, 2.0 / START_TAU_S * sd * sd * shape, 0.0)
+    shares = np.zeros((len(every), len(single)))
+    for k, lag in enumerate(every):
+        for tau_s, share in zip((lag.tau_s, lag.second_tau_s), lag.shares, strict=True):
+            if tau_s:
+                shares[k, single[lag.input, tau_s]] = share
+    return np.asarray(shares @ covariance @ shares.T)
 
 
 class LagBank:
-    """The lags of one input; `start_ns` is the first stamp since the last `forget`."""
+    """
+    The lags of one input; `start_ns` is the first stamp since the last `forget`.
 
-    def __init__(self, taus: tuple[float, ...]) -> None:
-        self.taus = taus
-        self._sparse_s = SPARSE_SHARE * min(taus, default=math.inf)
-        self._nil = [0.0] * len(taus)
+    The state are single lags of the time constants `taus`; a lag of two stages is a sum of two.
+    """
+
+    def __init__(self, taus: tuple[float, ...], second_taus: tuple[float, ...] = ()) -> None:
+        seconds = second_taus or (0.0,) * len(taus)
+        self._lags = tuple(Lag('', *both) for both in zip(taus, seconds, strict=True))
+        number = {tau: k for (_, tau), k in _single(self._lags).items()}
+        self.taus = tuple(number)
+        #: For each lag the numbers of its single lags and their shares; empty without sums.
+        self._sums = [
+            (number[lag.tau_s], number.get(lag.second_tau_s, 0), *lag.shares) for lag in self._lags
+        ]
+        if not any(seconds):
+            self._sums = []
+        self._sparse_s = SPARSE_SHARE * min(self.taus, default=math.inf)
+        self._nil = [0.0] * len(self.taus)
         self.forget()
 
     def forget(self) -> None:
@@ -109,7 +180,7 @@ class LagBank:
         if dt_ns <= 0:
             self.lagging = [m + change for m in self.lagging]
         else:
-            self.lagging, self.extra = self.at(stamp_ns, value)
+            self.lagging, self.extra = self._single_at(stamp_ns, value)
             self.stamp_ns = stamp_ns
             if sd or dt_ns * 1e-9 > self._sparse_s:
                 self._doubt(_coefficients(self.taus, dt_ns)[0], dt_ns * 1e-9, change, sd)
@@ -137,6 +208,15 @@ class LagBank:
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
         """Return ``u - L`` [K] and the extra variance of each lag at a stamp, with u = `value`."""
+        lagging, extra = self._single_at(stamp_ns, value)
+        if not self._sums:
+            return lagging, extra
+        # The errors of the two single lags have common causes: standard deviations add.
+        return [a * lagging[i] + b * lagging[j] for i, j, a, b in self._sums], [
+            (a * math.sqrt(extra[i]) - b * math.sqrt(extra[j])) ** 2 for i, j, a, b in self._sums
+        ]
+
+    def _single_at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -153,7 +233,7 @@ class LagBank:
         """Return the remaining share of each lag's start value at a stamp, 1 to 0."""
         start_ns = self.start_ns
         age = 0.0 if start_ns is None else max(stamp_ns - start_ns, 0) * 1e-9
-        return [math.exp(-age / tau) for tau in self.taus]
+        return [lag.start_share(age) for lag in self._lags]
 
 
 @lru_cache(maxsize=1024)
@@ -177,12 +257,20 @@ class ThermalMemory:
     def __init__(self, spec: MemorySpec) -> None:
         self.spec = spec
         #: The lags of each input, by the input's name.
-        self.banks = {name: LagBank(spec.taus(name)) for name in spec.inputs}
+        self.banks = {}
+        for name in spec.inputs:
+            lags = spec.lags_of(name)
+            taus = tuple(lag.tau_s for lag in lags)
+            self.banks[name] = LagBank(taus, tuple(lag.second_tau_s for lag in lags))
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
         #: For each play: index of the board lag that it follows, -1 for the board; half-width [K].
-        self._inputs = [self.board.taus.index(tau) if tau else -1 for tau, _ in spec.plays]
-        self._widths = [width for _, width in spec.plays]
+        lags = spec.lags_of(BOARD_INPUT)
+        self._inputs = [
+            lags.index(Lag(BOARD_INPUT, play.tau_s, play.second_tau_s)) if play.tau_s else -1
+            for play in spec.plays
+        ]
+        self._widths = [play.width_k for play in spec.plays]
         self._held: list[float] = []
 
     def forget(self) -> None:
@@ -194,7 +282,7 @@ class ThermalMemory:
     def board_step(self, stamp_ns: int, board: float) -> None:
         """Take the next estimate of the board temperature [degC]."""
         self.board.step(stamp_ns, board)
-        lagging = self.board.lagging
+        lagging, _ = self.board.at(stamp_ns, board)
         inputs = [board if place < 0 else board - lagging[place] for place in self._inputs]
         self._held = [
             v - r if p < v - r else v + r if p > v + r else p
@@ -241,16 +329,22 @@ def memory_on_grid(
     """
     inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
     columns: list[Floats] = []
-    behind: dict[float, Floats] = {}
-    for name, tau in spec.lags:
+    single: dict[tuple[str, float], Floats] = {}
+    for name, tau in _single(spec.lags):
         u = inputs[name]
         lost = -math.expm1(-step_s / tau)
-        m = _recursion(1.0 - lost, np.diff(u, prepend=u[:1]) * (lost * tau / step_s))
-        if name == BOARD_INPUT:
-            behind[tau] = m
-        columns += [m if name == BOARD_INPUT else u - m, np.zeros_like(u)]
-    for tau, width in spec.plays:
-        v = board - behind[tau] if tau else board
+        driven = np.diff(u, prepend=u[:1]) * (lost * tau / step_s)
+        single[name, tau] = _recursion(1.0 - lost, driven)
+    behind: dict[Lag, Floats] = {}
+    for lag in spec.lags:
+        u, m = inputs[lag.input], single[lag.input, lag.tau_s]
+        if lag.second_tau_s:
+            share, second_share = lag.shares
+            m = share * m + second_share * single[lag.input, lag.second_tau_s]
+        behind[lag] = m
+        columns += [m if lag.input == BOARD_INPUT else u - m, np.zeros_like(u)]
+    for tau, width, second_tau in spec.plays:
+        v = board - behind[Lag(BOARD_INPUT, tau, second_tau)] if tau else board
         columns.append(_play(v, width) - v)
     return np.column_stack(columns) if columns else np.zeros((len(board), 0), dtype=np.float64)
 

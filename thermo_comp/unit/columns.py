@@ -3,8 +3,8 @@
 """
 Owns the columns of the thermal response: the regressors of bias and scale.
 
-With ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s, ``L_tau(u)`` the first-order
-lag of u, ``P_r(v)`` the play of half-width r on v, and w the weight of the dynamic regime:
+With ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s, ``L_tau(u)`` the lag of u,
+``P_r(v)`` the play of half-width r on v, and w the weight of the dynamic regime:
 
 =============  ==========================  ================================================
 kind           value u                     effect
@@ -49,7 +49,7 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 
 from ..quantities import QUANTITIES
-from ..thermal.memory import BOARD_INPUT, MemorySpec
+from ..thermal.memory import BOARD_INPUT, Lag, MemorySpec, Play
 from ..thermal.state import BOARD, RATE, WEIGHT, Layout
 from ..typing import Floats
 from .functions import by_element, hold
@@ -81,6 +81,8 @@ LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
 _Value = Annotated[float, QUANTITIES['value of a column']]
+#: Time constants of the two stages of a lag [s]; the second is 0 for a lag of one stage.
+Stages = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,11 @@ class Column:
         QUANTITIES['lag'],
         'Time constant of the lag (board, gradient_lag, square, cube; play, bend: 0 = none).',
     ] = 0.0
+    second_tau_s: Annotated[
+        float,
+        QUANTITIES['lag'],
+        'Time constant of a second stage of the lag, in series with the first; 0 = none.',
+    ] = 0.0
     width_k: Annotated[
         float, QUANTITIES['width'], 'Width of gradient_even, half-width of play.'
     ] = 0.0
@@ -157,6 +164,10 @@ class Column:
                 raise ValueError(
                     f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
                 )
+        if self.second_tau_s > 0.9 * self.tau_s:
+            raise ValueError(
+                f'`second_tau_s` must be at most 0.9 of `tau_s`, got {self.second_tau_s:g}'
+            )
 
     @property
     def is_of_sensor(self) -> bool:
@@ -165,11 +176,13 @@ class Column:
         return is_loss or self.kind in ('gradient', 'gradient_lag', 'gradient_even', 'size')
 
     @property
-    def lag(self) -> tuple[str, float] | None:
-        """The lag that the value is computed from: input and time constant [s]; None if none."""
+    def lag(self) -> Lag | None:
+        """The lag that the value is computed from; None if it has none."""
         if self.kind == 'gradient_lag':
-            return self.sensor, self.tau_s
-        return (BOARD_INPUT, self.tau_s) if self.tau_s and self.kind != 'gradient_even' else None
+            return Lag(self.sensor, self.tau_s, self.second_tau_s)
+        if self.tau_s and self.kind != 'gradient_even':
+            return Lag(BOARD_INPUT, self.tau_s, self.second_tau_s)
+        return None
 
     @property
     def order(self) -> int:
@@ -191,28 +204,30 @@ def bank(
     sensors: Sequence[str] = ('case',),
     at_rest: Mapping[str, float] | None = None,
     span_k: tuple[float, float] = (0.0, 0.0),
-    part_taus: Sequence[float] | None = None,
+    parts: Sequence[Stages] | None = None,
 ) -> tuple[Column, ...]:
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
     of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K],
-    `part_taus` the only time constants of lags [s], one for the part of each axis (0: none).
+    `parts` the only time constants of lags, those of the part of each axis.
     """
-    fine, coarse, play_taus, bend_taus = FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS
-    most_knees = MOST_KNEES if part_taus is None else MOST_PART_KNEES
-    if part_taus is not None:
-        play_taus = bend_taus = tuple(sorted({*part_taus}))
-        fine = coarse = tuple(tau for tau in bend_taus if tau)
+    fine, coarse, of_plays, of_bends = (
+        [(tau, 0.0) for tau in taus] for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
+    )
+    most_knees = MOST_KNEES if parts is None else MOST_PART_KNEES
+    if parts is not None:
+        of_plays = of_bends = sorted({*parts})
+        fine = coarse = [stages for stages in of_bends if stages[0]]
     gradient = _family('gradient', ['gradient'], sensors)
-    board = _family('board', ['board'], taus=fine)
-    gradient_lag = _family('gradient_lag', ['gradient_lag'], sensors, taus=fine)
-    products = _family('product', ['board'], powers=(1, 2), taus=coarse)
+    board = _family('board', ['board'], lags=fine)
+    gradient_lag = _family('gradient_lag', ['gradient_lag'], sensors, lags=fine)
+    products = _family('product', ['board'], powers=(1, 2), lags=coarse)
     mixed = _family('gradient_x_temperature', ['gradient'], sensors, powers=(1,))
     mixed += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse)
     # The bias of a part that lags the board by m is a polynomial in its temperature t - m:
     # (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
-    square = _family('square', ['square'], powers=(0, 1), taus=coarse)
-    square += _family('square', ['cube'], taus=coarse)
+    square = _family('square', ['square'], powers=(0, 1), lags=coarse)
+    square += _family('square', ['cube'], lags=coarse)
     even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
     even = [replace(column, range=(0.0, 1.0)) for column in even]
     even += _family('gradient_even', ['size', 'square'], sensors, (0, 1, 2))
@@ -223,12 +238,12 @@ def bank(
         for column in even
         if rest.get(column.sensor)
     ]
-    play = _family('play', ['play'], taus=play_taus, widths=PLAY_WIDTHS)
+    play = _family('play', ['play'], lags=of_plays, widths=PLAY_WIDTHS)
     least_k = LEAST_KNEE_K * MOST_KNEES / most_knees
     n_knees = min(int((span_k[1] - span_k[0]) / least_k), most_knees)
     bend = [
-        Column('bend', 'bend', tau_s=tau, knee_k=knee, range=UNBOUNDED)
-        for tau in bend_taus
+        Column('bend', 'bend', tau_s=tau, second_tau_s=second, knee_k=knee, range=UNBOUNDED)
+        for tau, second in of_bends
         for knee in np.linspace(*span_k, n_knees + 2)[1:-1].round(3).tolist()
     ]
     return (*gradient, *board, *gradient_lag, *products, *mixed, *square, *even, *play, *bend)
@@ -239,31 +254,33 @@ def _family(
     kinds: Sequence[Any],
     sensors: Sequence[str] = ('case',),
     powers: Sequence[int] = (0,),
-    taus: Sequence[float] = (0.0,),
+    lags: Sequence[Stages] = ((0.0, 0.0),),
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
     """Return the columns of a group with all combinations of the properties."""
     return [
-        Column(group, kind, sensor, tau, width, power=power, range=UNBOUNDED)
-        for sensor, kind, power, tau, width in product(sensors, kinds, powers, taus, widths)
+        Column(group, kind, sensor, tau, second, width, power=power, range=UNBOUNDED)
+        for sensor, kind, power, (tau, second), width in product(
+            sensors, kinds, powers, lags, widths
+        )
     ]
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
     """Return the memory that columns need of a tracker; ValueError if a sensor is missing."""
-    lags: set[tuple[str, float]] = set()
-    plays: set[tuple[float, float]] = set()
+    lags: set[Lag] = set()
+    plays: set[Play] = set()
     for column in columns:
         if column.is_of_sensor and column.sensor not in sensors:
             raise ValueError(f'`sensor` must be one of {tuple(sensors)}, got {column.sensor}')
         if column.lag:
             lags.add(column.lag)
         if column.kind == 'play':
-            plays.add((column.tau_s, column.width_k))
+            plays.add(Play(column.tau_s, column.width_k, column.second_tau_s))
     order = (BOARD_INPUT, *sensors)
     return MemorySpec(
         tuple(sensors),
-        tuple(sorted(lags, key=lambda lag: (order.index(lag[0]), lag[1]))),
+        tuple(sorted(lags, key=lambda lag: (order.index(lag.input), *lag[1:]))),
         tuple(sorted(plays)),
     )
 
@@ -386,7 +403,7 @@ def _source(column: Column, layout: Layout) -> tuple[int, str, float, float]:
     if column.kind == 'rate':
         place = RATE
     elif column.kind == 'play':
-        place = layout.plays[column.tau_s, column.width_k]
+        place = layout.plays[Play(column.tau_s, column.width_k, column.second_tau_s)]
     elif column.lag:
         place = layout.lags[column.lag]
     elif column.kind == 'bend':

@@ -119,9 +119,9 @@ class Correction:
         self._felt, self._felt_starts = np.unique(pair[self._felt_columns], return_index=True)
         # Derivatives by T: +1 of ``T - L``, -1 of ``g = T_s - T``, 0 of the lag of a gradient.
         signs = [-1.0 for _ in self.memory.sensors]
-        signs += [float(name == BOARD_INPUT) for name, _ in self.memory.lags]
+        signs += [float(lag.input == BOARD_INPUT) for lag in self.memory.lags]
         lags = Layout(self.memory).lags
-        self._lagged = [at for (name, _), at in lags.items() if name == BOARD_INPUT]
+        self._lagged = [at for lag, at in lags.items() if lag.input == BOARD_INPUT]
         self._signs = np.array(signs)[:, np.newaxis, np.newaxis]
 
     def bias_scale(self, states: Floats) -> Floats:

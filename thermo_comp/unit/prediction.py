@@ -189,9 +189,11 @@ def ramp_states(
     gradient = calibration.board_lag_s * rate
     states[:, BOARD], states[:, RATE], states[:, WEIGHT] = temperature, rate, float(rate != 0.0)
     states[:, list(layout.gradients.values())] = gradient
-    for (name, tau), place in layout.lags.items():
-        end = tau * rate if name == BOARD_INPUT else gradient
-        states[:, place] = end * (1.0 - np.exp(-np.asarray(lasted_s) / tau))
-    for (_, width), place in layout.plays.items():
-        states[:, place] = -np.sign(rate) * width
+    for lag, place in layout.lags.items():
+        for tau, share in zip(lag[1:], lag.shares, strict=True):
+            end = tau * rate if lag.input == BOARD_INPUT else gradient
+            reached = 1.0 - np.exp(-np.asarray(lasted_s) / tau) if tau else 1.0
+            states[:, place] += share * end * reached
+    for play, place in layout.plays.items():
+        states[:, place] = -np.sign(rate) * play.width_k
     return states
