@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from builders import SECOND_NS
+from builders import SECOND_NS, calibration, term
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.thermal.memory import MemorySpec
+from thermo_comp.thermal.memory import Lag, MemorySpec
 from thermo_comp.thermal.settings import DetectorSettings
-from thermo_comp.thermal.state import BOARD, GRADIENT, Layout
+from thermo_comp.thermal.state import BOARD, GRADIENT, Layout, Rate
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.columns import (
     BANK_TAUS,
@@ -23,6 +23,8 @@ from thermo_comp.unit.columns import (
     bank,
     memory_of,
 )
+from thermo_comp.unit.correction import Correction
+from thermo_comp.unit.terms import TERMS, Term
 
 WIDE = {'range': UNBOUNDED}
 
@@ -67,7 +69,7 @@ def test_change_is_even_about_rest():
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
     np.testing.assert_array_equal(values[:, 1], values[:, 2])
-    slopes = table.slopes(states)
+    slopes, _ = table.slopes(states)
     np.testing.assert_allclose(slopes[:, 1], -slopes[:, 2])
 
 
@@ -128,20 +130,41 @@ def test_a_bend_moves_with_the_board_and_its_lag():
     spec = memory_of(columns)
     table = ColumnTable(columns, spec, 20.0)
     state = np.zeros((Layout(spec).width, 1))
-    lag = Layout(spec).lags['board', 60.0, 0.0]
+    lag = Layout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
     # By the number that it is computed from, and by the board at a given lag.
-    assert table.slopes(state)[:, 0].tolist() == [1.0, -1.0]
-    assert table.board_slopes(state)[:, 0].tolist() == [1.0, 1.0]
+    assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
-    assert not table.slopes(state).any()
-    assert not table.board_slopes(state).any()
-    assert (
-        ColumnTable([Column('gradient', 'gradient', **WIDE)], MemorySpec(), 20.0).board_slopes(
-            np.zeros((7, 1))
-        )
-        is None
-    )
+    assert not np.any(table.slopes(state))
+    flow = ColumnTable([Column('gradient', 'gradient', **WIDE)], MemorySpec(), 20.0)
+    assert flow.slopes(np.zeros((7, 1)))[1] is None
+
+
+def test_a_new_kind_is_one_class(monkeypatch):
+    class RateSquare(Term):
+        kind, formula, order, form = 'rate_square', '(dT_s/dt)^2', 2, TERMS['square'].form
+
+        def source(self, column):
+            return Rate(column.sensor)
+
+    monkeypatch.setitem(TERMS, 'rate_square', RateSquare())
+    unit = calibration(response=(term('rate_square', (0.0, 0.0, 3e6), range=(0.0, 1e-3)),))
+    correction = Correction(unit)
+    assert correction.memory == MemorySpec(rates=('case',))
+    tracker = ThermalTracker(unit.detector, correction.memory)
+    for second in range(600):
+        tracker.read('board', second * SECOND_NS, 20.0)
+        tracker.read('case', second * SECOND_NS, 20.0 + 0.01 * second)
+    state = tracker.sample(599 * SECOND_NS)
+    place = Layout(correction.memory).places[Rate('case')]
+    rate, variance = state[place : place + 2]
+    line = correction.line(state, state, np.zeros(9), 0.0)
+    assert line[8] == pytest.approx(3e6 * rate**2) == pytest.approx(300.0, rel=0.02)
+    # d(bias)/d(rate) = 2 * 3e6 rate; 300 counts per m/s^2.
+    by_rate = (2.0 * 3e6 * rate / 300.0) ** 2 * variance
+    assert line[18] - correction.noise[2] == pytest.approx(by_rate, rel=1e-6)
+    with pytest.raises(ValueError, match=r'make a bias within .* of its column'):
+        calibration(response=(term('rate_square', (1e13, 0.0, 0.0), range=(0.0, 1e9)),))
 
 
 @given(st.lists(st.floats(-60.0, 60.0), min_size=5, max_size=5))
@@ -164,6 +187,7 @@ def test_one_state_has_the_bits_of_many(boards):
 @pytest.mark.parametrize(
     ('keys', 'message'),
     [
+        ({'kind': 'pressure', **WIDE}, '`kind` must be one of .*, got pressure'),
         ({'range': (1.0, 1.0)}, '`range` must be .* got .1.0, 1.0.'),
         ({'kind': 'board', **WIDE}, '`tau_s` must be greater than 0 for board'),
         ({'kind': 'cube', **WIDE}, '`tau_s` must be greater than 0 for cube'),
@@ -173,10 +197,3 @@ def test_one_state_has_the_bits_of_many(boards):
 def test_refusals(keys, message):
     with pytest.raises(ValueError, match=message):
         Column(**{'group': 'gradient', 'kind': 'gradient', **keys})
-
-
-def test_a_kind_without_a_source_is_not_read_from_a_gradient():
-    unknown = Column('rate', 'rate', **WIDE)
-    object.__setattr__(unknown, 'kind', 'pressure')
-    with pytest.raises(ValueError, match='kind pressure'):
-        ColumnTable([unknown], memory_of([]), 20.0)

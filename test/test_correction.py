@@ -230,7 +230,8 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     _, states = states_of(unit, rng)
     _, state, shares = states[0]
     slow = SlowUncertainty(unit, correction).at(state, shares)
-    first = 5 + 2 * len(SENSORS)
+    layout = Layout(correction.memory)
+    places = [layout.places[lag] for lag in layout.lags]
     draws = rng.multivariate_normal(np.zeros(len(lags)), start_covariance(lags), size=4000)
     state = np.array(state)
     moved = np.repeat(state[:, np.newaxis], len(draws), axis=1)
@@ -239,7 +240,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     )
     # Squares of lags are nonlinear: the spread is tested for small changes.
     small = 0.05
-    moved[first : first + 2 * len(lags) : 2] += small * (draws * np.array(shares)).T
+    moved[places] += small * (draws * np.array(shares)).T
     found = Correction(wide).bias_scale(moved)
     for axis, (a, b, c) in enumerate(np.reshape(slow, (3, 3))):
         bias, scale = found[:, axis]
@@ -339,8 +340,8 @@ def sd_at(unit, board, behind=0.0, force=0.0):
     layout = Layout(correction.memory)
     state = [0.0] * layout.width
     state[BOARD] = board
-    for place in layout.lags.values():
-        state[place] = behind
+    for lag in layout.lags:
+        state[layout.places[lag]] = behind
     line = correction.line(tuple(state), tuple(state), np.zeros(9), 0.0)
     a, b, c = line[12:15]
     return math.sqrt(a - correction.noise[0] + b * force + c * force**2)

@@ -19,9 +19,9 @@ from thermo_comp.fitting.reduction import Readings
 from thermo_comp.fitting.windows import N_SECTIONS, Model, thermal_windows
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
 from thermo_comp.simulation.run import arrays
-from thermo_comp.thermal.memory import MemorySpec, ThermalMemory, memory_on_grid
+from thermo_comp.thermal.memory import Lag, MemorySpec, Play, ThermalMemory, memory_on_grid
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
-from thermo_comp.thermal.state import Layout
+from thermo_comp.thermal.state import Gradient, Layout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.columns import ColumnTable, bank, memory_of
@@ -170,14 +170,14 @@ def test_the_lag_of_a_column_moves_it_as_its_slope_says():
     spec = memory_of(columns)
     layout, table = Layout(spec), ColumnTable(columns, spec, 20.0)
     state = np.zeros((layout.width, 1))
-    state[0], state[layout.gradients['case']] = 27.0, 0.4
-    for lag, place in layout.lags.items():
-        state[place] = 0.3 + 1e-4 * lag[1]
-    expected = (table.slopes(state) * table.factors(state[0], state[3])[0])[:, 0]
+    state[0], state[layout.places[Gradient('case')]] = 27.0, 0.4
+    for lag in layout.lags:
+        state[layout.places[lag]] = 0.3 + 1e-4 * lag.tau_s
+    expected = (table.slopes(state)[0] * table.factors(state[0], state[3])[0])[:, 0]
     for k, column in enumerate(columns):
-        if column.lag and column.kind != 'play':
+        if isinstance(column.source, Lag):
             step = np.zeros_like(state)
-            step[layout.lags[column.lag]] = 1e-6
+            step[layout.places[column.source]] = 1e-6
             slope = (table.values(state + step) - table.values(state - step))[k, 0] / 2e-6
             assert slope == pytest.approx(expected[k], rel=1e-6)
 
@@ -239,13 +239,14 @@ def states_of(windows, calibration):
     states[:, 0], states[:, 3] = windows.temperature, windows.weight
     raw = dict(zip(windows.model.columns, windows.raw.T, strict=True))
     plain = {(c.kind, c.sensor, c.tau_s, c.width_k): value for c, value in raw.items()}
-    for (tau, width, _), place in layout.plays.items():
-        states[:, place] = plain['play', 'case', tau, width]
-    for (name, tau, _), place in layout.lags.items():
-        kind = 'board' if name == 'board' else 'gradient_lag'
-        states[:, place] = plain.get((kind, 'case', tau, 0.0), 0.0)
-    for place in layout.gradients.values():
-        states[:, place] = windows.gradient
+    for one, place in layout.places.items():
+        if isinstance(one, Play):
+            states[:, place] = plain['play', 'case', one.tau_s, one.width_k]
+        elif isinstance(one, Lag):
+            kind = 'board' if one.input == 'board' else 'gradient_lag'
+            states[:, place] = plain.get((kind, 'case', one.tau_s, 0.0), 0.0)
+        elif isinstance(one, Gradient):
+            states[:, place] = windows.gradient
     return states.T
 
 

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline as ReferenceSpline
 
-from thermo_comp.thermal.memory import memory_on_grid
-from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Layout
+from thermo_comp.thermal.memory import Lag, Play, memory_on_grid
+from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Gradient, Layout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial, check_reference, hold
@@ -167,21 +167,23 @@ def test_ramp_is_what_the_memory_makes_of_one(rate):
     # Second route: the memory of the fit goes through a ramp after a soak, second by second.
     one = replace(rich_calibration(), board_lag_s=100.0)
     spec = Correction(one).memory
+    first = Layout(spec).width - 2 * len(spec.lags) - len(spec.plays)
     gradient = np.append(0.0, np.full(900, 100.0 * rate))
     board = 25.0 + rate * np.arange(-900.0, 1.0)
     lived = memory_on_grid(spec, 1.0, board, [gradient] * len(spec.sensors))[-1]
     (state,) = ramp_states(one, board[-1:], rate, 900.0)
     layout = Layout(spec)
     assert state[[BOARD, RATE, WEIGHT]].tolist() == [25.0, rate, 1.0]
-    assert state[list(layout.gradients.values())] == pytest.approx(100.0 * rate)
-    # The gradient is reached within a second of the 900, not at once.
-    for lag, place in layout.lags.items():
-        assert state[place] == pytest.approx(lived[place - layout.first_lag], rel=2e-3), lag
-    for (tau, width), place in layout.plays.items():
-        # Half an hour would also push the play on the lag to its end.
-        if not tau:
-            assert state[place] == pytest.approx(-width * np.sign(rate))
-            assert state[place] == pytest.approx(lived[place - layout.first_lag])
+    for quantity, place in layout.places.items():
+        if isinstance(quantity, Gradient):
+            assert state[place] == pytest.approx(100.0 * rate)
+        elif isinstance(quantity, Lag):
+            # The gradient is reached within a second of the 900, not at once.
+            assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
+        elif isinstance(quantity, Play) and not quantity.tau_s:
+            # Half an hour would also push the play on the lag to its end.
+            assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
+            assert state[place] == pytest.approx(lived[place - first])
 
 
 def test_statistics_of_scalars_by_hand():

@@ -38,6 +38,14 @@ def rest(number):
     return Rest(stamp, 1000, (1.0, -2.0, 2941.25), (3.0,) * 3, (*state, 0.25, 0.0), (0.5,))
 
 
+def test_a_state_with_rates_survives_the_log_and_one_without_names_none():
+    start = replace(START, memory=replace(START.memory, rates=('case',)))
+    one = rest(1)
+    one = replace(one, state=(*one.state[:7], 0.01, 1e-9, *one.state[7:]))
+    assert decode(encode(start) + encode(one)) == ([(start, one)], 0)
+    assert b'"memory":[["case"],[["board",60.0,0.0]],[]]' in encode(START)
+
+
 @pytest.fixture
 def unit(tmp_path):
     path = tmp_path / 'unit.yaml'

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from builders import SECOND_NS
 
-from thermo_comp.thermal.memory import MemorySpec
+from thermo_comp.thermal.memory import Lag, MemorySpec
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
-from thermo_comp.thermal.state import GRADIENT, MEMORY_SETTLED_SD, VAR_GRADIENT, Layout
+from thermo_comp.thermal.state import GRADIENT, MEMORY_SETTLED_SD, VAR_GRADIENT, Layout, Rate
 from thermo_comp.thermal.tracker import LOST_GRADIENT_RELATIVE_SD, ThermalTracker
 
 TAU_S = 900.0
@@ -37,7 +37,8 @@ def test_memory_of_a_ramp_is_the_closed_form(step_s):
     expected = rate * TAU_S * (1.0 - math.exp(-ramp_s / TAU_S))
     # The thermometer needs some readings to follow the ramp: m remembers at most that lag, tens of
     # mK of 6.5 K.
-    assert tracker.sample(end_ns)[Layout(LAG).first_lag] == pytest.approx(expected, abs=0.05)
+    lag = Layout(LAG).places[Lag('board', TAU_S)]
+    assert tracker.sample(end_ns)[lag] == pytest.approx(expected, abs=0.05)
     assert tracker.is_settled(end_ns)
 
 
@@ -119,3 +120,18 @@ def test_lost_case_is_replaced_by_the_boards_rate():
     # Lag times rate, the closed form of a first-order lag in a ramp.
     assert state[GRADIENT] == pytest.approx(600.0 * 0.01, abs=0.1)
     assert math.sqrt(state[VAR_GRADIENT]) >= LOST_GRADIENT_RELATIVE_SD * 5.9
+
+
+def test_rate_of_a_sensor_is_the_slope_of_its_readings_or_that_of_the_board():
+    spec = MemorySpec(rates=('case',))
+    tracker = ThermalTracker(DetectorSettings(), spec, ThermalConfig(case_timeout_s=10.0))
+    t = np.arange(0, 1000)
+    feed(tracker, 20.0 + 0.01 * t, 20.0 + 0.02 * t)
+    place = Layout(spec).places[Rate('case')]
+    rate, variance = tracker.sample(999 * SECOND_NS)[place : place + 2]
+    assert rate == pytest.approx(0.02, rel=0.01)
+    assert 0.0 < variance < 0.001**2
+    feed(tracker, 20.0 + 0.01 * np.arange(1000, 1100), start_s=1000)
+    rate, variance = tracker.sample(1099 * SECOND_NS)[place : place + 2]
+    assert rate == pytest.approx(0.01, rel=0.01)
+    assert math.sqrt(variance) == pytest.approx(0.01, rel=0.01)

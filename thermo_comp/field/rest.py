@@ -58,8 +58,9 @@ class Rest:
 def encode(one: Start | Rest) -> bytes:
     """Write one record as a line."""
     if isinstance(one, Start):
-        memory = [one.memory.sensors, one.memory.lags, one.memory.plays]
-        data: Any = {**vars(one), 'memory': memory}
+        # Rates stand there only if there are any: earlier releases do not know them.
+        *memory, rates = vars(one.memory).values()
+        data: Any = {**vars(one), 'memory': [*memory, rates] if rates else memory}
     else:
         # Nine digits: a resolution of 0.001 counts for a converter of 24 bits.
         data = [
@@ -93,11 +94,12 @@ def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
 
 
 def _start(data: dict[str, Any]) -> Start:
-    sensors, lags, plays = data['memory']
+    sensors, lags, plays, *rates = data['memory']
     memory = MemorySpec(
         tuple(map(str, sensors)),
         tuple(Lag(str(name), *map(_number, taus)) for name, *taus in lags),
         tuple(Play(*map(_number, play)) for play in plays),
+        tuple(map(str, *rates)) if rates else (),
     )
     start = Start(**{**data, 'memory': memory})
     _whole(start.start_ns)

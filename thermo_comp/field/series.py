@@ -243,17 +243,11 @@ def series_of(
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
     """Return the places of a state's elements, and of its lags' shares, in the log's state."""
-    layout, target = Layout(memory), Layout(wanted)
-    places = np.arange(target.width)
     try:
-        for kind in ('gradients', 'lags'):
-            for name, place in getattr(target, kind).items():
-                at = getattr(layout, kind)[name]
-                places[place : place + 2] = at, at + 1
-        for play, place in target.plays.items():
-            places[place] = layout.plays[play]
+        logged, target = Layout(memory).numbers, Layout(wanted).numbers
+        places = np.array([logged.index(number) for number in target], np.int64)
         return places, np.array([memory.lags.index(lag) for lag in wanted.lags], np.int64)
-    except (KeyError, ValueError) as error:
+    except ValueError as error:
         raise RecordingError(
             'the rests were logged with a calibration that has other columns; their thermal state '
             'does not contain the lags of this calibration'
@@ -323,7 +317,7 @@ def _by_parameter(
         on_bias = v[:, [axis]] / scale[:, [axis]]
         blocks = (layout.bias[axis], on_bias), (layout.scale[axis], on_bias * K * x[:, [axis]])
         for k, (block, factor) in enumerate(blocks):
-            result[:, block.static : block.end] = regressors[axis + 3 * k].T * factor
+            result[:, block.rows] = regressors[axis + 3 * k].T * factor
     if correction.of_force is not None:
         by_term = v[:, :, np.newaxis] * correction.of_force.regressors(x, columns[BOARD])
         places = slice(layout.nonlinear, layout.misalignment)

@@ -208,9 +208,9 @@ def _moved(
         bias, scale = layout.bias[axis], layout.scale[axis]
         K = correction.K[axis, 0]
         rows = np.zeros((4, layout.n_parameters))
-        rows[0, bias.static : bias.end] = regressors[axis][:, 0] / K
-        rows[1, scale.static : scale.end] = regressors[axis + 3][:, 0] * gravity
-        rows[2, bias.static : bias.end] = (regressors[axis] @ [0.0, -1.0, 1.0]) / K
+        rows[0, bias.rows] = regressors[axis][:, 0] / K
+        rows[1, scale.rows] = regressors[axis + 3][:, 0] * gravity
+        rows[2, bias.rows] = (regressors[axis] @ [0.0, -1.0, 1.0]) / K
         rows[3] = rows[0] + rows[1] * float(weights @ series.force[:, axis]) / gravity
         prior, posterior = (rows @ one @ rows.T for one in (solution.prior, solution.posterior))
         jitter = 1e-12 * np.trace(prior[:2, :2]) * np.eye(2) + 1e-30 * np.eye(2)

@@ -13,6 +13,7 @@ from datetime import datetime, timezone
 import numpy as np
 
 from .. import __version__
+from ..thermal.state import USUAL_BOARD_LAG_S
 from ..typing import Floats
 from ..unit.calibration import (
     FORMAT_VERSION,
@@ -25,7 +26,7 @@ from ..unit.calibration import (
     Unit,
     parameter_layout,
 )
-from ..unit.columns import USUAL_BOARD_LAG_S, Column
+from ..unit.columns import Column
 from ..unit.nonlinearity import Kind, Nonlinearity
 from ..unit.posterior import posterior_of
 from ..unit.provenance import Provenance, ResidualSummary, Source
@@ -143,12 +144,13 @@ def _valid_columns(
     for k in used:
         column = windows.model.columns[k]
         valid = column.range
-        if column.kind != 'gradient_even':
-            valid = _range(windows.raw[:, k], 0.01, _LINEAR_RANGE**column.order)
+        if column.term.bounds is None:
+            order = column.term.order
+            valid = _range(windows.raw[:, k], 0.01, _LINEAR_RANGE**order)
             if not state.weights[:, :, n_curves + k].any():
                 # A column with zero weight contributes only to the covariance, which is valid at
                 # any value.
-                most = (upper - lower) ** column.order
+                most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
         result.append(
             replace(column, range=valid if known is None else union((valid, column.range)))

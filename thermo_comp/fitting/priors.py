@@ -21,10 +21,12 @@ from scipy.linalg import solve_triangular
 
 from .. import __version__
 from ..errors import FitError
+from ..thermal.memory import Lag
 from ..typing import Floats
 from ..unit.calibration import POPULATION, Calibration, RegimeSet, parameter_layout
 from ..unit.columns import FINE_TAUS, Column
 from ..unit.provenance import Provenance, Source
+from ..unit.terms import LINE
 from .assembly import blank_terms, file_parameters, parameters_of, union, with_parameters
 from .equations import as_vector
 from .nonlinear import without_terms
@@ -82,7 +84,7 @@ def with_calibration(calibration: Calibration, regression: Regression, state: St
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError('the curves of the prior differ from axis to axis, or from bias to scale')
     # Per axis: the level of the static set, then the other coefficients relative to this level.
-    both = np.array([[values[block.static : block.end] for block in part] for part in layout[:2]])
+    both = np.array([[values[block.rows] for block in part] for part in layout[:2]])
     both[..., layout.bias[0].dynamic] -= both[..., 0]
     both[0] /= regression.nominal_scale[:, None]
     return replace(state, bias=both[0, :, 0], weights=both[..., 1:] * regression.rms)
@@ -221,24 +223,24 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     sum of two lags; its powers are approximated by those of one lag with the sum of the time
     constants.
     """
-    if column.lag and column.second_tau_s:
-        tau, second = column.tau_s, column.second_tau_s
-        if column.kind not in ('board', 'gradient_lag'):
+    if column.second_tau_s:
+        tau, second, lag = column.tau_s, column.second_tau_s, column.source
+        if not isinstance(lag, Lag) or column.term.form is not LINE:
             return _on_common_lags(replace(column, tau_s=tau + second, second_tau_s=0.0))
         return [
             (common, share * part)
-            for tau_s, share in zip((tau, second), column.lag.shares, strict=True)
+            for tau_s, share in zip((tau, second), lag.shares, strict=True)
             for common, part in _on_common_lags(replace(column, tau_s=tau_s, second_tau_s=0.0))
         ]
-    if not column.lag or column.kind == 'play' or column.tau_s in FINE_TAUS:
+    if not isinstance(column.source, Lag) or column.tau_s in FINE_TAUS:
         return [(column, 1.0)]
     at = bisect(FINE_TAUS, column.tau_s)
     if not at:
         share = column.tau_s / FINE_TAUS[0]
         shortest = replace(column, tau_s=FINE_TAUS[0])
-        if column.kind == 'bend':
+        if column.term.is_temperature:
             return [(replace(column, tau_s=0.0), 1.0 - share), (shortest, share)]
-        return [(shortest, share**column.order)]
+        return [(shortest, share**column.term.order)]
     if at == len(FINE_TAUS):
         return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
     # Cubic interpolation over the logarithm of the time constant, by Lagrange's polynomials.
@@ -276,7 +278,7 @@ def _relative_to(
     values, factor = parameters_of(calibration), np.ones(calibration.posterior.n_parameters)
     layout, into = parameter_layout(calibration), parameter_layout(like)
     for axis, (bias, relative) in enumerate(zip(layout.bias, layout.scale, strict=True)):
-        factor[bias.static : bias.end] = mean_K[axis] / scale[axis]
+        factor[bias.rows] = mean_K[axis] / scale[axis]
         values[[relative.static, relative.dynamic]] = np.log(scale[axis] / mean_K[axis])
     placed = np.zeros((into.n_parameters, len(values)))
     others = np.arange(layout.nonlinear, len(values))

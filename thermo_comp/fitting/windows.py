@@ -10,15 +10,15 @@ The thermal tracker of the compensator is run over the bags' readings, and the c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import FitError
-from ..thermal.memory import MemorySpec, memory_on_grid, start_covariance
+from ..thermal.memory import Lag, MemorySpec, memory_on_grid, start_covariance
 from ..thermal.settings import DetectorSettings, ThermalConfig
-from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Layout
+from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Gradient, Layout
 from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats, Ints
 from ..unit.columns import Column, ColumnTable, Stages, memory_of
@@ -99,8 +99,7 @@ class Model:
         return np.array(
             [
                 [
-                    (column.tau_s, column.second_tau_s) == stages
-                    or not (column.kind in ('bend', 'play') or column.lag)
+                    (column.tau_s, column.second_tau_s) == stages or not column.source.is_of_part
                     for stages in self.parts
                 ]
                 for column in self.columns
@@ -258,10 +257,10 @@ def _rows(
     curves = model.sets.columns(board - model.reference_temperature, weight)
     # Derivative of each column by the initial state of its lag.
     by_start = np.zeros_like(raw)
-    slopes = table.slopes(states) * factors
+    slopes = table.slopes(states)[0] * factors
     for k, column in enumerate(table.columns):
-        if column.lag and _has_start(column):
-            by_start[k] = slopes[k] * column.lag.start_share(time - begin_s, np.exp)
+        if isinstance(column.source, Lag):
+            by_start[k] = slopes[k] * column.source.start_share(time - begin_s, np.exp)
     return _Rows(
         averaged(time[:, None])[:, 0],
         total,
@@ -280,7 +279,7 @@ def _rows(
 def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: Ints) -> Windows:
     """Make the data of the regression."""
     groups, columns, acts_on = model.sets.groups, model.columns, model.acts_on
-    n_curves = len(groups)
+    n_curves, lags = len(groups), Layout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 3]
     # A support tilts with board and case temperature, linearly and with the square of the latter.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
@@ -288,7 +287,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     is_tilting = tilt_rms > 0.0
     # Hysteresis and bends of the scale are not modelled, and it has no level of the dynamic set:
     # Fc = 1 at the reference temperature in both regimes.
-    in_scale = [*[True] * n_curves, *(column.kind not in ('play', 'bend') for column in columns)]
+    in_scale = [*[True] * n_curves, *(column.term.has_scale for column in columns)]
     in_scale[model.sets.level] = False
     return Windows(
         position=position,
@@ -299,11 +298,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         mean=rows.mean,
         columns=rows.columns,
         groups=(*groups, *(column.group for column in columns)),
-        lag=np.array(
-            [-1] * n_curves
-            + [spec.lags.index(column.lag) if _has_start(column) else -1 for column in columns],
-            dtype=np.int64,
-        ),
+        lag=np.array([-1] * n_curves + [lags.get(one.source, -1) for one in columns], np.int64),
         kelvins=_kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient),
         start=np.hstack((np.zeros((len(t), n_curves)), rows.start)),
         start_covariance=start_covariance(spec.lags),
@@ -313,11 +308,6 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         if acts_on is None
         else np.vstack((np.ones((n_curves, 3), dtype=bool), acts_on)),
     )
-
-
-def _has_start(column: Column) -> bool:
-    """Whether a column depends on the unknown initial state of a lag."""
-    return column.lag is not None and column.kind != 'play'
 
 
 def _sections(position: Ints, time: Floats) -> Ints:
@@ -343,14 +333,14 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     # The level of the dynamic set corresponds to the RMS gradient, which also differs in ramps.
     steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
-        steepest.append(column.steepest(series, flow) * farthest**column.power)
+        steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)
     slope = np.array(steepest)
     return np.where(slope > 0.0, rms / np.where(slope > 0.0, slope, 1.0), 0.0)
 
 
 def _track(bag: ReducedBag, model: Model) -> Track:
     """Run the tracker over the readings of a bag."""
-    spec = MemorySpec(model.sensors)
+    spec = replace(memory_of(model.columns, model.sensors), lags=(), plays=())
     if not len(bag.board.value):
         # Without a thermometer assume that the unit has been at the reference temperature for
         # 1e9 s, so that all lags are 0.
@@ -374,6 +364,7 @@ def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats]:
     states = track.states
     grid = np.asarray(track.start_s + track.step_s * np.arange(len(states)), dtype=np.float64)
     # The lags are evaluated on the whole grid at once, which is much faster than at each reading.
-    gradients = [states[:, GRADIENT + 2 * k] for k in range(len(spec.sensors))]
+    layout = Layout(spec)
+    gradients = [states[:, layout.places[Gradient(name)]] for name in spec.sensors]
     memory = memory_on_grid(spec, track.step_s, states[:, BOARD], gradients)
     return grid, np.hstack((states, memory))

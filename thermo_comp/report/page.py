@@ -12,9 +12,11 @@ from matplotlib.figure import Figure
 
 from ..files import PAGE, PICTURE, write_atomically
 from ..fitting.reduction import ReducedBag
+from ..fitting.windows import CURVE, SET
 from ..judging.evaluation import drifts_of
 from ..thermal.regime import Regime
 from ..unit.gravity import STANDARD_GRAVITY
+from ..unit.terms import GROUPS
 from . import figures_bags as of_bags
 from . import figures_unit as of_unit
 from .certificate import (
@@ -100,6 +102,7 @@ def render_report(
         conformity=conformity(evidence),
         over_temperature=over_temperature(evidence, info),
         programs=_programs(evidence),
+        groups={CURVE: 'curve over temperature', SET: 'difference of the sets', **GROUPS},
         withheld=withheld_because(evidence, info),
         is_gravity_known=unclaimed_gravity_sd(evidence, info) is not None,
         error=position_error,

@@ -21,6 +21,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from ..typing import Floats
+from .quantity import Quantity
 
 #: Name of the board temperature as the input of a lag or play.
 BOARD_INPUT: Final = 'board'
@@ -38,15 +39,17 @@ SPARSE_SHARE: Final = 0.1
 _FADED: Final = 1e-18
 
 
-class Lag(NamedTuple):
-    """
-    A lag of an input, ``'board'`` or the sensor of a gradient, with the time constants of its two
-    stages [s]; the second is shorter, or 0 for a lag of one stage.
-    """
-
+class _Lag(NamedTuple):
     input: str
     tau_s: float
     second_tau_s: float = 0.0
+
+
+class Lag(_Lag, Quantity):
+    """
+    The board temperature less its lag, or the lag of the gradient of a sensor (`input`) [K], with
+    the time constants of its two stages [s]; the second is shorter, or 0 for a lag of one stage.
+    """
 
     @property
     def shares(self) -> tuple[float, float]:
@@ -69,24 +72,37 @@ class Lag(NamedTuple):
         return (remaining / (a * a * tau + both + b * b * tau_2)) ** 0.5
 
 
-class Play(NamedTuple):
-    """A play of half-width `width_k` that follows a lag of the board; 0 s: the board itself."""
-
+class _Play(NamedTuple):
     tau_s: float
     width_k: float
     second_tau_s: float = 0.0
 
 
+class Play(_Play, Quantity):
+    """
+    A play of half-width `width_k` less its input, a lag of the board (0 s: the board itself) [K].
+    It has no variance: an error of its input moves the play along.
+    """
+
+    input = BOARD_INPUT
+
+    @property
+    def lag(self) -> Lag | None:
+        """The lag that the play follows; None if it follows the board."""
+        return Lag(BOARD_INPUT, self.tau_s, self.second_tau_s) if self.tau_s else None
+
+
 @dataclass(frozen=True)
 class MemorySpec:
     """
-    Contents of a tracker's memory. `sensors`: thermometers by name, the first leads the detector.
-    `lags`: in the order of `inputs`.
+    Contents of a tracker's state. `sensors`: thermometers by name, the first leads the detector.
+    `lags`: in the order of `inputs`. `rates`: sensors whose rate of change is in the state.
     """
 
     sensors: tuple[str, ...] = ('case',)
     lags: tuple[Lag, ...] = ()
     plays: tuple[Play, ...] = ()
+    rates: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'lags', tuple(Lag(*lag) for lag in self.lags))
@@ -266,10 +282,7 @@ class ThermalMemory:
         self.is_empty = not spec.lags and not spec.plays
         #: For each play: index of the board lag that it follows, -1 for the board; half-width [K].
         lags = spec.lags_of(BOARD_INPUT)
-        self._inputs = [
-            lags.index(Lag(BOARD_INPUT, play.tau_s, play.second_tau_s)) if play.tau_s else -1
-            for play in spec.plays
-        ]
+        self._inputs = [lags.index(play.lag) if play.lag else -1 for play in spec.plays]
         self._widths = [play.width_k for play in spec.plays]
         self._held: list[float] = []
 
@@ -343,9 +356,9 @@ def memory_on_grid(
             m = share * m + second_share * single[lag.input, lag.second_tau_s]
         behind[lag] = m
         columns += [m if lag.input == BOARD_INPUT else u - m, np.zeros_like(u)]
-    for tau, width, second_tau in spec.plays:
-        v = board - behind[Lag(BOARD_INPUT, tau, second_tau)] if tau else board
-        columns.append(_play(v, width) - v)
+    for play in spec.plays:
+        v = board - behind[play.lag] if play.lag else board
+        columns.append(_play(v, play.width_k) - v)
     return np.column_stack(columns) if columns else np.zeros((len(board), 0), dtype=np.float64)
 
 

@@ -1,26 +1,70 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the thermal state of a unit at one stamp: by name, and as the flat tuple of a sample."""
+"""Owns the thermal state of a unit at one stamp: its quantities, and their places in a sample."""
 
+from dataclasses import dataclass
 from typing import Final
 
-from .memory import MemorySpec
+from ..quantities import QUANTITIES
+from .memory import BOARD_INPUT, MemorySpec
+from .quantity import Quantity
 
 #: Sd of every lag below which the memory counts as settled [K].
 MEMORY_SETTLED_SD: Final = 0.05
+#: Lag of a board behind its case if the bags do not determine it [s]: 15 min, typical of a housing
+#: of a few hundred grams in a chamber.
+USUAL_BOARD_LAG_S: Final = 900.0
 
-#: Layout of `ThermalTracker.sample`: from `GRADIENT` on (gradient, variance) per sensor, then
-#: (lag, extra variance) per lag, then each play less its input (`Layout` says where).
+#: First places of a sample: board temperature and its variance, board rate, weight of the dynamic
+#: set, 1.0 while the regime is unknown, gradient of the first sensor and its variance.
 (BOARD, VAR_BOARD, RATE, WEIGHT, UNKNOWN, GRADIENT, VAR_GRADIENT) = range(7)
 
 
+@dataclass(frozen=True)
+class Board(Quantity):
+    """The board temperature [degC]."""
+
+    input: str = BOARD_INPUT
+
+
+@dataclass(frozen=True)
+class Rate(Quantity):
+    """The rate of change of a thermometer [K/s]."""
+
+    input: str = BOARD_INPUT
+    largest = (QUANTITIES['temperature rate'].at_most or 0.0) / 60.0
+    per_kelvin = 1.0 / USUAL_BOARD_LAG_S
+    is_of_part = False
+    by_board = 0.0
+
+
+@dataclass(frozen=True)
+class Gradient(Quantity):
+    """The temperature of a sensor less that of the board [K]."""
+
+    input: str
+    is_of_part = False
+    by_board = -1.0
+
+
 class Layout:
-    """Index of each gradient, lag and play in a sample; a variance follows a gradient or lag."""
+    """
+    The numbers of a sample: those up to UNKNOWN; pairs of a quantity and its variance; plays.
+
+    pairs, lags: number of each pair, and of each lag; the pairs of lags are `lag_pairs`
+    variances: places of the variances, in the order of the pairs
+    numbers: name of each number, in order
+    places: place of each quantity
+    """
 
     def __init__(self, spec: MemorySpec) -> None:
-        self.gradients = {name: GRADIENT + 2 * k for k, name in enumerate(spec.sensors)}
-        self.first_lag = GRADIENT + 2 * len(spec.sensors)
-        self.lags = {lag: self.first_lag + 2 * k for k, lag in enumerate(spec.lags)}
-        self.first_play = self.first_lag + 2 * len(spec.lags)
-        self.plays = {play: self.first_play + k for k, play in enumerate(spec.plays)}
-        self.width = self.first_play + len(spec.plays)
+        sensors: list[Quantity] = [*map(Gradient, spec.sensors), *map(Rate, spec.rates)]
+        self.lags: dict[Quantity, int] = {lag: k for k, lag in enumerate(spec.lags)}
+        quantities = [*sensors, *self.lags]
+        self.pairs = {one: k for k, one in enumerate(quantities)}
+        self.lag_pairs = slice(len(sensors), len(self.pairs))
+        self.variances = slice(VAR_GRADIENT, GRADIENT + 2 * len(self.pairs), 2)
+        numbers = [number for one in quantities for number in (one, (one, 'variance'))]
+        self.numbers = (Board(), VAR_BOARD, Rate(), WEIGHT, UNKNOWN, *numbers, *spec.plays)
+        self.width = len(self.numbers)
+        self.places = {one: k for k, one in enumerate(self.numbers) if isinstance(one, Quantity)}

@@ -16,7 +16,7 @@ from .memory import BOARD_INPUT, MemorySpec, ThermalMemory, start_covariance
 from .plausibility import Fault, LeadCheck, SensorCheck
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
-from .state import GRADIENT, MEMORY_SETTLED_SD, VAR_BOARD, VAR_GRADIENT, Layout
+from .state import MEMORY_SETTLED_SD, USUAL_BOARD_LAG_S, Layout
 from .thermometer import Thermometer
 
 #: Relative sd of the gradient estimated from the board's rate while a sensor is lost.
@@ -33,7 +33,7 @@ class ThermalTracker:
         detector: DetectorSettings,
         memory: MemorySpec | None = None,
         config: ThermalConfig | None = None,
-        board_lag_s: float = 900.0,
+        board_lag_s: float = USUAL_BOARD_LAG_S,
     ) -> None:
         self.settings = detector
         self.spec = memory or MemorySpec()
@@ -184,12 +184,8 @@ class ThermalTracker:
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
         """
         Thermal state at a stamp as a flat tuple, in the order of `state.Layout`; the board must
-        have at least one reading.
-
-        Board temperature [degC], its variance [K^2], its rate [K/s], weight, 1.0 while the regime
-        is unknown; (gradient [K], variance from the sensor's side [K^2]) per sensor; (lag [K],
-        variance beyond that of its start [K^2]) per lag: ``T - L`` of the board, L of a gradient;
-        play less its input [K].
+        have at least one reading. The variance of a gradient is that from the sensor's side, the
+        variance of a lag is that beyond the variance of its start.
         """
         board, rate, var_board = self.board.at(stamp_ns)
         decided_ns = self._decided_ns
@@ -198,8 +194,7 @@ class ThermalTracker:
             and self.detector.regime is not Regime.UNKNOWN
             and (stamp_ns - decided_ns) * 1e-9 <= self._unwatched_s
         )
-        state = [board, var_board, rate, self.weight_at(stamp_ns), 0.0 if is_known else 1.0]
-        gradients = []
+        gradients, pairs = [], []
         for name in self.spec.sensors:
             sensor = self.thermometers[name]
             if self.is_live(stamp_ns, sensor):
@@ -208,22 +203,19 @@ class ThermalTracker:
             else:
                 gradient, variance = self._lost_gradient(stamp_ns, rate)
             gradients.append(gradient)
-            state.append(gradient)
-            state.append(variance)
-        self._add_doubt(stamp_ns, state)
+            pairs += [gradient, variance + self.checks[name].doubt(stamp_ns)]
+        for name in self.spec.rates:
+            sensor = self.thermometers[name]
+            is_live = self.is_live(stamp_ns, sensor)
+            # The rate of a lost sensor is that of the board, and as uncertain as it is large.
+            pairs += [sensor.rate, sensor.var_rate] if is_live else [rate, rate * rate]
+        var_board += self.checks[BOARD_INPUT].doubt(stamp_ns)
+        # If the lead is reversed, the topics of case and board may be swapped.
+        is_reversed = self.lead.is_reversed
+        var_board += gradients[0] * gradients[0] if is_reversed else self.lead.doubt
         if not self.memory.is_empty:
-            state += self.memory.at(stamp_ns, board, gradients)
-        return tuple(state)
-
-    def _add_doubt(self, stamp_ns: int, state: list[float]) -> None:
-        state[VAR_BOARD] += self.checks[BOARD_INPUT].doubt(stamp_ns)
-        for place, name in enumerate(self.spec.sensors):
-            state[VAR_GRADIENT + 2 * place] += self.checks[name].doubt(stamp_ns)
-        if self.lead.is_reversed:
-            # The topics of case and board may be swapped.
-            state[VAR_BOARD] += state[GRADIENT] * state[GRADIENT]
-        else:
-            state[VAR_BOARD] += self.lead.doubt
+            pairs += self.memory.at(stamp_ns, board, gradients)
+        return board, var_board, rate, self.weight_at(stamp_ns), float(not is_known), *pairs
 
     def _lost_gradient(self, stamp_ns: int, rate: float) -> tuple[float, float]:
         """Estimate a gradient from the board's rate, while its sensor is lost."""
@@ -241,7 +233,7 @@ class ThermalTracker:
     def is_settled(self, stamp_ns: int) -> bool:
         """Whether the start, which was not seen, no longer matters to the memory."""
         layout = Layout(self.spec)
-        extra = self.sample(stamp_ns)[layout.first_lag + 1 : layout.first_play : 2]
+        extra = self.sample(stamp_ns)[layout.variances][layout.lag_pairs]
         start = start_covariance(self.spec.lags).diagonal().tolist()
         shares = self.memory.start_shares(stamp_ns)
         return all(

@@ -3,69 +3,38 @@
 """
 Owns the columns of the thermal response: the regressors of bias and scale.
 
-With ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s, ``L_tau(u)`` the lag of u,
-``P_r(v)`` the play of half-width r on v, and w the weight of the dynamic regime:
-
-=============  ==========================  ================================================
-kind           value u                     effect
-=============  ==========================  ================================================
-gradient       g_s                         heat flow
-rate           dT_board/dt [K/s]           the same, from one thermometer
-board          T_board - L_tau(T_board)    parts that lag the board
-gradient_lag   L_tau(g_s)                  parts between the thermometers
-square         (T_board - L_tau)^2, or     curves of parts that lag the board; losses of a
-               q_s^2 where tau is 0        flow
-cube           (T_board - L_tau)^3         the same, and a flow that is not linear
-gradient_even  tanh((q_s / width)^2)       heat load, equal for both directions of the flow
-size           abs(q_s)                    the same, as of a heat pump
-play           P_r(v) - v, v = t or        rate-independent hysteresis
-               v = L_tau(t)
-bend           max(v - knee, 0)            a slope that changes at one temperature of a part
-=============  ==========================  ================================================
-
-Kinds *gradient_even* and *size* have the same value for heating and cooling. They are computed
-from ``q_s = g_s - rest``: rest is 0 in the group *gradient_even*, and in the group
-*gradient_even_about_rest* the gradient at rest, where self-heating makes the board warmer than
-the case.
-
-A column is ``phi = u t^power (1 | 1 - w | w)``, with u held at the edges of the column's range
-and t at those of the calibrated temperatures. Curves go on along their tangent beyond them, the
-powers of t do not: with power p the tangent of a product would be u p t^(p - 1), and no recording
-tells how a coefficient that changes with temperature goes on.
+A column is ``phi = u t^power (1 | 1 - w | w)``, with u the value of its kind (`unit.terms`), t the
+board temperature from the reference, and w the weight of the dynamic regime; u is held at the
+edges of the column's range and t at those of the calibrated temperatures. Curves go on along their
+tangent beyond them, the powers of t do not: with power p the tangent of a product would be
+u p t^(p - 1), and no recording tells how a coefficient that changes with temperature goes on.
 
 The groups of the bank are its kinds. *product* contains board, and *gradient_x_temperature*
 contains gradient and gradient_lag, times a power of temperature: coefficients that change with
-temperature.
+temperature. *gradient_even* contains also size and square, and *gradient_even_about_rest* the same
+about the gradient at rest.
 
 Tracker, fit, correction, covariance and file use this table.
 """
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 
 from ..quantities import QUANTITIES
 from ..thermal.memory import BOARD_INPUT, Lag, MemorySpec, Play
-from ..thermal.state import BOARD, RATE, WEIGHT, Layout
+from ..thermal.quantity import Quantity
+from ..thermal.state import BOARD, WEIGHT, Gradient, Layout, Rate
 from ..typing import Floats
-from .functions import by_element, hold
+from .functions import hold
 from .schema import check_ranges
+from .terms import GROUPS, LINE, TERMS, Term
 
 #: A column range that limits no value.
 UNBOUNDED: Final = (-1e9, 1e9)
-#: Kinds of columns whose value is a power of a temperature difference.
-_ORDERS: Final = {
-    'square': 2,
-    'cube': 3,
-    **dict.fromkeys(('gradient', 'board', 'gradient_lag', 'size', 'play', 'bend'), 1),
-}
-#: Lag of a board behind its case if the bags do not determine it [s]: 15 min, typical of a housing
-#: of a few hundred grams in a chamber.
-USUAL_BOARD_LAG_S: Final = 900.0
 #: Time constants of the bank [s], in ratios of sqrt(2), from a few readings to the longest memory
 #: that bags show. Linear lags use all of them, so that a part of 100 ug/K with a time constant
 #: between two of them is matched; products and powers, which are smaller, use every other.
@@ -80,6 +49,12 @@ BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
+# The names of groups and kinds, as the schema of the file reads them.
+if TYPE_CHECKING:
+    _Group: TypeAlias = str
+    _Kind: TypeAlias = str
+else:
+    _Group, _Kind = Literal[tuple(GROUPS)], Literal[tuple(TERMS)]
 _Value = Annotated[float, QUANTITIES['value of a column']]
 #: Time constants of the two stages of a lag [s]; the second is 0 for a lag of one stage.
 Stages = tuple[float, float]
@@ -89,38 +64,11 @@ Stages = tuple[float, float]
 class Column:
     """One regressor of the thermal response; its keys are the calibration file's."""
 
-    group: Annotated[
-        Literal[
-            'gradient',
-            'rate',
-            'board',
-            'gradient_lag',
-            'product',
-            'gradient_x_temperature',
-            'square',
-            'gradient_even',
-            'gradient_even_about_rest',
-            'play',
-            'bend',
-        ],
-        'Group of columns that the fit keeps or drops together.',
-    ]
+    group: Annotated[_Group, 'Group of columns that the fit keeps or drops together.']
     kind: Annotated[
-        Literal[
-            'gradient',
-            'rate',
-            'board',
-            'gradient_lag',
-            'square',
-            'cube',
-            'size',
-            'gradient_even',
-            'play',
-            'bend',
-        ],
-        'g_s; dT_board/dt [K/s]; T - lagged T; lagged g_s; (T - lagged T)^2, or q_s^2 without '
-        'lag; (T - lagged T)^3; abs(q_s); tanh((q_s / width)^2); play of t minus t; max(t - '
-        'knee_k, 0), of t lagged, where g_s = T_s - T_board and q_s = g_s - rest_k.',
+        _Kind,
+        '; '.join(term.formula for term in TERMS.values())
+        + ', where g_s = T_s - T_board and q_s = g_s - rest_k.',
     ]
     sensor: Annotated[str, 'The thermometer s of g_s.'] = 'case'
     tau_s: Annotated[
@@ -156,11 +104,10 @@ class Column:
 
     def __post_init__(self) -> None:
         check_ranges(self, range=QUANTITIES['span of a column'])
-        for key, kinds in (
-            ('tau_s', ('board', 'gradient_lag', 'cube')),
-            ('width_k', ('gradient_even', 'play')),
-        ):
-            if self.kind in kinds and not getattr(self, key) > 0.0:
+        if self.kind not in TERMS:
+            raise ValueError(f'`kind` must be one of {tuple(TERMS)}, got {self.kind}')
+        for key in self.term.positive:
+            if not getattr(self, key) > 0.0:
                 raise ValueError(
                     f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
                 )
@@ -170,34 +117,24 @@ class Column:
             )
 
     @property
+    def term(self) -> Term:
+        """The kind of the column."""
+        return TERMS[self.kind]
+
+    @property
+    def source(self) -> Quantity:
+        """The quantity of the thermal state that the value is computed from."""
+        return self.term.source(self)
+
+    @property
     def is_of_sensor(self) -> bool:
         """Whether the value is computed from readings of `sensor`."""
-        is_loss = self.kind == 'square' and not self.tau_s
-        return is_loss or self.kind in ('gradient', 'gradient_lag', 'gradient_even', 'size')
+        return self.source.input != BOARD_INPUT
 
     @property
-    def lag(self) -> Lag | None:
-        """The lag that the value is computed from; None if it has none."""
-        if self.kind == 'gradient_lag':
-            return Lag(self.sensor, self.tau_s, self.second_tau_s)
-        if self.tau_s and self.kind != 'gradient_even':
-            return Lag(BOARD_INPUT, self.tau_s, self.second_tau_s)
-        return None
-
-    @property
-    def order(self) -> int:
-        """Power of temperature in the value, not counting the factor t^power."""
-        return _ORDERS.get(self.kind, 1)
-
-    def steepest(self, raw: Floats, flow_k: float) -> float:
-        """Return the largest slope [1/K] of values u; `flow_k` is the RMS of the gradient [K]."""
-        if self.kind == 'gradient_even':
-            return 1.0 / flow_k
-        if self.kind == 'rate':
-            return 1.0 / USUAL_BOARD_LAG_S
-        order = _ORDERS[self.kind]
-        largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / order)
-        return float(order * largest ** (order - 1))
+    def is_gradient(self) -> bool:
+        """Whether the value is the gradient of `sensor`."""
+        return self.term.form is LINE and isinstance(self.source, Gradient)
 
 
 def bank(
@@ -218,40 +155,40 @@ def bank(
     if parts is not None:
         of_plays = of_bends = sorted({*parts})
         fine = coarse = [stages for stages in of_bends if stages[0]]
-    gradient = _family('gradient', ['gradient'], sensors)
-    board = _family('board', ['board'], lags=fine)
-    gradient_lag = _family('gradient_lag', ['gradient_lag'], sensors, lags=fine)
-    products = _family('product', ['board'], powers=(1, 2), lags=coarse)
-    mixed = _family('gradient_x_temperature', ['gradient'], sensors, powers=(1,))
-    mixed += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse)
+    columns = _family('gradient', ['gradient'], sensors)
+    columns += _family('board', ['board'], lags=fine)
+    columns += _family('gradient_lag', ['gradient_lag'], sensors, lags=fine)
+    columns += _family('product', ['board'], powers=(1, 2), lags=coarse)
+    columns += _family('gradient_x_temperature', ['gradient'], sensors, powers=(1,))
+    columns += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse)
     # The bias of a part that lags the board by m is a polynomial in its temperature t - m:
     # (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
-    square = _family('square', ['square'], powers=(0, 1), lags=coarse)
-    square += _family('square', ['cube'], lags=coarse)
+    columns += _family('square', ['square'], powers=(0, 1), lags=coarse)
+    columns += _family('square', ['cube'], lags=coarse)
     even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
-    even = [replace(column, range=(0.0, 1.0)) for column in even]
     even += _family('gradient_even', ['size', 'square'], sensors, (0, 1, 2))
     # A heat pump's load is even in the heat flow; the effect of a change is even about rest.
     rest = at_rest or {}
-    even += [
+    columns += even + [
         replace(column, group='gradient_even_about_rest', rest_k=rest[column.sensor])
         for column in even
         if rest.get(column.sensor)
     ]
-    play = _family('play', ['play'], lags=of_plays, widths=PLAY_WIDTHS)
+    columns += _family('play', ['play'], lags=of_plays, widths=PLAY_WIDTHS)
     least_k = LEAST_KNEE_K * MOST_KNEES / most_knees
     n_knees = min(int((span_k[1] - span_k[0]) / least_k), most_knees)
-    bend = [
-        Column('bend', 'bend', tau_s=tau, second_tau_s=second, knee_k=knee, range=UNBOUNDED)
-        for tau, second in of_bends
-        for knee in np.linspace(*span_k, n_knees + 2)[1:-1].round(3).tolist()
+    knees = np.linspace(*span_k, n_knees + 2)[1:-1].round(3).tolist()
+    columns += [
+        replace(column, knee_k=knee)
+        for column in _family('bend', ['bend'], lags=of_bends)
+        for knee in knees
     ]
-    return (*gradient, *board, *gradient_lag, *products, *mixed, *square, *even, *play, *bend)
+    return tuple(columns)
 
 
 def _family(
-    group: Any,
-    kinds: Sequence[Any],
+    group: str,
+    kinds: Sequence[str],
     sensors: Sequence[str] = ('case',),
     powers: Sequence[int] = (0,),
     lags: Sequence[Stages] = ((0.0, 0.0),),
@@ -259,7 +196,11 @@ def _family(
 ) -> list[Column]:
     """Return the columns of a group with all combinations of the properties."""
     return [
-        Column(group, kind, sensor, tau, second, width, power=power, range=UNBOUNDED)
+        Column(
+            *(group, kind, sensor, tau, second, width),
+            power=power,
+            range=TERMS[kind].bounds or UNBOUNDED,
+        )
         for sensor, kind, power, (tau, second), width in product(
             sensors, kinds, powers, lags, widths
         )
@@ -268,35 +209,23 @@ def _family(
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
     """Return the memory that columns need of a tracker; ValueError if a sensor is missing."""
-    lags: set[Lag] = set()
-    plays: set[Play] = set()
+    sources: set[Quantity] = set()
     for column in columns:
         if column.is_of_sensor and column.sensor not in sensors:
             raise ValueError(f'`sensor` must be one of {tuple(sensors)}, got {column.sensor}')
-        if column.lag:
-            lags.add(column.lag)
-        if column.kind == 'play':
-            plays.add(Play(column.tau_s, column.width_k, column.second_tau_s))
+        sources.add(column.source)
+    plays = [one for one in sources if isinstance(one, Play)]
+    lags = {one for one in sources if isinstance(one, Lag)}
+    lags |= {play.lag for play in plays if play.lag}
     order = (BOARD_INPUT, *sensors)
     return MemorySpec(
         tuple(sensors),
         tuple(sorted(lags, key=lambda lag: (order.index(lag.input), *lag[1:]))),
         tuple(sorted(plays)),
+        tuple(name for name in sensors if Rate(name) in sources),
     )
 
 
-#: Form of a value and its derivative, as functions of x = number of the state / width.
-_FORMS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
-    'line': (lambda x: x, np.ones_like),
-    'square': (lambda x: x * x, lambda x: 2.0 * x),
-    'cube': (lambda x: x * x * x, lambda x: 3.0 * x * x),
-    'size': (np.abs, np.sign),
-    'bend': (lambda x: np.maximum(x, 0.0), lambda x: (x > 0.0).astype(np.float64)),
-    'gradient_even': (
-        lambda x: by_element(math.tanh, x * x),
-        lambda x: 2.0 * x * (1.0 - by_element(math.tanh, x * x) ** 2),
-    ),
-}
 _DURING: Final = ('always', 'static', 'dynamic')
 
 
@@ -324,37 +253,39 @@ class ColumnTable:
         #: Whether any column belongs to one regime alone.
         self.differs = bool(self._during.any())
         # Columns that differ only in power, range or regime share one evaluation.
-        of = [_source(column, layout) for column in columns]
+        of = [
+            (layout.places[one.source], one.term, one.term.centre(one), one.term.width(one))
+            for one in columns
+        ]
         sources = list(dict.fromkeys(of))
         self._source = np.array([sources.index(source) for source in of], np.int64)
         self._places = np.array([source[0] for source in sources], np.int64)
-        self._widths = np.array([source[2] for source in sources])[:, np.newaxis]
-        self._rests = np.array([source[3] for source in sources])[:, np.newaxis]
-        # A bend is of the board less its lag: two numbers of a state.
-        self._bends = np.array([k for k, one in enumerate(sources) if one[1] == 'bend'], np.int64)
-        self._is_lagging = self._places[self._bends][:, np.newaxis] != BOARD
-        rows = {
-            form: [k for k, source in enumerate(sources) if source[1] == form] for form in _FORMS
-        }
-        self._forms = [
-            (rows[form], *both) for form, both in _FORMS.items() if rows[form] and form != 'line'
+        self._centres, self._widths = (
+            np.array([source[k] for source in sources])[:, np.newaxis] for k in (2, 3)
+        )
+        terms = np.array([source[1] for source in sources], object)
+        self._terms = [
+            (np.flatnonzero(terms == term), term)
+            for term in dict.fromkeys(terms.tolist())
+            if term.form is not LINE
         ]
-        #: Index in a state of the number that each column is computed from.
-        self.places = self._places[self._source]
+        # Temperatures of parts are made of two numbers of a state.
+        self._parts = np.flatnonzero([term.is_temperature for term in terms])
+        self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
 
     def raw(self, states: Floats) -> Floats:
         """Evaluate u of each column, without the limits of its range."""
         u = self._scaled(states)
-        for rows, value, _ in self._forms:
-            u[rows] = value(u[rows])
+        for rows, term in self._terms:
+            u[rows] = term.form.value(u[rows])
         return np.asarray(u[self._source])
 
     def _scaled(self, states: Floats) -> Floats:
         numbers = states[self._places]
-        if len(self._bends):
-            lag = np.where(self._is_lagging, numbers[self._bends], 0.0)
-            numbers[self._bends] = states[BOARD] - self._reference - lag
-        return np.asarray((numbers - self._rests) / self._widths)
+        if len(self._parts):
+            lag = np.where(self._is_lagging, numbers[self._parts], 0.0)
+            numbers[self._parts] = states[BOARD] - self._reference - lag
+        return np.asarray((numbers - self._centres) / self._widths)
 
     def held(self, raw: Floats) -> Floats:
         """Limit the result of `raw` to the columns' ranges."""
@@ -379,39 +310,18 @@ class ColumnTable:
         factors, _ = self.factors(states[BOARD], states[WEIGHT])
         return np.asarray(self.held(self.raw(states)) * factors)
 
-    def slopes(self, states: Floats) -> Floats:
-        """Differentiate u by the number that it is computed from, without limits of range."""
-        slopes = np.ones((len(self._places), states.shape[1]))
-        scaled = self._scaled(states)
-        for rows, _, slope in self._forms:
-            slopes[rows] = slope(scaled[rows])
-        slopes[self._bends] *= np.where(self._is_lagging, -1.0, 1.0)
-        return np.asarray((slopes / self._widths)[self._source])
-
-    def board_slopes(self, states: Floats) -> Floats | None:
-        """Differentiate u by the board temperature at a given lag; None if none depends on it."""
-        if not len(self._bends):
-            return None
-        slopes = np.zeros((len(self._places), states.shape[1]))
-        slopes[self._bends] = self._scaled(states)[self._bends] > 0.0
-        return np.asarray(slopes[self._source])
-
-
-def _source(column: Column, layout: Layout) -> tuple[int, str, float, float]:
-    """Return the index in a state that a column is computed from, its form, width and rest."""
-    form = column.kind if column.kind in _FORMS else 'line'
-    if column.kind == 'rate':
-        place = RATE
-    elif column.kind == 'play':
-        place = layout.plays[Play(column.tau_s, column.width_k, column.second_tau_s)]
-    elif column.lag:
-        place = layout.lags[column.lag]
-    elif column.kind == 'bend':
-        place = BOARD
-    elif column.is_of_sensor:
-        place = layout.gradients[column.sensor]
-    else:
-        raise ValueError(f'no number of the state belongs to columns of kind {column.kind}')
-    width = column.width_k if form == 'gradient_even' else 1.0
-    rest = column.knee_k if form == 'bend' else column.rest_k
-    return place, form, width, rest if form != 'line' else 0.0
+    def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
+        """
+        Differentiate u, without limits of range: by the number that it is computed from, and by
+        the board temperature at a given lag; None if no column depends on the latter.
+        """
+        slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
+        for rows, term in self._terms:
+            slopes[rows] = term.form.slope(scaled[rows])
+        slopes /= self._widths
+        if not len(self._parts):
+            return np.asarray(slopes[self._source]), None
+        by_board = np.zeros_like(slopes)
+        by_board[self._parts] = slopes[self._parts]
+        slopes[self._parts] *= np.where(self._is_lagging, -1.0, 1.0)
+        return np.asarray(slopes[self._source]), np.asarray(by_board[self._source])

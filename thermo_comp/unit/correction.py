@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..thermal.memory import BOARD_INPUT, MemorySpec
-from ..thermal.state import BOARD, GRADIENT, UNKNOWN, VAR_BOARD, VAR_GRADIENT, WEIGHT, Layout
+from ..thermal.state import BOARD, UNKNOWN, VAR_BOARD, WEIGHT, Layout
 from ..typing import Floats
 from .calibration import Calibration
 from .columns import ColumnTable, memory_of
@@ -108,21 +108,14 @@ class Correction:
         self.n_slow = 9 if self.of_force is None else 24
 
     def _find_felt(self) -> None:
-        """Find the columns that depend on each gradient and lag, to propagate its variance."""
-        # In a state each gradient and lag is followed by its variance. A play has no variance:
-        # an error of its input v is taken to move the play P(v) along, so that P(v) - v stays.
-        pair = (self.table.places - GRADIENT) // 2
-        n_pairs = len(self.memory.sensors) + len(self.memory.lags)
-        self._felt_variances = slice(VAR_GRADIENT, GRADIENT + 2 * n_pairs, 2)
+        """Find the columns that depend on each quantity with a variance, to propagate it."""
+        self.layout = layout = Layout(self.memory)
+        pair = np.array([layout.pairs.get(one.source, -1) for one in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
-        self._felt_columns = columns[(pair[columns] >= 0) & (pair[columns] < n_pairs)]
+        self._felt_columns = columns[pair[columns] >= 0]
         self._felt, self._felt_starts = np.unique(pair[self._felt_columns], return_index=True)
-        # Derivatives by T: +1 of ``T - L``, -1 of ``g = T_s - T``, 0 of the lag of a gradient.
-        signs = [-1.0 for _ in self.memory.sensors]
-        signs += [float(lag.input == BOARD_INPUT) for lag in self.memory.lags]
-        lags = Layout(self.memory).lags
-        self._lagged = [at for lag, at in lags.items() if lag.input == BOARD_INPUT]
-        self._signs = np.array(signs)[:, np.newaxis, np.newaxis]
+        self._signs = np.array([one.by_board for one in layout.pairs])[:, np.newaxis, np.newaxis]
+        self._lagged = [layout.places[one] for one in layout.lags if one.input == BOARD_INPUT]
 
     def bias_scale(self, states: Floats) -> Floats:
         """Evaluate bias and scale of the three axes, shape (2, 3, n)."""
@@ -165,18 +158,18 @@ class Correction:
         raw = self.table.raw(states)
         beyond = (raw - self.table.held(raw))[:, 0].tolist()
         columns = zip(beyond, self.table.columns, strict=True)
-        gradients = [0.0, *(one for one, column in columns if column.kind == 'gradient')]
+        gradients = [0.0, *(one for one, column in columns if column.is_gradient)]
         of_columns = float(self.table.excess(raw).max(initial=0.0))
         return Excess(
             over[is_dynamic], too_fast[is_dynamic], max(gradients, key=abs), curves + of_columns
         )
 
-    def felt(self, states: Floats, factors: Floats) -> Floats:
-        """Differentiate bias and relative scale by gradients and lags, shape (p, 6, n)."""
+    def felt(self, slopes: Floats) -> Floats:
+        """Differentiate bias and relative scale by `Layout.pairs`, (p, 6, n), by those of phi."""
         columns = self._felt_columns
-        result = np.zeros((len(self._signs), 6, states.shape[1]))
+        result = np.zeros((len(self._signs), 6, slopes.shape[1]))
         if len(columns):
-            each = self._W[:, columns] * (self.table.slopes(states) * factors)[columns]
+            each = self._W[:, columns] * slopes[columns]
             result[self._felt] = np.add.reduceat(each, self._felt_starts, axis=1).swapaxes(0, 1)
         return result
 
@@ -248,11 +241,12 @@ class Correction:
         excess, _, relative = self.curves.excess(states)
         outside = rest * relative[0] + weight * relative[1]
         shares = np.array([rest + unknown * weight, weight + unknown * rest])
-        variances = (shares * states[VAR_BOARD], states[self._felt_variances])
-        felt = self.felt(states, factors[0])
+        variances = (shares * states[VAR_BOARD], states[self.layout.variances])
+        by_source, direct = self.table.slopes(states)
+        felt = self.felt(by_source * factors[0])
         # The response depends on the board temperature by t^power and by gradients and lags.
         on_board = raw * factors[1]
-        if (direct := self.table.board_slopes(states)) is not None:
+        if direct is not None:
             on_board = on_board + direct * factors[0]
         on_board = self._weigh(on_board, in_order(self._signs * felt, 0))
         slopes = self.curves.slopes(board)

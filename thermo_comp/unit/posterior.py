@@ -90,6 +90,11 @@ class Block(NamedTuple):
     response: int
     end: int
 
+    @property
+    def rows(self) -> slice:
+        """All parameters of the block."""
+        return slice(self.static, self.end)
+
 
 def lay_out(
     pairs: Iterable[tuple[TemperatureFunction, TemperatureFunction]], n_columns: int
@@ -116,6 +121,12 @@ class ParameterLayout(NamedTuple):
     nonlinear: int
     misalignment: int
     n_parameters: int
+
+    @property
+    def force(self) -> list[slice]:
+        """The coefficients of the nonlinear terms of each axis."""
+        n = (self.misalignment - self.nonlinear) // 3
+        return [slice(first, first + n) for first in (self.nonlinear + n * k for k in range(3))]
 
 
 def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:

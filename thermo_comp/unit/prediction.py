@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..thermal.memory import BOARD_INPUT, start_covariance
-from ..thermal.state import BOARD, RATE, WEIGHT, Layout
+from ..thermal.memory import BOARD_INPUT, Lag, Play, start_covariance
+from ..thermal.state import BOARD, WEIGHT, Gradient, Layout, Rate
 from ..typing import Floats
 from .calibration import Calibration, parameter_layout
 from .correction import Correction
@@ -28,31 +28,23 @@ class SlowUncertainty:
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
         self._correction = correction
         self._K = correction.K[:, 0].tolist()
-        self._n_sensors = len(correction.memory.sensors)
         self._root = np.asarray(np.linalg.cholesky(start_covariance(correction.memory.lags)))
-        self._blocks: list[tuple[Floats, Floats, Floats, Floats]] = []
-        self._of_force: list[tuple[Floats, Floats]] = []
+        #: By axis rows of the factor and further variances: of bias, scale and nonlinear terms.
+        self._blocks: list[list[tuple[Floats, Floats]]] = []
         posterior = calibration.posterior
         if posterior is None:
             return
         layout = parameter_layout(calibration)
         matrix, rest = posterior.matrix, posterior.variances
-        for bias, scale in zip(layout.bias, layout.scale, strict=True):
-            of_bias, of_scale = slice(bias.static, bias.end), slice(scale.static, scale.end)
-            rows = np.concatenate((matrix[of_bias], matrix[of_scale]))
-            n_bias, n_linear, of_force = bias.end - bias.static, len(rows), rest[:0]
-            if correction.of_force is not None:
-                n_each = (layout.misalignment - layout.nonlinear) // 3
-                first = layout.nonlinear + n_each * len(self._blocks)
-                rows = np.concatenate((rows, matrix[first : first + n_each]))
-                of_force = rest[first : first + n_each]
+        for bias, scale, force in zip(layout.bias, layout.scale, layout.force, strict=True):
+            parts = bias.rows, scale.rows, force
+            variances = [rest[part] for part in parts]
+            rows = np.concatenate([matrix[part] for part in parts])
             if matrix.shape[1] > len(rows):
                 # The same covariance of one axis from fewer columns.
                 rows = np.ascontiguousarray(np.linalg.qr(rows.T)[1].T)
-            self._blocks.append(
-                (rows[:n_bias], rest[of_bias], rows[n_bias:n_linear], rest[of_scale])
-            )
-            self._of_force.append((rows[n_linear:], of_force))
+            by_part = np.split(rows, np.cumsum([len(part) for part in variances])[:-1])
+            self._blocks.append(list(zip(by_part, variances, strict=True)))
 
     def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[float]:
         """
@@ -63,7 +55,8 @@ class SlowUncertainty:
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         phi = table.held(table.raw(states)) * factors
-        felt = self._correction.felt(states, factors)[self._n_sensors :, :, 0]
+        felt = self._correction.felt(table.slopes(states)[0] * factors)
+        felt = felt[self._correction.layout.lag_pairs, :, 0]
         moved = felt * np.array(start_shares)[:, np.newaxis]
         regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
         result: list[float] = []
@@ -73,7 +66,7 @@ class SlowUncertainty:
             bias, scale = ((self._root * moved[:, [row]]).sum(axis=0) for row in (axis, axis + 3))
             v = _products(bias / K, scale)
             if self._blocks:
-                of_bias, var_bias, of_scale, var_scale = self._blocks[axis]
+                (of_bias, var_bias), (of_scale, var_scale), of_force = self._blocks[axis]
                 on_bias, on_scale = regressors[axis] / K, regressors[axis + 3]
                 both = (of_bias * on_bias).sum(axis=0), (of_scale * on_scale).sum(axis=0)
                 v += _products(*both)
@@ -81,7 +74,7 @@ class SlowUncertainty:
                 v[2] += (var_scale * on_scale[:, 0] ** 2).sum()
                 if nonlinear is not None:
                     t = float(nonlinear.held(states[BOARD])[0])
-                    beyond += nonlinear.variance(t, *self._of_force[axis], *both)
+                    beyond += nonlinear.variance(t, *of_force, *both)
             elif nonlinear is not None:
                 beyond += [0.0] * 5
             result += v.tolist()
@@ -98,7 +91,7 @@ class SlowUncertainty:
         phi = self._correction.table.values(columns)
         regressors = self._correction.curves.regressors(columns, phi)
         whole, away = np.zeros((2, len(states), 3))
-        for axis, (rows, variances, _, _) in enumerate(self._blocks):
+        for axis, ((rows, variances), _, _) in enumerate(self._blocks):
             felt = regressors[axis].T / self._K[axis]
             for result, design in ((whole, felt), (away, felt - mean_of(felt))):
                 result[:, axis] = ((design @ rows) ** 2).sum(axis=1) + design**2 @ variances
@@ -186,14 +179,16 @@ def ramp_states(
     """Build states (n, width) of a ramp that has lasted for `lasted_s` [s] at `rate` [K/s]."""
     layout = Layout(Correction(calibration).memory)
     states = np.zeros((len(temperature), layout.width))
+    states[:, BOARD], states[:, WEIGHT] = temperature, float(rate != 0.0)
     gradient = calibration.board_lag_s * rate
-    states[:, BOARD], states[:, RATE], states[:, WEIGHT] = temperature, rate, float(rate != 0.0)
-    states[:, list(layout.gradients.values())] = gradient
-    for lag, place in layout.lags.items():
-        for tau, share in zip(lag[1:], lag.shares, strict=True):
-            end = tau * rate if lag.input == BOARD_INPUT else gradient
-            reached = 1.0 - np.exp(-np.asarray(lasted_s) / tau) if tau else 1.0
-            states[:, place] += share * end * reached
-    for play, place in layout.plays.items():
-        states[:, place] = -np.sign(rate) * play.width_k
+    for one, place in layout.places.items():
+        if isinstance(one, Rate | Gradient):
+            states[:, place] = rate if isinstance(one, Rate) else gradient
+        elif isinstance(one, Lag):
+            for tau, share in zip(one[1:], one.shares, strict=True):
+                end = tau * rate if one.input == BOARD_INPUT else gradient
+                reached = 1.0 - np.exp(-np.asarray(lasted_s) / tau) if tau else 1.0
+                states[:, place] += share * end * reached
+        elif isinstance(one, Play):
+            states[:, place] = -np.sign(rate) * one.width_k
     return states

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..quantities import QUANTITIES
-from .columns import Column
 from .functions import TANGENT_SPANS, TemperatureFunction
 from .posterior import ParameterLayout
 
@@ -35,8 +34,6 @@ WORST = 1e6
 _GRID = 513
 #: Distance beyond its range in which a function is checked.
 _AROUND = f'and along its tangents, {TANGENT_SPANS:g} of the range on each side'
-_DIFFERENCE_K = QUANTITIES['temperature span'].at_most or 0.0
-_RATE_K_S = (QUANTITIES['temperature rate'].at_most or 0.0) / 60.0
 
 
 def check_reach(calibration: Calibration, layout: ParameterLayout) -> None:
@@ -50,7 +47,11 @@ def check_reach(calibration: Calibration, layout: ParameterLayout) -> None:
         force = calibration.unit.full_scale / min(abs(a.scale_factor) for a in calibration.axes)
         calibration.nonlinearity.check_slope(force, outermost)
     response = calibration.response
-    sizes = [_largest(term, max(map(abs, outermost))) for term in response]
+    farthest_k = max(map(abs, outermost))
+    sizes = [
+        min(max(map(abs, term.range)), term.term.largest(term)) * farthest_k**term.power
+        for term in response
+    ]
     for k, (term, size) in enumerate(zip(response, sizes, strict=True)):
         effect = size * max(map(abs, term.bias))
         if not effect <= WORST * most:
@@ -76,7 +77,7 @@ def check_reach(calibration: Calibration, layout: ParameterLayout) -> None:
             (layout.bias[k], [axis.bias_function for axis in axes], most),
             (layout.scale[k], [axis.scale_function for axis in axes], LARGEST_RELATIVE_SCALE),
         ):
-            sd = np.sqrt(variances[block.static : block.end])
+            sd = np.sqrt(variances[block.rows])
             worst = np.max(sd * [*_regressors(functions, edges), *sizes])
             if not worst <= WORST * bound:
                 raise ValueError(
@@ -98,14 +99,6 @@ def _check_axes(calibration: Calibration, most: float) -> None:
                 f'`axes.{name}.scale_factor` makes unit.full_scale a force that {fault}, '
                 f'got {force:g}'
             )
-
-
-def _largest(column: Column, farthest_k: float) -> float:
-    """Return a column's largest value within `farthest_k` [K] of the reference temperature."""
-    physical = {'gradient_even': 1.0, 'rate': _RATE_K_S}.get(
-        column.kind, (_DIFFERENCE_K + abs(column.rest_k)) ** column.order
-    )
-    return min(max(map(abs, column.range)), physical) * float(farthest_k) ** column.power
 
 
 def _check_bias(key: str, level: float, reached: tuple[float, float], most: float) -> None:

@@ -1,0 +1,24 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns what all quantities of the thermal state have in common."""
+
+from typing import ClassVar
+
+from ..quantities import QUANTITIES
+
+
+class Quantity:
+    """A quantity of the thermal state; `input` is the thermometer that it is computed from."""
+
+    input: str
+    #: Largest magnitude that a calibration may contain.
+    largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
+    #: Typical change of the quantity per kelvin of temperature change.
+    per_kelvin: ClassVar[float] = 1.0
+    #: Whether it belongs to one part of the unit, which has its own time constants.
+    is_of_part: ClassVar[bool] = True
+
+    @property
+    def by_board(self) -> float:
+        """Derivative by the board temperature; readings of the others and lags are given."""
+        return float(self.input == 'board')

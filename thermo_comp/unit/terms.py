@@ -1,0 +1,212 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the kinds of regressors of the thermal response, one class each: a new kind is a new class.
+
+The value is ``u = form.value(x)``, ``x = (n - centre) / width``. The number n is a quantity of the
+thermal state, the `source`; with `is_temperature` it is ``t - source``, the temperature of a part
+that lags the board. Here ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s,
+and ``q_s = g_s - rest``: rest is 0, or the gradient at rest, where self-heating makes the board
+warmer than the case. Values of q_s are the same for heating and cooling.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ..thermal import memory, state
+from ..thermal.quantity import Quantity
+from ..typing import Floats
+from .functions import by_element
+
+if TYPE_CHECKING:
+    from .columns import Column
+
+
+class Form(NamedTuple):
+    """A function and its derivative; the bits of a result depend on its own x alone."""
+
+    value: Callable[[Floats], Floats]
+    slope: Callable[[Floats], Floats]
+
+
+_Names: TypeAlias = tuple[str, ...]
+_Pairs: TypeAlias = tuple[tuple[str, str], ...]
+LINE: Final = Form(lambda x: x, np.ones_like)
+_CLASSES: Final[list[type[Term]]] = []
+
+
+class Term(ABC):
+    """A kind of regressor, for tracker, fit, correction, covariance, limits, file, certificate."""
+
+    kind: ClassVar[str]  # name in the file
+    formula: ClassVar[str]  # value, in the description of the file
+    #: Groups of columns that appear with this kind, each with its name in a certificate.
+    groups: ClassVar[_Pairs] = ()
+    form: ClassVar[Form] = LINE
+    #: Power of temperature in the value, not counting the factor t^power of a column.
+    order: ClassVar[int] = 1
+    #: Keys of a column that hold the centre and the width of x; without a key they are 0 and 1.
+    centre_key: ClassVar[str] = ''
+    width_key: ClassVar[str] = ''
+    #: Keys of a column that must be greater than 0.
+    positive: ClassVar[_Names] = ()
+    #: Range of all values; None: the range that the bags show.
+    bounds: ClassVar[tuple[float, float] | None] = None
+    is_temperature: ClassVar[bool] = False
+    #: Whether the fit estimates a weight of the scale.
+    has_scale: ClassVar[bool] = True
+
+    def __init_subclass__(cls) -> None:
+        _CLASSES.append(cls)
+
+    @abstractmethod
+    def source(self, column: Column) -> Quantity:
+        """Return the quantity of the thermal state that a column is computed from."""
+
+    def centre(self, column: Column) -> float:
+        """Return the centre of x."""
+        return float(getattr(column, self.centre_key, 0.0))
+
+    def width(self, column: Column) -> float:
+        """Return the width of x."""
+        return float(getattr(column, self.width_key, 1.0))
+
+    def largest(self, column: Column) -> float:
+        """Return the largest magnitude of u that is possible."""
+        if self.bounds is not None:
+            return max(map(abs, self.bounds))
+        return (column.source.largest + abs(self.centre(column))) ** self.order
+
+    def steepest(self, column: Column, raw: Floats, flow_k: float) -> float:
+        """Return the largest slope [1/K] of values u; `flow_k` is the RMS of the gradient [K]."""
+        if self.bounds is not None:
+            return 1.0 / flow_k
+        largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
+        return float(self.order * largest ** (self.order - 1)) * column.source.per_kelvin
+
+
+def _lag(name: str, column: Column) -> memory.Lag:
+    return memory.Lag(name, column.tau_s, column.second_tau_s)
+
+
+class Gradient(Term):
+    """Heat flow."""
+
+    kind, formula = 'gradient', 'g_s'
+    groups: ClassVar[_Pairs] = (('gradient', 'heat flow (case − board)'),)
+
+    def source(self, column: Column) -> Quantity:
+        """Return g_s."""
+        return state.Gradient(column.sensor)
+
+
+class Rate(Term):
+    """Heat flow, from one thermometer."""
+
+    kind, formula = 'rate', 'dT_board/dt [K/s]'
+    groups = (('rate', 'rate of the board'),)
+
+    def source(self, column: Column) -> Quantity:  # noqa: ARG002
+        """Return dT_board/dt."""
+        return state.Rate()
+
+
+class Board(Term):
+    """Parts that lag the board."""
+
+    kind, formula = 'board', 'T - lagged T'
+    positive: ClassVar[_Names] = ('tau_s',)
+    groups: ClassVar[_Pairs] = (('board', 'parts that lag the board'),)
+
+    def source(self, column: Column) -> Quantity:
+        """Return ``T_board - L_tau(T_board)``, or for a bend without lag the board's own."""
+        return _lag(memory.BOARD_INPUT, column) if column.tau_s else state.Board()
+
+
+class GradientLag(Term):
+    """Parts between the thermometers."""
+
+    kind, formula, positive = 'gradient_lag', 'lagged g_s', ('tau_s',)
+    groups = (
+        ('gradient_lag', 'parts between case and board'),
+        # Coefficients of this kind and those before it that change with temperature.
+        ('product', 'lags, changing with temperature'),
+        ('gradient_x_temperature', 'heat flow, changing with temperature'),
+    )
+
+    def source(self, column: Column) -> Quantity:
+        """Return ``L_tau(g_s)``."""
+        return _lag(column.sensor, column)
+
+
+class Square(Term):
+    """Curves of parts that lag the board; without a lag losses of a heat flow."""
+
+    kind, formula = 'square', '(T - lagged T)^2, or q_s^2 without lag'
+    groups = (('square', 'curves of parts that lag'),)
+    order, form, centre_key = 2, Form(lambda x: x * x, lambda x: 2.0 * x), 'rest_k'
+
+    def source(self, column: Column) -> Quantity:
+        """Return ``T_board - L_tau(T_board)``, or g_s."""
+        return _lag(memory.BOARD_INPUT, column) if column.tau_s else state.Gradient(column.sensor)
+
+
+class Cube(Board):
+    """Curves of parts that lag the board, and a heat flow that is not linear."""
+
+    kind, formula, groups = 'cube', '(T - lagged T)^3', ()
+    order, form, centre_key = 3, Form(lambda x: x * x * x, lambda x: 3.0 * x * x), 'rest_k'
+
+
+class Size(Gradient):
+    """Heat load, as of a heat pump."""
+
+    kind, formula, groups = 'size', 'abs(q_s)', ()
+    form, centre_key = Form(np.abs, np.sign), 'rest_k'
+
+
+class GradientEven(Gradient):
+    """Heat load that saturates."""
+
+    kind, formula = 'gradient_even', 'tanh((q_s / width)^2)'
+    groups = (
+        ('gradient_even', 'size of the heat flow'),
+        ('gradient_even_about_rest', 'size of a temperature change'),
+    )
+    form = Form(
+        lambda x: by_element(math.tanh, x * x),
+        lambda x: 2.0 * x * (1.0 - by_element(math.tanh, x * x) ** 2),
+    )
+    centre_key, width_key, positive, bounds = 'rest_k', 'width_k', ('width_k',), (0.0, 1.0)
+
+
+class Play(Term):
+    """Rate-independent hysteresis."""
+
+    kind, formula, positive, has_scale = 'play', 'play of t minus t', ('width_k',), False
+    groups = (('play', 'hysteresis'),)
+
+    def source(self, column: Column) -> Quantity:
+        """Return ``P(v) - v``, P the play of half-width `width_k`, v = t or t less its lag."""
+        return memory.Play(column.tau_s, column.width_k, column.second_tau_s)
+
+
+class Bend(Board):
+    """A slope that changes at one temperature of a part."""
+
+    kind, formula, positive = 'bend', 'max(t - knee_k, 0), of t lagged', ()
+    groups = (('bend', 'change of slope'),)
+    form = Form(lambda x: np.maximum(x, 0.0), lambda x: (x > 0.0).astype(np.float64))
+    centre_key, is_temperature, has_scale = 'knee_k', True, False
+
+
+#: All kinds by name, in the order of their classes: that of the names in the file's schema.
+TERMS: Final[dict[str, Term]] = {cls.kind: cls() for cls in _CLASSES}
+#: All groups of columns, each with its name in a certificate.
+GROUPS: Final = {name: text for term in TERMS.values() for name, text in term.groups}
