@@ -197,3 +197,10 @@ def test_one_state_has_the_bits_of_many(boards):
 def test_refusals(keys, message):
     with pytest.raises(ValueError, match=message):
         Column(**{'group': 'gradient', 'kind': 'gradient', **keys})
+
+
+def test_a_time_constant_beside_a_kind_without_lag_is_ignored():
+    columns = [Column('gradient', kind, tau_s=60.0, **WIDE) for kind in ('gradient', 'size')]
+    assert memory_of(columns) == MemorySpec()
+    state = np.array([[20.0, 0.0, 0.0, 0.0, 0.0, -1.5, 0.0]]).T
+    assert ColumnTable(columns, MemorySpec(), 20.0).values(state).tolist() == [[-1.5], [1.5]]
