@@ -195,8 +195,8 @@ def thermal_windows(
     readings of a thermometer are missing. A bag without any temperature is taken to be at the
     reference, where all columns are 0. `tracks`: known thermal states of this detector
     """
-    tracks = tracks or [_track(bag, model) for bag in bags]
     spec = memory_of(model.columns, model.sensors)
+    tracks = tracks or [_track(bag, model, spec) for bag in bags]
     table = ColumnTable(model.columns, spec, model.reference_temperature)
     parts: list[_Rows] = []
     rests: list[tuple[ReducedBag, StillInterval]] = []
@@ -259,8 +259,8 @@ def _rows(
     by_start = np.zeros_like(raw)
     slopes = table.slopes(states)[0] * factors
     for k, column in enumerate(table.columns):
-        if isinstance(column.source, Lag):
-            by_start[k] = slopes[k] * column.source.start_share(time - begin_s, np.exp)
+        if isinstance(lag := column.source, Lag):
+            by_start[k] = slopes[k] * lag.start_share(time - begin_s, np.exp)
     return _Rows(
         averaged(time[:, None])[:, 0],
         total,
@@ -338,9 +338,9 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     return np.where(slope > 0.0, rms / np.where(slope > 0.0, slope, 1.0), 0.0)
 
 
-def _track(bag: ReducedBag, model: Model) -> Track:
+def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     """Run the tracker over the readings of a bag."""
-    spec = replace(memory_of(model.columns, model.sensors), lags=(), plays=())
+    spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
         # Without a thermometer assume that the unit has been at the reference temperature for
         # 1e9 s, so that all lags are 0.

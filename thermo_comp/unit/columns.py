@@ -211,9 +211,9 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
     """Return the memory that columns need of a tracker; ValueError if a sensor is missing."""
     sources: set[Quantity] = set()
     for column in columns:
-        if column.is_of_sensor and column.sensor not in sensors:
+        sources.add(source := column.source)
+        if source.input not in (BOARD_INPUT, *sensors):
             raise ValueError(f'`sensor` must be one of {tuple(sensors)}, got {column.sensor}')
-        sources.add(column.source)
     plays = [one for one in sources if isinstance(one, Play)]
     lags = {one for one in sources if isinstance(one, Lag)}
     lags |= {play.lag for play in plays if play.lag}
