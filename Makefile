@@ -17,7 +17,7 @@ JOBS ?= 3
 FUZZ_SECONDS ?= 60
 PYTEST_ARGS ?=
 
-# The newest interpreter that the ROS wheels are published for, unless PYTHON is good enough.
+# The newest interpreter for which there are ROS wheels, unless PYTHON is 3.10 or newer.
 CANDIDATES := $(PYTHON) python3.12 python3.11 python3.10 python3.13
 BIN := $(VENV)/bin
 
@@ -27,7 +27,7 @@ unexport AMENT_PREFIX_PATH
 unexport COLCON_PREFIX_PATH
 unexport LD_LIBRARY_PATH
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
-# What is compiled is kept: without it each of the tests' many processes compiles it anew.
+# Keep compiled modules: otherwise each of the many processes of the tests compiles them again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test lint nightly oldest fuzz bench docs clean help
@@ -52,7 +52,7 @@ lint: $(VENV)/.installed-dev
 nightly: $(VENV)/.installed-test
 	$(BIN)/python -m pytest --hypothesis-profile=nightly -n $(JOBS) test/test_properties.py
 
-# Of each library the first release of the series that setup.py begins with.
+# Installs of each library the first release of the oldest series that setup.py allows.
 oldest:
 	grep -oE "'[A-Za-z0-9-]+(\[[a-z]+\])?>=[0-9.]+" setup.py \
 	  | sed -E "s/'([A-Za-z0-9-]+)(\[[a-z]+\])?>=([0-9.]+)/\1==\3.*/" | sort -u > oldest.txt
@@ -61,7 +61,7 @@ oldest:
 fuzz: $(VENV)/.installed-fuzz
 	$(BIN)/python fuzz/run.py all --seconds $(FUZZ_SECONDS)
 
-# Not in place: what is measured is what a user installs.
+# The package is not installed in place: the figures are those of an installation by a user.
 bench: | $(BIN)/python
 	$(BIN)/python -m venv $(VENV)-bench
 	$(VENV)-bench/bin/python -m pip install -qq --disable-pip-version-check '.[ros,test]'

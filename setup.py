@@ -11,7 +11,7 @@ VERSION = re.search(
     r"^__version__ = '([^']+)'$", (ROOT / NAME / '__init__.py').read_text(), re.MULTILINE
 ).group(1)
 
-# Of the commands; the node needs numpy and yaml alone, and package.xml names those.
+# Libraries of the commands; the node only needs numpy and yaml, which package.xml names.
 INSTALL = [
     'numpy>=1.26',
     'PyYAML>=6.0',

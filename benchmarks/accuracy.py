@@ -89,7 +89,7 @@ def block(record: SimulatedRun) -> Block:
 @dataclass(frozen=True)
 class Corrected:
     """
-    What a calibration makes of the test records, and its constants at the reference.
+    Test records corrected with a calibration, and its constants at the reference.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Corrected:
     constants, constants_sd : ndarray, shape (2, 3)
         Bias [counts/cycle] and ln K at the reference, and their claimed standard deviations.
     fit_s : float
-        What the fit took, s.
+        Time of the fit, s.
     calibration : Calibration
         The result of the fit.
 
@@ -129,13 +129,13 @@ def fit_and_correct(
     density = np.array(calibration.noise_density_m_s2_sqrt_hz)
     for record in test_records:
         compensator = Compensator(calibration)
-        found = process_block(compensator, block(record))
-        slots = found.index // round(WINDOW_S * 1e9 / record.accel_stamp_ns[0])
+        corrected = process_block(compensator, block(record))
+        slots = corrected.index // round(WINDOW_S * 1e9 / record.accel_stamp_ns[0])
         first = np.flatnonzero(np.diff(slots, prepend=-1))
-        columns = np.column_stack((found.specific_force, found.covariance[:, [0, 4, 8]]))
+        columns = np.column_stack((corrected.specific_force, corrected.covariance[:, [0, 4, 8]]))
         size = np.diff(first, append=len(slots))
         mean = np.add.reduceat(columns, first, axis=0)[size == size.max()] / size.max()
-        # White noise and rounding average out, the rest of the published variance does not.
+        # White noise and rounding average out, the other parts of the published variance do not.
         white = np.array(compensator.thermal.correction.noise)
         forces.append(mean[:, :3])
         sds.append(np.sqrt(np.maximum(mean[:, 3:] - white, 0.0) + density**2 / WINDOW_S))
@@ -165,7 +165,7 @@ class Errors:
 def errors(found: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[SimulatedRun]) -> Errors:
     """Compare with the truth."""
     vector = [one - record.truth.specific_force for one, record in zip(found, tests, strict=True)]
-    norm = np.concatenate([np.linalg.norm(one, axis=1) for one in found]) - STANDARD_GRAVITY
+    norm = np.concatenate([np.linalg.norm(force, axis=1) for force in found]) - STANDARD_GRAVITY
     ratio = np.concatenate([e / s for e, s in zip(vector, sd, strict=True)])
     return Errors(
         _rms(norm) / MICRO_G,
@@ -194,8 +194,8 @@ def corrected_by_truth(run: SimulatedRun) -> Floats:
 
 def floor(tests: Sequence[SimulatedRun]) -> Errors:
     """Return the residual of the true model with the same noise."""
-    found = [corrected_by_truth(record) for record in tests]
-    return errors(found, [np.ones_like(one) for one in found], tests)
+    forces = [corrected_by_truth(record) for record in tests]
+    return errors(forces, [np.ones_like(force) for force in forces], tests)
 
 
 def judged(found: Errors, goal: Goal | None, least: Errors) -> str:
@@ -230,12 +230,12 @@ def part_kinds(options: argparse.Namespace) -> None:
                 fit_and_correct(records, tests, model=m) for m in ('golovach', 'response')
             )
             sets = errors(paper.specific_force, paper.sd, tests)
-            found = errors(ours.specific_force, ours.sd, tests)
-            worse = '' if found.vector <= 1.05 * sets.vector else ' (worse than golovach)'
+            errors_ = errors(ours.specific_force, ours.sd, tests)
+            worse = '' if errors_.vector <= 1.05 * sets.vector else ' (worse than golovach)'
             print(
                 f'| {kind} | {seed} | {least.norm:.2f} / {least.vector:.2f} '
-                f'| {sets.norm:.2f} / {sets.vector:.2f} | {judged(found, goal, least)}{worse} '
-                f'| {found.peak:.1f} | {found.claimed:.2f} | {ours.fit_s:.1f} |',
+                f'| {sets.norm:.2f} / {sets.vector:.2f} | {judged(errors_, goal, least)}{worse} '
+                f'| {errors_.peak:.1f} | {errors_.claimed:.2f} | {ours.fit_s:.1f} |',
                 flush=True,
             )
 
@@ -280,10 +280,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument('parts', nargs='*', choices=[*parts, []], help='default: all')
+    parser.add_argument(
+        'parts', nargs='*', choices=[*parts, []], help='parts to run (default: all)'
+    )
     parser.add_argument('--seeds', type=int, default=3, help='units per kind')
     parser.add_argument('--rate-hz', type=float, default=4.0, help='cycles per second')
-    parser.add_argument('--kinds', type=lambda text: text.split(','), help='some kinds only')
+    parser.add_argument(
+        '--kinds', type=lambda text: text.split(','), help='kinds of units, by commas'
+    )
     options = parser.parse_args()
     for name in options.parts or parts:
         print(f'\n### {name}\n', flush=True)

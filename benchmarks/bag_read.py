@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the measurement of reading: bag to columns, ours against rosbags and mcap in one run.
+Owns the measurement of reading: bag to columns, by this package, rosbags and mcap in one run.
 
-All read the same counts and temperatures (400 Hz and 2 x 10 Hz) from the same files. `rosbags`
-reads and deserializes each message; `mcap` reads each message and does not decode it at all.
-Rates are counts messages per second of wall time, best of the repeats; what matters are ratios.
+All readers get the same counts and temperatures (400 Hz and 2 x 10 Hz) from the same files.
+`rosbags` reads and deserializes each message; `mcap` reads each message and does not decode it at
+all. Rates are counts messages per second of wall time, best of the repeats; only their ratios hold
+on other machines.
 
     python benchmarks/bag_read.py --samples 1000000
 """
@@ -92,9 +93,9 @@ def read_mcap(path: Path) -> int:
 def timed(read: Callable[[Path], int], path: Path, n: int) -> tuple[float, float]:
     """Measure wall and CPU time of one reading, per message."""
     wall, cpu = time.perf_counter(), time.process_time()
-    found = read(path)
+    content = read(path)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    assert found == n, f'{found} messages read, {n} written'
+    assert content == n, f'{content} messages read, {n} written'
     return wall / n, cpu / n
 
 
@@ -134,11 +135,15 @@ def measure(
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description='Reading a bag to columns against its peers.')
-    parser.add_argument('--samples', type=int, default=2_000_000, help='counts messages for ours')
-    parser.add_argument('--peer-samples', type=int, default=200_000, help='and for the peers')
+    parser.add_argument(
+        '--samples', type=int, default=2_000_000, help='messages that thermo_comp reads'
+    )
+    parser.add_argument(
+        '--peer-samples', type=int, default=200_000, help='messages that the peers read'
+    )
     parser.add_argument('--repeats', type=int, default=3)
     parser.add_argument('--chunk-bytes', type=int, default=CHUNK_BYTES)
-    parser.add_argument('--json', action='store_true', help='machine-readable')
+    parser.add_argument('--json', action='store_true', help='print JSON')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         rows = list(

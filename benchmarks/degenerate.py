@@ -3,9 +3,9 @@
 """
 Owns the table of every command on every degenerate input: exit code, seconds, peak memory.
 
-Whatever a recording or a table holds, a command ends in time, in bounded memory, with a sentence
-instead of a traceback, and never with 0 where something is lost. What breaks this is marked ``!``
-and makes the exit code 1.
+For any recording or table a command ends in time, in bounded memory, with a sentence instead of a
+traceback, and with exit code 0 only if no data are lost. A run that fails in any of these points
+is marked ``!`` and makes the exit code of the benchmark 1.
 
     python benchmarks/degenerate.py --only jump --json degenerate.json
 """
@@ -80,8 +80,8 @@ def _peak_megabytes(pid: int) -> float:
         status = Path(f'/proc/{pid}/status').read_text()
     except OSError:
         return 0.0
-    found = re.search(r'VmHWM:\s+(\d+) kB', status)
-    return int(found[1]) / 1024 if found else 0.0
+    match = re.search(r'VmHWM:\s+(\d+) kB', status)
+    return int(match[1]) / 1024 if match else 0.0
 
 
 def run(name: str, command: str, path: Path, out: Path) -> Run:
@@ -111,22 +111,22 @@ def run(name: str, command: str, path: Path, out: Path) -> Run:
         os.wait4(process.pid, 0)
     process.returncode = -9 if code is None else code
     lines = log.read_text('utf-8', 'replace').strip().splitlines()
-    said = ' | '.join(lines[-2:])
+    text = ' | '.join(lines[-2:])
     is_bad = (
         code not in {0, 1}
         or megabytes > LIMIT_MB
         or any(line.startswith('Traceback') for line in lines)
         or (code == 0 and INPUTS[name].is_lost)
     )
-    return Run(name, command, code, time.monotonic() - began, megabytes, said, is_bad)
+    return Run(name, command, code, time.monotonic() - began, megabytes, text, is_bad)
 
 
 def main() -> int:
     """Make the inputs, run the commands, print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
-    parser.add_argument('--only', default='', help='inputs whose name contains this')
+    parser.add_argument('--only', default='', help='inputs whose name contains this text')
     parser.add_argument('--commands', nargs='*', choices=COMMANDS, default=list(COMMANDS))
-    parser.add_argument('--json', type=Path, help='write what was found')
+    parser.add_argument('--json', type=Path, help='file for the results')
     arguments = parser.parse_args()
     runs: list[Run] = []
     print(f'{"input":34}' + ''.join(f'{name:>17}' for name in arguments.commands))

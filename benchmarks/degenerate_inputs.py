@@ -115,8 +115,8 @@ def _by_turns(force: np.ndarray) -> np.ndarray:
 
 def _without_gravity(force: np.ndarray) -> np.ndarray:
     """Subtract the mean of each position."""
-    own = force.reshape(POSITIONS, -1, 3)
-    return (own - own.mean(axis=1, keepdims=True)).reshape(-1, 3)
+    positions = force.reshape(POSITIONS, -1, 3)
+    return (positions - positions.mean(axis=1, keepdims=True)).reshape(-1, 3)
 
 
 def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:

@@ -86,9 +86,9 @@ def messages(path: Path) -> list[tuple[int, bytes]]:
     """Read the corrected samples of a bag: the time and the bytes of each."""
     with open_recording(path, Topics(imu=IMU_OUT.name, input='imu'), require=['accel']) as bag:
         return [
-            one
+            pair
             for block in bag.blocks(raw=True)
-            for one in zip(block.log_ns['accel'].tolist(), block.raw['accel'], strict=True)
+            for pair in zip(block.log_ns['accel'].tolist(), block.raw['accel'], strict=True)
         ]
 
 

@@ -28,8 +28,8 @@ def exact_unit(seed: int) -> UnitModel:
     """
     Make a unit whose drift is only a quadratic of the board's temperature.
 
-    It has no self-heating, so that its bags contain the reference state, in which no heat flows. A
-    bound on the constants at a state that was not visited would not be meaningful.
+    The unit has no self-heating, so that its bags contain the reference state, in which no heat
+    flows. A bound on the constants at a state that was not visited would not be meaningful.
     """
     rng = np.random.default_rng(seed)
 
@@ -49,8 +49,9 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
     """
     Cramer-Rao bound of bias [counts] and ln K at the reference, shape (2, 3), as sd.
 
-    Written on its own: window means of counts with white noise, unknown attitudes (two angles
-    each), M, and a quadratic of the true board temperature per axis; differentiated numerically.
+    Computed independently of the fit: window means of counts with white noise, unknown attitudes
+    (two angles each), M, and a quadratic of the true board temperature per axis; differentiated
+    numerically.
     """
     run = simulate(unit, parse_cyclogram(program), directions[0], rate_hz=1.0)
     truth = run.truth
@@ -117,11 +118,11 @@ def efficiency(n_units: int) -> None:
             ratios.append((ours.constants - truth) / bound(unit, 'demo', ups, WINDOW_S))
             claimed.append((ours.constants - truth) / ours.constants_sd)
         ratio = np.sqrt(np.mean(np.square(ratios), axis=(0, 2)))
-        own = np.sqrt(np.mean(np.square(claimed), axis=(0, 2)))
+        claim = np.sqrt(np.mean(np.square(claimed), axis=(0, 2)))
         inside = np.mean(np.abs(claimed) < 1.96, axis=(0, 2))
         print(
             f'| {n_positions} | {n_units} | {ratio[0]:.3f} | {ratio[1]:.3f} '
-            f'| {own[0]:.3f} | {own[1]:.3f} '
+            f'| {claim[0]:.3f} | {claim[1]:.3f} '
             f'| {100 * inside[0]:.1f} % | {100 * inside[1]:.1f} % |',
             flush=True,
         )

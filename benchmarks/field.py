@@ -7,10 +7,10 @@ Measures updates in the field against the best filter, on units that age (`field
 
 For each kind of platform, a vehicle level within 10 deg and a drone that is carried, units age for
 60 days: bias walk 15 ug and scale walk 10 ppm per root day, turn-on 20 ug, one shock of 300 ug a
-unit. On several days the calibration is updated with all rests so far, as `thermo_comp update`
-does, and judged on the rests of the day after; at the end its errors are compared with those of a
-Kalman filter that knows the process and the shock's start. With --recordings, the real recordings
-that are there are cut in parts, and updates are judged on the part after.
+unit. On several days the calibration is updated with all rests so far, as by `thermo_comp update`,
+and judged on the rests of the next day; at the end its errors are compared with those of a Kalman
+filter that is given the process and the time of the shock. With --recordings, real recordings in
+this folder are cut into parts, and updates are judged on the next part.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, F
     counts = measured(force, warmth, state)
     start = live(kind, 0, 1, Process()).rests[0][0]
     rests = []
-    for number, (one, warm) in enumerate(zip(counts, warmth, strict=True)):
+    for number, (count, warm) in enumerate(zip(counts, warmth, strict=True)):
         thermal = (REFERENCE_C + warm, 1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6)
         stamp = start.start_ns + number * 10**13
-        rests.append((start, Rest(stamp, 1000, tuple(K * one), (K * NOISE * 10,) * 3, thermal)))
+        rests.append((start, Rest(stamp, 1000, tuple(K * count), (K * NOISE * 10,) * 3, thermal)))
     return rests, counts, warmth, force
 
 
@@ -83,7 +83,7 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     Say whether the update, and the best filter, are worse than the old file on a day: whether the
     RMS over its n starts is larger by more than its standard error, the claim over sqrt(2 n).
     """
-    old, one = (series_of(after, given) for given in (LABORATORY, new))
+    old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K
     warmth = np.array([rest.state[0] for _, rest in after]) - REFERENCE_C
     of_best = np.linalg.norm(corrected(counts, warmth, kalman), axis=1) - G
@@ -94,9 +94,9 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     weights = old.n_windows / np.bincount(old.start, old.n_windows)[old.start]
     n_starts = int(old.start[-1]) + 1
     before, *later = (
-        np.sqrt(weights @ miss**2 / n_starts) for miss in (old.miss, one.miss, of_best)
+        np.sqrt(weights @ miss**2 / n_starts) for miss in (old.miss, updated.miss, of_best)
     )
-    error = root_mean(one.claim) / np.sqrt(2.0 * n_starts)
+    error = root_mean(updated.claim) / np.sqrt(2.0 * n_starts)
     found = [bool(rms > before + error) for rms in later]
     return found[0], found[1]
 
@@ -116,7 +116,7 @@ def best(history: History, process: Process, days: int) -> BestFilter:
         if day < days:
             rests[start, rest.state[0]].append(rest)
     for (start, celsius), windows in rests.items():
-        mean = np.mean([one.mean for one in windows], axis=0) / K
+        mean = np.mean([window.mean for window in windows], axis=0) / K
         variance = NOISE**2 / (WINDOW_S * len(windows))
         now = windows[0].stamp_ns / 86400e9 - DAY_ZERO
         found.take(now, start, mean, celsius - REFERENCE_C, variance)
@@ -133,9 +133,9 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
     for until in np.linspace(days / 6.0, days, 6).round().astype(int):
         chosen = [history.rests[k] for k in np.flatnonzero(day < until)]
         begin = time.perf_counter()
-        found = update(series_of(chosen, LABORATORY), LABORATORY)
+        updated = update(series_of(chosen, LABORATORY), LABORATORY)
         took = time.perf_counter() - begin
-        new = found.calibration if found.judged.is_better else LABORATORY
+        new = updated.calibration if updated.judged.is_better else LABORATORY
         after = [history.rests[k] for k in np.flatnonzero(day == until)]
         if after:
             kalman = filtered(history, process, until)
@@ -169,14 +169,14 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
 def simulated(kind: str, n_units: int, days: int) -> None:
     """Print the figures of one kind of platform."""
     results = [unit(kind, seed, days) for seed in range(n_units)]
-    joined = {name: np.array([one[0][name] for one in results]) for name in results[0][0]}
+    joined = {name: np.array([result[0][name] for result in results]) for name in results[0][0]}
     print(f'\n{kind}: {n_units} units, {days} days, one shock each')
     for column, name in enumerate(('|f|', 'x', 'y', 'z')):
         a, b, c = (root_mean(joined[key][..., column]) / UG for key in ('before', 'after', 'best'))
         n_worse, n_best = (
             sum(
-                root_mean(one[0][key][:, column]) > root_mean(one[0]['before'][:, column])
-                for one in results
+                root_mean(result[0][key][:, column]) > root_mean(result[0]['before'][:, column])
+                for result in results
             )
             for key in ('after', 'best')
         )
@@ -186,12 +186,12 @@ def simulated(kind: str, n_units: int, days: int) -> None:
         )
     ratio = root_mean(joined['missed']) / root_mean(joined['claimed'])
     print(f'  error / claimed sd of |f| {ratio:.2f} (0.7 .. 1.4)')
-    days_after = np.array([pair for one in results for pair in one[1]])
+    days_after = np.array([pair for result in results for pair in result[1]])
     print(
         f'  day after an update: {len(days_after)} days, worse than the old file beyond the '
         f'standard error {days_after[:, 0].sum()} (the best filter: {days_after[:, 1].sum()})'
     )
-    print(f'  update of {days} days: {max(one[2] for one in results):.1f} s at most')
+    print(f'  update of {days} days: {max(result[2] for result in results):.1f} s at most')
 
 
 def log_size() -> None:

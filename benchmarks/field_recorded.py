@@ -36,7 +36,7 @@ def part(of: Columns, begin: float, end: float) -> Columns:
 
     def cut(time_s: np.ndarray, *values: np.ndarray) -> tuple[np.ndarray, ...]:
         is_in = (time_s >= begin) & (time_s < end)
-        return tuple(one[is_in] for one in (time_s, *values))
+        return tuple(column[is_in] for column in (time_s, *values))
 
     time_s, counts = cut(of.time_s, of.counts)
     temperatures = {name: cut(*both) for name, both in of.temperatures.items()}
@@ -71,28 +71,28 @@ def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple
         for t, value in zip(*both, strict=True)
         if name in ('board', *calibration.sensors)
     )
-    found: list[tuple[Start, Rest]] = []
+    collected: list[tuple[Start, Rest]] = []
     for t, sample in zip(of.time_s, of.counts, strict=True):
         stamp = int(t * 1e9)
         while readings and readings[0][0] <= stamp:
             at, name, value = readings.pop(0)
             compensator.push(name, at, value)
         compensator.process(stamp, *sample.tolist())
-        found += [(start, one) for one in finder.add(np.array([stamp]), sample[np.newaxis])]
-    return found
+        collected += [(start, rest) for rest in finder.add(np.array([stamp]), sample[np.newaxis])]
+    return collected
 
 
 def cases(folder: Path, work: Path) -> Iterator[tuple[str, Path, list[float], float]]:
-    """Yield name, bag, the begins of all parts with the end [s], and the length of a window."""
-    # After the sensor's last jump (docs/real_data.md), until it is taken out.
+    """Yield name, bag, the begins of all parts and the end [s], and the length of a window [s]."""
+    # From the sensor's last jump (docs/real_data.md) until it is taken out of the freezer.
     yield 'freezer', freezer_bag(folder, work), [518.5, *np.arange(900.0, 1941.0, 104.0)], 10.0
     for unit in range(3):
         yield f'handheld {unit}', handheld_bag(folder, work, unit), [0.0, *range(80, 157, 11)], 2.0
 
 
 def judge_recordings(folder: Path) -> None:
-    """Print for each recording how its updates do on the part after."""
-    print('\nreal recordings, an update by the parts so far judged on the part after')
+    """Print for each recording the residual before and after updates, on the next part."""
+    print('\nreal recordings, an update by the parts so far judged on the next part')
     with tempfile.TemporaryDirectory() as work:
         for name, bag, edges, window in cases(folder, Path(work)):
             gather.SECONDS = int(window)
@@ -107,13 +107,13 @@ def judge_recordings(folder: Path) -> None:
             parts = [one for one in parts if one]
             old, new, n_written = [], [], 0
             for k in range(3, len(parts)):
-                known = [one for some in parts[:k] for one in some]
-                found = update(series_of(known, calibration), calibration)
-                n_written += found.judged.is_better
-                best = found.calibration if found.judged.is_better else calibration
-                for rms, one in ((old, calibration), (new, best)):
-                    rms.append(float(np.sqrt(np.mean(series_of(parts[k], one).miss ** 2))))
-            mg = [1e3 * np.sqrt(np.mean(np.square(one))) / GRAVITY for one in (old, new)]
+                known = [rest for some in parts[:k] for rest in some]
+                updated = update(series_of(known, calibration), calibration)
+                n_written += updated.judged.is_better
+                best = updated.calibration if updated.judged.is_better else calibration
+                for rms, used in ((old, calibration), (new, best)):
+                    rms.append(float(np.sqrt(np.mean(series_of(parts[k], used).miss ** 2))))
+            mg = [1e3 * np.sqrt(np.mean(np.square(rms))) / GRAVITY for rms in (old, new)]
             n_worse = sum(b > 1.001 * a for a, b in zip(old, new, strict=True))
             print(
                 f'  {name:11} {len(old)} updates, {n_written} written: |f| - g of the part after '

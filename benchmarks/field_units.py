@@ -4,7 +4,7 @@
 Owns the ageing units of the benchmark `field.py`: physics, rests, reference filter.
 
 A unit leaves the laboratory with a calibration whose error is drawn from the covariance that the
-calibration states. From then on bias and scale walk at random, each start has a bias of its own,
+calibration states. From then on bias and scale walk at random, each start has another bias offset,
 and one shock moves the biases. The forward model and the Kalman filter are written here in numpy
 and share no code with the update; the filter is given the true variances and the shock's start.
 """
@@ -51,7 +51,7 @@ KINDS = ('level', 'carried')
 
 @dataclass(frozen=True)
 class Process:
-    """What the field does: walks per root day, turn-on, sd of the shock."""
+    """The ageing process in the field: walks per root day, turn-on, sd of the shock."""
 
     bias: float = 15 * UG
     scale: float = 10e-6
@@ -145,16 +145,16 @@ def temperature(day: float, rng: np.random.Generator) -> float:
 def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[float]:
     """Split the rests of a start: one attitude of a vehicle, 20 to 90 s each of a drone."""
     while seconds >= WINDOW_S:
-        one = seconds if kind == 'level' else min(seconds, rng.uniform(20.0, 90.0))
-        yield one
-        seconds -= one
+        rest = seconds if kind == 'level' else min(seconds, rng.uniform(20.0, 90.0))
+        yield rest
+        seconds -= rest
 
 
 def live(kind: str, seed: int, days: int, process: Process) -> History:
     """Let a unit age: three starts a day, two to ten minutes of rest each."""
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     state = np.concatenate((PRIOR * rng.standard_normal(15), np.zeros(9)))
-    found, before, is_shocked, n_starts = History(), 0.0, False, 0
+    history, before, is_shocked, n_starts = History(), 0.0, False, 0
     for day in range(days):
         for number in range(3):
             now = day + (8.0 + 5.0 * number + rng.uniform(0.0, 2.0)) / 24.0
@@ -177,13 +177,13 @@ def live(kind: str, seed: int, days: int, process: Process) -> History:
                     mean = tuple((K * (clean + noise)).tolist())
                     thermal = (celsius, 1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6)
                     rest = Rest(stamp, 1000, mean, (K * NOISE * 10.0,) * 3, thermal)
-                    found.rests.append((start, rest))
-                    found.day.append(day)
-                    found.start.append(n_starts)
+                    history.rests.append((start, rest))
+                    history.day.append(day)
+                    history.start.append(n_starts)
                     stamp += int(WINDOW_S * 1e9)
             n_starts += 1
-        found.states.append(np.concatenate((state[:21], np.zeros(3))))
-    return found
+        history.states.append(np.concatenate((state[:21], np.zeros(3))))
+    return history
 
 
 class BestFilter:
@@ -197,16 +197,16 @@ class BestFilter:
 
     def take(self, now: float, start: int, counts: Floats, warmth: float, variance: float) -> None:
         """Take the mean of a rest [K], `now` in days, the variance of its norm."""
-        one = self.process
+        process = self.process
         if start != self._start:
             elapsed, self._now, self._start = now - self._now, now, start
-            walk = np.repeat([one.bias**2, one.scale**2], 3) * elapsed
+            walk = np.repeat([process.bias**2, process.scale**2], 3) * elapsed
             self.P[range(15, 21), range(15, 21)] += walk
-            if now >= one.shock_day and not self._is_shocked:
+            if now >= process.shock_day and not self._is_shocked:
                 self._is_shocked = True
-                self.P[range(15, 18), range(15, 18)] += one.shock**2
+                self.P[range(15, 18), range(15, 18)] += process.shock**2
             self.state[21:], self.P[21:], self.P[:, 21:] = 0.0, 0.0, 0.0
-            self.P[range(21, 24), range(21, 24)] = one.turn_on**2
+            self.P[range(21, 24), range(21, 24)] = process.turn_on**2
         warm = np.array([warmth])
 
         def norm(state: Floats) -> float:

@@ -4,8 +4,8 @@
 Owns the cost of a fit: CPU time and peak memory over the number of bags, against reading alone,
 and the power of the number of samples with which the time grows.
 
-Bags of four hours are simulated once, written to disk, and then read, and fitted, by processes of
-their own, so that each peak is that process' alone.
+Bags of four hours are simulated once and written to disk. Reading and fitting run in separate
+processes, so that each has its own peak of memory.
 
     python benchmarks/fit_scaling.py --bags 6 12 24 --rate-hz 100
 """
@@ -55,12 +55,12 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
         [sys.executable, __file__, '--task', task, *map(str, paths)],
         check=False,
         capture_output=True,
-        text=True,
+        lines=True,
     )
     if done.returncode:
         # A process that was ended by the system prints nothing.
-        said = done.stderr.splitlines() or [f'exit code {done.returncode}']
-        sys.exit(f'{task} of {len(paths)} bags failed: {said[-1]}')
+        lines = done.stderr.splitlines() or [f'exit code {done.returncode}']
+        sys.exit(f'{task} of {len(paths)} bags failed: {lines[-1]}')
     return dict(json.loads(done.stdout))
 
 

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of a fleet: scaling, what the scheduler adds, what crosses the network, what is lost.
+Owns the cost of a fleet: scaling, overhead of the scheduler, network traffic, lost results.
 
-Units are simulated and written to bags once (``--folder`` keeps them), and really fitted. Workers
-are processes of one thread, as the command starts them.
+Units are simulated and written to bags once (``--folder`` keeps them), and fitted as by the
+command `fleet fit`. Workers are processes of one thread, as by `fleet fit`.
 
     python benchmarks/fleet.py scaling              strong and weak, 1 and 2 workers
     python benchmarks/fleet.py overhead             500 small units, and 100 workers on paper
@@ -43,14 +43,14 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 #: An hour over 35 K at a sample per second, so that hundreds of units are simulated in minutes.
 PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2
-#: The smallest thermal test that can be fitted, which leaves the scheduler the least time.
+#: The smallest thermal test that can be fitted: it gives the scheduler the highest load.
 SMALL_PROGRAM, SMALL_BAGS = '20 2min, 45@5 8min, 5@5 10min', 6
 N_LOTS = 4
 _REST_S = 4.0
 
 
 def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
-    """Simulate units, one bag per position; existing ones are kept."""
+    """Simulate units, one bag per position; existing bags are kept."""
     chamber = parse_cyclogram(program)
     for seed in range(1, n_units + 1):
         unit = unit_preset('mems', seed)
@@ -83,8 +83,8 @@ def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
 
 def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
     """Find the units of a fleet, repeated under other names if there are too few."""
-    found = find_units(Storage(str(folder)))
-    return [found[i % len(found)] for i in range(n_units)]
+    units = find_units(Storage(str(folder)))
+    return [units[i % len(units)] for i in range(n_units)]
 
 
 @dataclass(frozen=True)
@@ -95,17 +95,17 @@ class Measured:
     Parameters
     ----------
     seconds : float
-        From the first task sent to the last result.
+        Time from the first task sent to the last result [s].
     tasks : tuple of float
-        How long each task took its worker [s].
+        Time of each task on its worker [s].
     own_cpu_s : float
         Processor time of this process: client and scheduler.
     rest_cpu : float
-        The part of a processor that it takes with nothing to do: heartbeats, watching.
+        Share of a processor that this process uses without tasks: heartbeats, watching.
     n_bytes : int
-        Written to any connection by any of the processes.
+        Number of bytes that all processes wrote to their connections.
     cpu_s : float
-        Processor time of the workers at the units.
+        Processor time of the workers for the fits [s].
 
     """
 
@@ -140,7 +140,7 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
         before = bytes_written() + sum(client.run(bytes_written).values())
         cpu, began, started = process_cpu(), time.perf_counter(), time.time()
         outcomes = list(run(client, str(folder), units, options))
-        seconds, own = time.perf_counter() - began, process_cpu() - cpu
+        seconds, spent = time.perf_counter() - began, process_cpu() - cpu
         n_bytes = bytes_written() + sum(client.run(bytes_written).values()) - before
         tasks = tuple(
             part['stop'] - part['start']
@@ -150,9 +150,9 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
         )
     assert len(outcomes) == n_units
     assert len(tasks) == n_units
-    assert all(one.calibration for _, one in outcomes)
-    cpu_s = sum(float(one.row['cpu_s'] or 0.0) for _, one in outcomes)
-    return Measured(seconds, tasks, own, rest_cpu, n_bytes, cpu_s)
+    assert all(outcome.calibration for _, outcome in outcomes)
+    cpu_s = sum(float(outcome.row['cpu_s'] or 0.0) for _, outcome in outcomes)
+    return Measured(seconds, tasks, spent, rest_cpu, n_bytes, cpu_s)
 
 
 def process_cpu() -> float:
@@ -193,7 +193,7 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
     print(f'{n_units} units x 12 bags, model {model}; load {loads()}')
     print('| run | strong: 1 worker s | 2 workers s | x | free cores x | weak, half: 1 s | x |')
     print('|---|---|---|---|---|---|---|')
-    found: list[tuple[float, float, float]] = []
+    collected: list[tuple[float, float, float]] = []
     for number in range(repeats):
         one, two, half = (
             measure(folder / 'fleet', units, workers, options)
@@ -203,13 +203,13 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
         # two workers only lose waiting time, and time by sharing caches and memory; neither
         # depends on other programs.
         free = 2.0 * two.busy(2) / one.busy(1) * one.cpu_s / two.cpu_s
-        found.append((one.seconds / two.seconds, free, 2.0 * half.seconds / two.seconds))
+        collected.append((one.seconds / two.seconds, free, 2.0 * half.seconds / two.seconds))
         print(
-            f'| {number + 1} | {one.seconds:.1f} | {two.seconds:.1f} | {found[-1][0]:.2f} '
-            f'| {free:.2f} | {half.seconds:.1f} | {found[-1][2]:.2f} |',
+            f'| {number + 1} | {one.seconds:.1f} | {two.seconds:.1f} | {collected[-1][0]:.2f} '
+            f'| {free:.2f} | {half.seconds:.1f} | {collected[-1][2]:.2f} |',
             flush=True,
         )
-    strong, free, weak = (statistics.median(column) for column in zip(*found, strict=True))
+    strong, free, weak = (statistics.median(column) for column in zip(*collected, strict=True))
     print(
         f'median: strong {strong:.2f} x, with a free core each {free:.2f} x; weak {weak:.2f} x '
         f'the throughput; load {loads()}'
@@ -222,18 +222,18 @@ def overhead(folder: Path, n_units: int) -> None:
     """
     write_fleet(folder / 'small', 20, SMALL_BAGS, SMALL_PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model='golovach')
-    found = measure(folder / 'small', n_units, 2, FleetOptions(fit, certificates=False))
-    busy = sum(found.tasks)
+    cost = measure(folder / 'small', n_units, 2, FleetOptions(fit, certificates=False))
+    busy = sum(cost.tasks)
     print(f'{n_units} units x {SMALL_BAGS} bags, model golovach, 2 workers; load {loads()}')
-    print(f'elapsed {found.seconds:.1f} s, tasks {busy:.1f} s on both workers')
-    print(f'idle workers: {100.0 * (1.0 - busy / (2.0 * found.seconds)):.2f} % of their time')
+    print(f'elapsed {cost.seconds:.1f} s, tasks {busy:.1f} s on both workers')
+    print(f'idle workers: {100.0 * (1.0 - busy / (2.0 * cost.seconds)):.2f} % of their time')
     print(
-        f"scheduler and client: {100.0 * found.own_cpu_s / busy:.2f} % of the tasks' processor "
-        f'time; {1e3 * found.per_task_s:.2f} ms per unit, and {100.0 * found.rest_cpu:.1f} % of a '
+        f"scheduler and client: {100.0 * cost.own_cpu_s / busy:.2f} % of the tasks' processor "
+        f'time; {1e3 * cost.per_task_s:.2f} ms per unit, and {100.0 * cost.rest_cpu:.1f} % of a '
         'processor at rest'
     )
-    print(f'network: {found.n_bytes / n_units / 1e3:.1f} kB per unit, all connections together')
-    paper(found)
+    print(f'network: {cost.n_bytes / n_units / 1e3:.1f} kB per unit, all connections together')
+    paper(cost)
 
 
 def kill(folder: Path, n_units: int, model: str) -> int:
@@ -317,10 +317,10 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument('part', choices=['scaling', 'overhead', 'kill'])
-    parser.add_argument('--units', type=int, help='instead of 16, 500 and 200')
+    parser.add_argument('--units', type=int, help='number of units (default 16, 500, 200)')
     parser.add_argument('--repeats', type=int, default=3)
-    parser.add_argument('--model', default='response', help='of scaling and kill')
-    parser.add_argument('--folder', type=Path, help='where the bags are kept')
+    parser.add_argument('--model', default='response', help='model of the fits')
+    parser.add_argument('--folder', type=Path, help='folder that keeps the bags')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = (options.folder or Path(scratch)).absolute()

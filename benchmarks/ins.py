@@ -6,8 +6,8 @@ Owns the position error of an inertial navigator due to accelerometer drift, raw
 A platform stands in the chamber of the held-out bag, so that any motion that its navigator
 computes is an error. The navigator levels itself for five minutes, then navigates freely for half
 an hour; or it gets a zero-velocity update (ZUPT) every minute, and then coasts for five minutes.
-Such a flight begins in every minute of the run, with the raw accelerometer, with one set of
-coefficients, and compensated.
+A flight of either kind begins in every minute of the run, with the raw accelerometer, with one set
+of coefficients, and compensated.
 
 The gyroscopes are ideal and the Earth does not rotate, so that only the accelerometer matters; the
 vertical channel, which needs a barometer, is held. The filter has four
@@ -166,25 +166,25 @@ def models() -> tuple[dict[str, Model], float, Floats, float]:
     """
     bags, held_out = sorted((BAGS / 'fit').glob('*.mcap')), BAGS / 'held_out.mcap'
     full = tc.fit(bags, gravity=9.80665)
-    one = tc.fit(bags, gravity=9.80665, groups=('curve',), static_curve='cubic',
-                 dynamic_curve='cubic')  # fmt: skip
+    cubic = tc.fit(bags, gravity=9.80665, groups=('curve',), static_curve='cubic',
+                   dynamic_curve='cubic')  # fmt: skip
     recording = tc.read(held_out)
-    found = {}
-    for name, unit in (('one set', one), ('compensated', full)):
+    collected = {}
+    for name, unit in (('one set', cubic), ('compensated', full)):
         out = unit.correct(recording.time_s, recording.counts, **recording.temperatures)
         noise = np.array(Correction(unit).noise)
         claimed = np.nanmean(np.diagonal(out.covariance, axis1=1, axis2=2), axis=0) - noise
         density = float(np.mean(unit.noise_density_m_s2_sqrt_hz))
-        found[name] = Model(out.specific_force, density, float(np.sqrt(claimed[:2].mean())))
+        collected[name] = Model(out.specific_force, density, float(np.sqrt(claimed[:2].mean())))
     axes = [getattr(full.axes, axis) for axis in 'xyz']
     bias = np.array([axis.bias for axis in axes])
     scale = np.array([axis.scale_factor for axis in axes])
     raw = (recording.counts - bias) / scale @ np.array(full.misalignment).T
     # Raw data have no stated uncertainty, so the filter uses that of the compensated data.
-    ours = found['compensated']
+    ours = collected['compensated']
     truth = json.loads(inspect_recording(held_out).metadata['truth'])
     return (
-        {'raw': Model(raw, ours.noise_density, ours.bias_sd), **found},
+        {'raw': Model(raw, ours.noise_density, ours.bias_sd), **collected},
         float(np.median(np.diff(recording.time_s))),
         np.array(truth['up']),
         full.gravity_m_s2,
@@ -198,12 +198,12 @@ def draw(path: Path, results: dict[str, dict[str, Flights]]) -> None:
 
     figure, panels = plt.subplots(1, 2, figsize=(9.6, 3.8), layout='constrained')
     for panel, (program, flights) in zip(panels, results.items(), strict=True):
-        for name, one in flights.items():
-            minutes, colour = one.time_s / 60.0, COLOURS[name]
-            low, high = np.quantile(one.position, (0.05, 0.95), axis=1)
+        for name, flight in flights.items():
+            minutes, colour = flight.time_s / 60.0, COLOURS[name]
+            low, high = np.quantile(flight.position, (0.05, 0.95), axis=1)
             if name != 'one set':
                 panel.fill_between(minutes, low, high, color=colour, alpha=0.15, linewidth=0)
-            rms = np.sqrt(np.mean(one.position**2, 1))
+            rms = np.sqrt(np.mean(flight.position**2, 1))
             panel.plot(minutes, rms, color=colour, label=f'{name}: {rms[-1]:.3g} m at the end')
         panel.set(xlabel='minutes after levelling', title=program, ylim=(0.0, None))
         panel.legend(loc='upper left')
@@ -230,13 +230,13 @@ def main() -> int:
           '| sigma of position, m | error / sigma |')  # fmt: skip
     print('|---|---|---|---|---|---|---|---|')
     for program, flights in results.items():
-        for name, one in flights.items():
+        for name, flight in flights.items():
             position, velocity, tilt = (
                 float(np.sqrt(np.mean(error[-1] ** 2)))
-                for error in (one.position, one.velocity, one.tilt)
+                for error in (flight.position, flight.velocity, flight.tilt)
             )
-            sigma = float(one.sigma[-1, 0])
-            print(f'| {program} | {name} | {position:.3g} | {one.position[-1].max():.3g} '
+            sigma = float(flight.sigma[-1, 0])
+            print(f'| {program} | {name} | {position:.3g} | {flight.position[-1].max():.3g} '
                   f'| {velocity:.2g} | {1e6 * tilt:.3g} | {sigma:.3g} '
                   f'| {position / sigma:.2f} |')  # fmt: skip
     if options.figure:

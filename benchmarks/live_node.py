@@ -3,7 +3,7 @@
 """
 Runs the live node in this process, without loss of messages, and records what it publishes.
 
-For the demonstration, tests and benchmarks. As in a bag written by `replay`, the log time of an
+The demonstration, tests and benchmarks use it. As in a bag written by `replay`, the log time of an
 Imu is its stamp, and the log time of any other output the newest Imu stamp before it.
 """
 
@@ -59,14 +59,14 @@ def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
 
 def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> list[str]:
     """Return ROS arguments under which a node loses no message, at the price of latency."""
-    inputs = [*(one.name for one in SAMPLES.values()), *map(thermometer, thermometers)]
+    inputs = [*(sample.name for sample in SAMPLES.values()), *map(thermometer, thermometers)]
     overrides = [
         *(f'{topic}.subscription.reliability:=reliable' for topic in inputs),
         *(f'{topic}.subscription.history:=keep_all' for topic in inputs),
         f'{IMU_OUT.name}.publisher.history:=keep_all',
         *(f'{flag.name}.publisher.depth:=1000' for flag in FLAGS),
     ]
-    return [word for one in overrides for word in ('-p', f'qos_overrides.{namespace}/{one}')]
+    return [word for text in overrides for word in ('-p', f'qos_overrides.{namespace}/{text}')]
 
 
 class Recorder:
@@ -127,7 +127,7 @@ class Recorder:
     @property
     def has_publishers(self) -> bool:
         """Whether every topic has a publisher."""
-        return all(one.count_publishers() for one in self._heard.values())
+        return all(topic.count_publishers() for topic in self._heard.values())
 
 
 def _stamps(messages: list[bytes]) -> np.ndarray:
@@ -161,21 +161,21 @@ def through_the_node(
 
         def is_joined() -> bool:
             """Whether every topic has discovered both ends."""
-            heard = {one.topic_name for one in node.node.subscriptions}
-            sent = {one.topic_name for one in player.node.publishers}
+            heard = {subscription.topic_name for subscription in node.node.subscriptions}
+            sent = {publisher.topic_name for publisher in player.node.publishers}
             results = {f'{namespace}/{topic.name}' for topic in OUTPUTS}
             return (
                 recorder.has_publishers
                 and heard.isdisjoint(player.unheard())
                 and all(
-                    one.get_publisher_count()
-                    for one in node.node.subscriptions
-                    if one.topic_name in sent
+                    subscription.get_publisher_count()
+                    for subscription in node.node.subscriptions
+                    if subscription.topic_name in sent
                 )
                 and all(
-                    one.get_subscription_count()
-                    for one in node.node.publishers
-                    if one.topic_name in results
+                    publisher.get_subscription_count()
+                    for publisher in node.node.publishers
+                    if publisher.topic_name in results
                 )
             )
 

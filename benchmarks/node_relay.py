@@ -10,27 +10,25 @@ temperatures at 10 Hz, a sink process receives the Imu messages, and between the
 node, with everything on, or the naive relay: an rclpy node that copies Vector3Stamped to Imu in a
 callback. The CPU time is that of the whole relay process, all its threads, from the first sample
 to the last; the latency runs from the source's publish call to the arrival in the sink's
-middleware, before any Python of the sink. Only ratios travel. The node brings its own profile for
-Fast DDS; source, sink and naive relay run without one. At the last rate the node is measured once
-more while its `calibration_file` is set twice a second. `--core` keeps each relay to that
-core. `--floor` measures a third relay, too: one wait set, one
-subscription, bytes copied, nothing computed, the node's profile.
+middleware, before any Python of the sink. Ratios hold on other machines, times do not. The node
+uses its profile for Fast DDS; source, sink and naive relay use the default profile. At the last
+rate the node is measured once more while its `calibration_file` is set twice a second. `--core`
+binds each relay to a core. `--floor` measures a third relay, too, which copies bytes with one wait
+set, one subscription and the node's profile, and computes nothing.
 
-The source keeps `--depth` samples to repeat them. With a reliable relay Fast DDS has it throw away
-at once what has arrived, every 859 of them; with 2000 kept, that holds the source itself up for 1
-to 3 ms each time, which says nothing of the relay.
+The source keeps `--depth` samples to repeat them. With a reliable relay Fast DDS removes received
+samples from this store 859 at a time; with 2000 kept samples the removal delays the source by 1 to
+3 ms, which is no property of the relay.
 
-Processes that missed each other's first announcements meet at the next, 3 s later, and the one
-that then opens the other's shared memory may stand still for a third of a second: Fast DDS waits
-to see whether somebody reads there, and sends nothing meanwhile. So nothing is measured until all
-have met.
+Processes that missed each other's first announcements discover each other at the next, 3 s later.
+A process that then opens another's shared memory may stand still for a third of a second, as Fast
+DDS waits for a reader there. The measurement begins when all processes have been discovered.
 
-An idle core sleeps and needs time to wake up, and an idle virtual core may be given away.
-Where the system allows it (Linux, as root) all cores are therefore kept awake for all
-relays alike, by a request for no latency in /dev/cpu_dma_latency, as cyclictest has it;
-`--sleep` leaves them alone. The host may stop a virtual machine all the same; while it does, no
-process gets on. How much of the time that was stands behind each row ("stolen"): latencies say
-something where it is small.
+An idle core sleeps and needs time to wake up, and an idle virtual core may be given away. If the
+system allows it (Linux, as root) all cores are therefore kept awake for all relays alike, by a
+request for no latency in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` they may sleep.
+The host may stop a virtual machine all the same, and all processes with it. The share of stolen
+time is at the end of each row ("stolen"): latencies are meaningful if it is small.
 """
 
 from __future__ import annotations
@@ -104,15 +102,17 @@ def main() -> None:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
-    parser.add_argument('--quick', action='store_true', help='3 s, once, three rates')
+    parser.add_argument('--quick', action='store_true', help='three rates, one run of 3 s each')
     parser.add_argument('--seconds', type=float, help='length of a run (default 10)')
     parser.add_argument('--repeats', type=int, help='runs of each case (default 3)')
     parser.add_argument('--rates', type=int, nargs='+', help=f'default {RATES}')
-    parser.add_argument('--floor', action='store_true', help='a loop that only copies, too')
+    parser.add_argument(
+        '--floor', action='store_true', help='also measure a loop that only copies'
+    )
     parser.add_argument('--core', type=int, default=-1, help='core for the relays (default any)')
     parser.add_argument('--depth', type=int, default=100, help="source's queue (default 100)")
-    parser.add_argument('--sleep', action='store_true', help='cores may sleep when idle')
-    parser.add_argument('--json', help='write the figures to this file')
+    parser.add_argument('--sleep', action='store_true', help='let idle cores sleep')
+    parser.add_argument('--json', help='file for the figures')
     arguments = parser.parse_args()
     arguments.seconds = arguments.seconds or (3.0 if arguments.quick else 10.0)
     arguments.repeats = arguments.repeats or (1 if arguments.quick else 3)
@@ -182,7 +182,7 @@ def _ratio(runs: list[dict[str, Any]], naive: list[dict[str, Any]]) -> float:
     The speed of a machine changes over minutes by more than the differences to be measured.
     """
     return statistics.median(
-        one['cpu_us'] / other['cpu_us'] for one, other in zip(runs, naive, strict=True)
+        run['cpu_us'] / other['cpu_us'] for run, other in zip(runs, naive, strict=True)
     )
 
 

@@ -164,9 +164,9 @@ def fitted(runs: list[Run], **options: float) -> Calibration:
 def left(calibration: Calibration, one: Run, level: float) -> float:
     """Return the RMS vector error of 60 s means at one |f| [ug]."""
     compensator = Compensator(calibration, UNCHECKED)
-    found = process_block(compensator, one.block)
-    error = found.specific_force - one.force[found.index]
-    at = one.levels[found.index] == level
+    corrected = process_block(compensator, one.block)
+    error = corrected.specific_force - one.force[corrected.index]
+    at = one.levels[corrected.index] == level
     edges = np.flatnonzero(np.diff(np.r_[0, at, 0]))
     means = [
         error[a + k : a + k + 60].mean(axis=0)
@@ -177,7 +177,7 @@ def left(calibration: Calibration, one: Run, level: float) -> float:
 
 
 def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
-    """Fit a unit; return errors and claims of its terms, and what is left at 5 g."""
+    """Fit a unit; return errors and claimed sd of its terms, and the residual at 5 g."""
     rng = np.random.default_rng(seed)
     unit = Unit.drawn(rng, k2, k3)
     runs = [run(unit, inward, rng) for inward in mountings(rng)]
@@ -186,16 +186,16 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     nonlinearity = calibration.nonlinearity
     of_terms = sd[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
-    result = {'kinds': np.array([one.kind for one in nonlinearity.terms])}
+    result = {'kinds': np.array([term.kind for term in nonlinearity.terms])}
     if not k2:
-        # The same fit with terms pinned to 0 by their prior: what else has moved?
+        # The same fit with terms pinned to 0 by their prior shows the change of bias and scale.
         without = fitted(runs, k2_sd=1e-12, k3_sd=1e-13)
         values = [
-            np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in one.axes])
-            for one in (calibration, without)
+            np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in used.axes])
+            for used in (calibration, without)
         ]
         bias = sd[[one.static for one in layout.bias]] / [a.scale_factor for a in calibration.axes]
-        scale = sd[[one.static for one in layout.scale]]
+        scale = sd[[block.static for block in layout.scale]]
         result['moved'] = (values[0] - values[1]) / np.column_stack((bias, scale))
         return result
     for k, one in enumerate(nonlinearity.terms):
@@ -213,7 +213,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
 
 
 def main() -> int:
-    """Print the figures; 0 if all goals are met."""
+    """Print the figures; return 0 if all goals are met."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--units', type=int, default=20)
     parser.add_argument('--without', type=int, default=5, help='units without nonlinear terms')
@@ -235,22 +235,27 @@ def main() -> int:
     for seed, one in enumerate(found):
         print(seed, *one['kinds'], f'before {one["before"][0]:.0f} after {one["after"][0]:.2f} ug')
     for kind in ('square', 'cube'):
-        has = [one for one in found if kind in one]
+        has = [unit for unit in found if kind in unit]
         say(f'{kind}: share of units that have it', len(has) / len(found), 1.0, 1.0)
-        each = np.array([one[kind] for one in has])
+        each = np.array([unit[kind] for unit in has])
         say(f'{kind}: RMS relative error', float(np.sqrt(np.mean(each**2))), 0.0, 0.02)
         say(f'{kind}: largest relative error', float(np.abs(each).max()), 0.0, 0.02)
         for name in (f'{kind} ratio', f'{kind} slope ratio'):
-            ratio = np.array([one[name] for one in has])
+            ratio = np.array([unit[name] for unit in has])
             say(f'{name}: RMS error / claim', float(np.sqrt(np.mean(ratio**2))), 0.7, 1.4)
     say('all terms are square and cube', float(all(len(one['kinds']) == 2 for one in found)), 1, 1)
     rms = {k: float(np.sqrt(np.mean([one[k] ** 2 for one in found]))) for k in ('before', 'after')}
     say('5 g in a new mounting without the terms, RMS [ug]', rms['before'], 200.0, 700.0)
     say('5 g in a new mounting, RMS [ug]', rms['after'], 0.0, 3.0)
     if plain:
-        say('units without: terms left in the file', sum(len(one['kinds']) for one in plain), 0, 0)
-        moved = float(np.abs([one['moved'] for one in plain]).max())
-        say('units without: largest move of bias, scale / sd', moved, 0.0, 1.0)
+        say(
+            'units without such terms: terms in the file',
+            sum(len(unit['kinds']) for unit in plain),
+            0,
+            0,
+        )
+        moved = float(np.abs([unit['moved'] for unit in plain]).max())
+        say('units without such terms: largest move of bias, scale / sd', moved, 0.0, 1.0)
     return int(wrong > 0)
 
 

@@ -31,15 +31,15 @@ def command(*arguments: object) -> dict[str, Any]:
     done = subprocess.run(line, capture_output=True, text=True, check=False, cwd=ROOT)
     if done.returncode not in {0, 1} or not done.stdout:
         raise RuntimeError(done.stderr)
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    content: dict[str, Any] = json.loads(done.stdout)
+    return content
 
 
 def without_case(bag: Path, target: Path) -> Path:
     """Copy samples and board temperatures only."""
-    found = read_recording(bag, require=('accel', 'board'))
-    columns, board = found.columns, found.columns.temperatures['board']
-    with BagWriter(target, metadata=dict(found.info.metadata)) as writer:
+    recording = read_recording(bag, require=('accel', 'board'))
+    columns, board = recording.columns, recording.columns.temperatures['board']
+    with BagWriter(target, metadata=dict(recording.info.metadata)) as writer:
         log_ns = columns.log_ns
         stamps = columns.accel_stamp_ns
         writer.write_counts('accel/counts', stamps, columns.accel, log_ns=log_ns['accel'])
@@ -49,7 +49,7 @@ def without_case(bag: Path, target: Path) -> Path:
 
 
 def bags_of(unit: str, folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the bags of a fit and held-out ones; simulated, except for the sample unit's."""
+    """Return the bags of a fit and the held-out bags; simulated, except for the sample unit's."""
     if unit == 'sample':
         return sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), [ROOT / 'bags' / 'held_out.mcap']
     common = ('simulate', '--unit', unit, '--rate-hz', RATE_HZ)
@@ -79,9 +79,9 @@ def main() -> None:
             alone = [without_case(bag, ones / f'{bag.stem}.mcap') for bag in bags]
             held_alone = [without_case(bag, ones / f'held_{bag.stem}.mcap') for bag in held]
             two = left(bags, held, folder / 'two.yaml')
-            one = left(alone, held_alone, folder / 'one.yaml')
-            values = (two['raw_rms'], two['rms'], one['rms'])
-            print(f'{unit:16}' + ''.join(f'{one / MICRO_G:8.3g}' for one in values), flush=True)
+            board = left(alone, held_alone, folder / 'one.yaml')
+            values = (two['raw_rms'], two['rms'], board['rms'])
+            print(f'{unit:16}' + ''.join(f'{rms / MICRO_G:8.3g}' for rms in values), flush=True)
 
 
 if __name__ == '__main__':

@@ -5,7 +5,8 @@ Owns the figures of docs/regime.md: the detector over ramps and soaks, in one ru
 
 Closed-form responses of a case (first-order lag) and a board (a second lag behind it) to a
 chamber's ramp, with the chamber's ripple and a self-heating drift, are read by sensors of several
-noises, quanta and rates. The detector runs as shipped. Seeded: one command, one set of figures.
+noises, quanta and rates. The detector runs as shipped. All runs are seeded: the command always
+prints the same figures.
 
     python benchmarks/regime.py --quick            # seconds
     python benchmarks/regime.py --workers 2        # some minutes
@@ -71,7 +72,7 @@ def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
         known_signature_delays,
         [(each, settings(each).false_alarms_per_hour, hours, n, seed) for each in plain],
     )
-    found = pool.map(run_ramps, jobs, chunksize=1)
+    results = pool.map(run_ramps, jobs, chunksize=1)
     bound_of = dict(zip(plain, bounds.get(), strict=True))
     rows = [
         [
@@ -86,18 +87,18 @@ def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
             'ramps',
         ]
     ]
-    for (scene, one), job in zip(found, jobs, strict=True):
+    for (scene, result), job in zip(results, jobs, strict=True):
         is_rippled = job[3]
         bound = ('', '') if is_rippled else bound_of.get(scene, ('', ''))
         rows.append(
             [
                 scene.sensor,
                 'yes' if is_rippled else 'no',
-                *(f'{each:.0f}' for each in quantiles(one.delays)),
+                *(f'{each:.0f}' for each in quantiles(result.delays)),
                 *(f'{each:.0f}' if each else '' for each in bound),
-                f'{one.missed}',
-                f'{one.flips}',
-                f'{one.n}',
+                f'{result.missed}',
+                f'{result.flips}',
+                f'{result.n}',
             ]
         )
     return rows
@@ -146,14 +147,14 @@ def rate_table(matrix: Matrix) -> Rows:
     """Count detections, flips and misses of the ramps, by the rate of the readings."""
     rows = [['readings', 'ramps', 'missed', 'missed of >= 0.2 K/min', 'with a flip']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
-        mine = [(scene, one) for scene, one in matrix if scene.rate_hz == rate]
+        mine = [(scene, result) for scene, result in matrix if scene.rate_hz == rate]
         rows.append(
             [
                 f'{rate:g} Hz',
-                f'{sum(one.n for _, one in mine)}',
-                f'{sum(one.missed for _, one in mine)}',
-                f'{sum(one.missed for scene, one in mine if scene.ramp_k_min >= 0.2)}',
-                f'{sum(one.flips for _, one in mine)}',
+                f'{sum(row.n for _, row in mine)}',
+                f'{sum(row.missed for _, row in mine)}',
+                f'{sum(row.missed for scene, row in mine if scene.ramp_k_min >= 0.2)}',
+                f'{sum(row.flips for _, row in mine)}',
             ]
         )
     return rows
@@ -162,9 +163,9 @@ def rate_table(matrix: Matrix) -> Rows:
 def scene_table(matrix: Matrix, lag: float) -> Rows:
     """Median delay and flagged share in each scene of one lag."""
     rows = [['sensor', 'Hz', 'K/min', 'median, s', 'share flagged']]
-    for scene, one in matrix:
+    for scene, result in matrix:
         if scene.lag_s == lag:
-            delay, share = f'{quantiles(one.delays)[0]:.0f}', f'{one.flagged:.2f}'
+            delay, share = f'{quantiles(result.delays)[0]:.0f}', f'{result.flagged:.2f}'
             row = [scene.sensor, f'{scene.rate_hz:g}', f'{scene.ramp_k_min:g}', delay, share]
             rows.append(row)
     return rows
@@ -226,16 +227,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument('parts', nargs='*', help=f'all by default: {", ".join(PARTS)}')
-    parser.add_argument('--quick', action='store_true', help='small versions, some seconds')
+    parser.add_argument('--quick', action='store_true', help='small runs, for some seconds')
     parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--workers', type=int, default=1, help='processes')
+    parser.add_argument('--workers', type=int, default=1, help='number of processes')
     parser.add_argument('--soak-hours', type=float, default=1100.0)
     parser.add_argument(
-        '--rates', type=float, nargs='+', choices=RAMPS, help='matrix: readings, Hz'
+        '--rates', type=float, nargs='+', choices=RAMPS, help='matrix: rates of the readings, Hz'
     )
     parser.add_argument('--ramps', type=int, help='matrix: number of ramps per scene')
-    parser.add_argument('--figures', metavar='FOLDER', type=Path, help='draw there, too')
-    parser.add_argument('--json', metavar='FILE', help='every table, machine-readable')
+    parser.add_argument('--figures', metavar='FOLDER', type=Path, help='folder for figures')
+    parser.add_argument('--json', metavar='FILE', help='file for every table, as JSON')
     arguments = parser.parse_args()
     parts = arguments.parts or [*PARTS]
     if not set(parts) <= set(PARTS):

@@ -82,8 +82,8 @@ def known_signature_delays(
     Return median and 95 % delay of a CUSUM with known ramp, baseline and noise.
 
     Page's statistic with the signature of the true ramp: the largest log likelihood ratio over the
-    onset times. Its threshold follows from the exceedances counted in noise alone, whose logarithm
-    falls linearly with the level.
+    onset times. The threshold of the statistic follows from the exceedances counted in noise
+    alone, whose logarithm falls linearly with the level.
     """
     rng = np.random.default_rng([seed, 9])
     dt = 1.0 / scene.rate_hz
@@ -97,7 +97,7 @@ def known_signature_delays(
         energy = np.cumsum(signature**2)
         sums = np.zeros(len(x))
         for length in range(1, longest + 1):
-            # the reading `length - 1` ago carries signature[0], the newest signature[length - 1]
+            # signature[0] is for the reading `length - 1` ago, the last element for the newest
             sums = np.convolve(x, signature[:length][::-1])[: len(x)]
             np.maximum(best, (sums - 0.5 * energy[length - 1]) / scene.noise_sd**2, out=best)
         return best

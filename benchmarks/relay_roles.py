@@ -3,8 +3,8 @@
 """
 Owns the processes that `node_relay.py` runs side by side: source, relays, sink, reloader.
 
-They communicate with their parent by lines on standard input and output, and with each other by
-DDS.
+The processes communicate with their parent by lines on standard input and output, and with each
+other by DDS.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _source(arguments: argparse.Namespace) -> None:
 
     rclpy.init()
     node = rclpy.create_node('source')
-    # Reliable, so that it matches both kinds of subscription.
+    # The publisher is reliable, so that it matches both kinds of subscription.
     qos = _qos('reliable', arguments.depth)
     counts = node.create_publisher(Vector3Stamped, 'accel/counts', qos)
     temperatures = [

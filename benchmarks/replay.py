@@ -3,9 +3,9 @@
 """
 Owns the measurement of the offline run: reading, compensating and writing a bag, in one run.
 
-Ours is the library as `thermo_comp replay` uses it. The peer is what one would write with
-rosbags: read and deserialize each message, correct it with the same compensator one by one,
-serialize and write it. Both write chunks packed with zstd. All bags hold 400 Hz of counts and two
+Our side is the library as `thermo_comp replay` uses it. The peer is a script with rosbags: read
+and deserialize each message, correct it with the same compensator one by one, serialize and write
+it. Our side and the peer write chunks packed with zstd. All bags hold 400 Hz of counts and two
 temperatures at 1 Hz.
 
     python benchmarks/replay.py --hours 24        # the day: read, compensate, linear in length
@@ -86,7 +86,7 @@ def compensate(path: Path) -> tuple[int, float]:
     n = 0
     with open_recording(path) as reader:
         for block in reader.blocks():
-            # The clock of this thread only, as the reader decompresses ahead in others.
+            # Use the clock of this thread only, as the reader decompresses ahead in others.
             begin = time.thread_time()
             n += len(process_block(compensator, block).index)
             spent += time.thread_time() - begin
@@ -99,7 +99,7 @@ def ours(path: Path, output: Path) -> int:
 
 
 def rosbags_pipeline(path: Path, output: Path) -> int:
-    """Do the same message by message with rosbags."""
+    """Replay message by message with rosbags."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -111,7 +111,7 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
     compensator = Compensator(calibration())
     n = 0
     target = Writer(output, version=9, storage_plugin=StoragePlugin.MCAP)
-    # Chunks are compressed as in ours.
+    # Chunks are compressed as by `thermo_comp replay`.
     target.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with Reader(path) as reader, target as writer:
         out = writer.add_connection('/imu/data_raw', imu_type.__msgtype__, typestore=store)
@@ -228,10 +228,10 @@ def memory(folder: Path, gigabytes: float) -> None:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description='The offline run against its peers.')
-    parser.add_argument('--samples', type=int, default=1_000_000, help='of the pipelines')
-    parser.add_argument('--hours', type=float, default=2.0, help='of the day')
+    parser.add_argument('--samples', type=int, default=1_000_000, help='samples of the pipelines')
+    parser.add_argument('--hours', type=float, default=2.0, help='length of the bag for reading')
     parser.add_argument('--compression', default='zstd', choices=('none', 'lz4', 'zstd'))
-    parser.add_argument('--gigabytes', type=float, default=0.0, help='of the large bag')
+    parser.add_argument('--gigabytes', type=float, default=0.0, help='size of the large bag')
     parser.add_argument('--repeats', type=int, default=2)
     options = parser.parse_args()
     print(

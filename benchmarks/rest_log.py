@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Measures what the rest log costs the node: CPU time per sample and latency, with it and without.
+Measures the cost of the rest log: CPU time per sample and latency of the node with and without it.
 
     python benchmarks/rest_log.py [--rates 400 1000 10000] [--seconds 60]
 
 The node runs in this process, source and sink of samples in two others; the log is on in even
-seconds of the clock and off in odd ones. Neighbouring seconds are compared, because a shared
+seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because a shared
 machine changes its pace. The latency runs from the source's publish call to the arrival in the
-sink's middleware. The time of one block of sums, on the clock, is the longest that a sample can
-wait for it.
+sink's middleware. The wall time of one block of sums is the longest time for which the block can
+delay a sample.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def tail_latencies(file: Path) -> tuple[Floats, Floats]:
     """Return the p99 latency [ms] of each even second, with the log, and of each odd one."""
     stamp_ns, latency_ns = np.load(file)
     second = stamp_ns // 1_000_000_000
-    # Without the first and the last second, which are not whole.
+    # Exclude the first and the last second, which are incomplete.
     seconds = np.unique(second)[1:-1]
-    tails = np.array([np.percentile(latency_ns[second == one], 99) for one in seconds]) * 1e-6
+    tails = np.array([np.percentile(latency_ns[second == at], 99) for at in seconds]) * 1e-6
     return tails[seconds % 2 == 0], tails[seconds % 2 == 1]
 
 
@@ -86,7 +86,7 @@ def measure(rate: int, seconds: int, folder: Path) -> None:
     words = [f'calibration_file:={calibration}', f'rest_log:={folder}/{rate}']
     with (
         _cores_kept_awake(False),
-        node_in_thread(*[word for one in words for word in ('-p', one)]) as node,
+        node_in_thread(*[word for text in words for word in ('-p', text)]) as node,
         _process('sink', options) as sink,
         _process('source', options) as source,
     ):
@@ -114,7 +114,7 @@ def _compared(with_log: Floats, without: Floats, unit: str) -> str:
     """Describe the difference between neighbouring seconds and its standard error."""
     n = min(len(with_log), len(without))
     more, usual = with_log[:n] - without[:n], float(np.median(without))
-    # The median, as a second in which the host stops the machine has a latency of its own.
+    # Use the median: a second in which the host stops the machine has a large latency.
     sd = 1.2533 * 1.4826 * float(np.median(np.abs(more - np.median(more)))) / np.sqrt(n)
     away = float(np.median(more))
     return f'{usual:.3g} {unit} without, {away / usual:+.1%} +- {sd / usual:.1%} with the log'

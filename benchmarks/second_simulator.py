@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a second simulator that shares nothing with the package's: the fit on physics it never saw.
+Owns a second simulator without code of the package, for fits of physics that the package lacks.
 
 Run ``python benchmarks/second_simulator.py`` for the table of docs/accuracy.md, or a part of it:
 ``python benchmarks/second_simulator.py --kinds own,even --plans wide --seeds 1``.
 
 Air, case, board, three heads and their pendulums are nodes of one ODE network, integrated in steps
 of 2 s; the board's own heat makes it warmer than the case. Bias and scale follow the pendulums.
-Samples come at 1 Hz with 5 ug of noise, thermometers at 0.5 Hz with 5 mK. Held out are three runs:
-other attitudes, ramps, orders, and another temperature at which the unit has soaked.
+Samples come at 1 Hz with 5 ug of noise, thermometers at 0.5 Hz with 5 mK. Three runs are held out,
+with other attitudes, ramps, orders, and another temperature at which the unit has soaked.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def unit_of(kind: str, seed: int) -> SimpleNamespace:
     normal(0.0)
     if kind not in ('own', 'slow'):
         unit.head_s, unit.pendulum_s = (
-            np.full(3, own[0]) for own in (unit.head_s, unit.pendulum_s)
+            np.full(3, lags[0]) for lags in (unit.head_s, unit.pendulum_s)
         )
     if kind == 'products':
         unit.stress = np.array([signed(3, 12), signed(0.05, 0.25)])
@@ -234,13 +234,13 @@ def runs_of(
         ideal = aligned @ force * (1.0 + 1e-6 * seen(scale))
         ideal = ideal + (unit.constant + seen(bias) + noise) * MICRO_G
         readings = [
-            np.round((np.interp(read, t, one[:, bag]) + sd) / READING_STEP) * READING_STEP
-            for one in (board, case)
+            np.round((np.interp(read, t, celsius[:, bag]) + sd) / READING_STEP) * READING_STEP
+            for celsius in (board, case)
             for sd in [READING_SD * draw.standard_normal(len(read))]
         ]
         # A sample is stamped at its end.
-        stamps, read_ns = (np.rint(1e9 * (one + 0.5 * SAMPLE_S)).astype(np.int64)
-                           for one in (middle, read))  # fmt: skip
+        stamps, read_ns = (np.rint(1e9 * (time + 0.5 * SAMPLE_S)).astype(np.int64)
+                           for time in (middle, read))  # fmt: skip
         result.append(
             SimpleNamespace(
                 name=f'p{bag:02d}', accel_stamp_ns=stamps,
@@ -262,18 +262,18 @@ def plan_of(kind: str, seed: int, plan: str) -> tuple[list[Any], list[Any]]:
     up /= np.linalg.norm(up, axis=1)[:, None]
     first = seed_of(f'{kind}{seed}{held}') % 2**31
     tests = [
-        runs_of(unit, one, up[[k]], first + k, soaked_s=21600.0, soaked_c=20.0)[0]
-        for k, one in enumerate(programs)
+        runs_of(unit, program, up[[k]], first + k, soaked_s=21600.0, soaked_c=20.0)[0]
+        for k, program in enumerate(programs)
     ]
     return records, tests
 
 
 def floor_of(tests: Sequence[Any]) -> tuple[float, float]:
     """Return the noise in means of a minute, of |f| and of the vector [ug]."""
-    means = [one.noise[: len(one.noise) // 60 * 60].reshape(-1, 60, 3).mean(1) for one in tests]
+    means = [test.noise[: len(test.noise) // 60 * 60].reshape(-1, 60, 3).mean(1) for test in tests]
     norms = [
-        mean @ one.truth.specific_force / STANDARD_GRAVITY
-        for mean, one in zip(means, tests, strict=True)
+        mean @ test.truth.specific_force / STANDARD_GRAVITY
+        for mean, test in zip(means, tests, strict=True)
     ]
     sizes = np.linalg.norm(np.concatenate(means), axis=1)
     both = (np.concatenate(norms), sizes)
@@ -287,10 +287,10 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     names = {'type': lambda text: text.split(',')}
-    parser.add_argument('--kinds', **names, default=KINDS, help='some kinds only')
-    parser.add_argument('--plans', **names, default=('wide', 'mild'), help='beyond, too')
+    parser.add_argument('--kinds', **names, default=KINDS, help='kinds (default: all)')
+    parser.add_argument('--plans', **names, default=('wide', 'mild'), help='wide, mild, beyond')
     parser.add_argument('--seeds', type=int, default=1, help='units per kind')
-    parser.add_argument('--model', default='response', help='or golovach')
+    parser.add_argument('--model', default='response', help='response or golovach')
     options = parser.parse_args()
     print('| plan | kind | seed | floor: norm / vector | fit | error / claimed sd | fit s |')
     print('|---|---|---|---|---|---|---|')
@@ -300,10 +300,10 @@ def main() -> int:
                 records, tests = plan_of(kind, seed, plan)
                 least = floor_of(tests)
                 ours = fit_and_correct(records, tests, full_scale=FULL_SCALE, model=options.model)
-                found = errors(ours.specific_force, ours.sd, tests)
+                result = errors(ours.specific_force, ours.sd, tests)
                 print(
                     f'| {plan} | {kind} | {seed} | {least[0]:.2f} / {least[1]:.2f} '
-                    f'| {found.norm:.2f} / {found.vector:.2f} | {found.claimed:.2f} '
+                    f'| {result.norm:.2f} / {result.vector:.2f} | {result.claimed:.2f} '
                     f'| {ours.fit_s:.1f} |',
                     flush=True,
                 )

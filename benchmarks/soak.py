@@ -5,12 +5,12 @@ Soaks the node: hours at full rate with reloads and regime changes; every sample
 
     python benchmarks/soak.py [--minutes 60] [--rate 2000] [--json FILE]
 
-The node runs as a process of its own, under the settings that lose nothing. The temperatures ramp
-up, rest, ramp down and rest every three minutes, so the regime changes; `calibration_file` is set
-every two seconds. Every second the resident memory of the node is read, every ten the latency of
-the samples since, from before the publish call to after the take. Slopes are least squares over
-what follows the first tenth, with the standard error that independent windows of a minute give.
-Exit code 1 where a sample is missing.
+The node runs in a separate process, with settings under which no message is lost. The temperatures
+ramp up, rest, ramp down and rest every three minutes, so the regime changes; `calibration_file` is
+set every two seconds. The resident memory of the node is read every second, the latency of the
+samples (from before the publish call to after the take) every ten seconds. Slopes are least
+squares over the run without its first tenth, with the standard error of independent windows of a
+minute. The exit code is 1 if a sample is missing.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class Soak:
             self.n_heard += len(frames)
             for data in reports:
                 (status,) = deserialize_message(data, DiagnosticArray).status
-                self.account = {one.key: one.value for one in status.values}
+                self.account = {value.key: value.value for value in status.values}
             self._news.notify_all()
 
     def send(self, n: int) -> None:
@@ -233,7 +233,7 @@ class Soak:
             'n_out_of_order': self.n_disorder,
             'n_reloads': self.n_reloads,
             'n_regime_changes': self.n_changes,
-            'memory_kib': [one for _, one in memory[:: max(1, len(memory) // 30)]],
+            'memory_kib': [kib for _, kib in memory[:: max(1, len(memory) // 30)]],
             'memory_slope_kib_per_hour': slope(memory, 60.0),
             'latency_p50_ms': [latency[0][1], latency[-1][1]],
             'latency_p99_ms': float(np.median([row[2] for row in latency])),
@@ -298,7 +298,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--minutes', type=float, default=60.0)
     parser.add_argument('--rate', type=int, default=2000, help='samples per second')
-    parser.add_argument('--json', help='write the figures to this file')
+    parser.add_argument('--json', help='file for the figures')
     arguments = parser.parse_args()
     os.environ.setdefault('ROS_DOMAIN_ID', str(81 + os.getpid() % 21))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -313,7 +313,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         paths = calibrations(arguments.rate, Path(folder))
         overrides = f'calibration_file:={paths[0]}', f'diagnostics_period:={REPORT_S}'
-        ros_args = [word for one in overrides for word in ('-p', one)]
+        ros_args = [word for override in overrides for word in ('-p', override)]
         with NodeProcess(*lossless(), '--log-level', 'FATAL', *ros_args) as node:
             soak = Soak(node, context, arguments.rate)
             try:

@@ -51,8 +51,8 @@ class LeakageEffect(Effect):
 class SlipEffect(Effect):
     """
     A joint that is strained by a part's temperature and slips; its stress [K of free strain]
-    depends on the path, not the time. It slips abruptly at `width` (Jenkins) or gradually towards
-    it (Dahl, Bouc-Wen); it starts relaxed.
+    depends on the path, not the time. The joint slips abruptly at `width` (Jenkins) or gradually
+    towards it (Dahl, Bouc-Wen); it starts relaxed.
     """
 
     part: str

@@ -184,19 +184,19 @@ def draw_year(axes: Axes) -> None:
     error: dict[str, list[float]] = {'old': [], 'new': [], 'claim': []}
     for week in range(52):
         chosen = [history.rests[k] for k in np.flatnonzero(day // 7 == week)]
-        old, new = (series_of(chosen, one) for one in (laboratory, calibrated))
+        old, new = (series_of(chosen, cal) for cal in (laboratory, calibrated))
         for one in np.unique(new.day):
             at = new.day == one
             for name, values in (('old', old.miss), ('new', new.miss), ('claim', new.claim)):
                 error[name].append(float(np.sqrt(np.mean(values[at] ** 2))) / units.UG)
-        found = update(new, calibrated, source_of(chosen, '', 7.0), ahead=7.0)
-        if found.judged.is_better:
-            calibrated = found.calibration
+        updated = update(new, calibrated, source_of(chosen, '', 7.0), ahead=7.0)
+        if updated.judged.is_better:
+            calibrated = updated.calibration
     days = np.arange(len(error['old']))
     axes.plot(days, error['old'], color=RED, lw=0.8, label="the chamber's calibration")
     axes.plot(days, error['new'], color=BLUE, lw=0.8, label='updated every week')
     claim = 2.0 * np.array(error['claim'])
-    axes.fill_between(days, 0.0, claim, color=BLUE, alpha=0.15, label='2 sd of its claim')
+    axes.fill_between(days, 0.0, claim, color=BLUE, alpha=0.15, label='2 claimed sd')
     axes.axvline(140.0, color=GREY, lw=0.8, ls=':')
     axes.text(142.0, 0.9 * max(error['old']), 'a shock', color=GREY)
     axes.set(xlabel='days after the chamber', ylabel='|f| - g at rest, RMS of a day [ug]')

@@ -94,7 +94,7 @@ BOUNDS = """\
 Each number in a calibration belongs to one of these quantities. The bounds are wider than any instrument needs; a file
 within them gives finite results and a positive definite covariance. Further bounds depend on the full scale of the unit.
 The bias including its curve must stay within twice the full scale over the whole temperature range. The largest
-contribution of a column, and of one standard deviation of a parameter, must stay within a million times that. The
+contribution of a column, and of one standard deviation of a parameter, must stay within a million times this bound. The
 relative scale including the largest contributions of all columns must stay between 0.1 and 10.
 """
 
@@ -128,7 +128,7 @@ calibration has a `gyroscope`, its bias at this thermal state is subtracted from
 
 The parameter `topics` names the driver's topics, like `--topic` offline:
 `topics:=imu=/imu/data,board=/fmu/out/sensor_accel:temperature`, or a file of such lines, as in [config/drivers](drivers.md).
-`TOPIC:FIELD` is a number inside a message, written as for `ros2 topic echo --field`. The node learns its type from the
+`TOPIC:FIELD` is a number inside a message, written as for `ros2 topic echo --field`. The node takes the message type from the
 publisher; only the messages of the driver's package must be installed. A reading without a header gets the stamp of the
 newest sample before it. `output=TOPIC` names the output, for a driver that publishes `imu/data_raw` itself; the node refuses
 an output that is its input.
@@ -136,7 +136,7 @@ an output that is its input.
 ## Recording a test
 
 `thermo_comp record` is a separate node, `thermo_comp_record`: it subscribes to the inputs above, and to every other
-`temperature/<name>`, once they have a publisher, reliably if offered. It publishes nothing. See
+`temperature/<name>`, once they have a publisher, reliably if offered. This node publishes nothing. See
 [Recording](recording.md#recording).
 
 ## Parameters
@@ -159,14 +159,14 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | NaN or infinite counts | dropped, counted, WARN |
 | counts at full scale | dropped, counted, ERROR while it lasts |
 | no board temperature yet | nothing is published, ERROR |
-| no board temperature, and a calibration without temperature correction | its constants are applied, and the covariance allows for 10 K |
+| no board temperature, and a calibration without temperature correction | the constants are applied, and the covariance allows for 10 K |
 | board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
 | case temperature older than `case_timeout` | the board decides the regime, WARN, larger covariance |
 | board temperature outside the calibrated range | curves go on along their tangent for a quarter of the range, then are held; larger covariance, WARN with how far |
 | gradient or rate outside the calibrated range | held at the edge, larger covariance, WARN with how far |
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
 | a temperature that jumps faster than any part can | its readings are not used until they are plausible again or the sensor is lost |
-| a temperature that is constant while the other changes | its readings are not used: held, then lost |
+| a temperature that is constant while that of the other thermometer changes | its readings are not used: the last value is held, then the sensor counts as lost |
 | both temperatures constant for 5 s | used, with a growing covariance, WARN |
 | a board that leads the case in ramps (swapped topics) | larger covariance, ERROR |
 | counts constant for `stuck_timeout`, or all zero | dropped, counted, ERROR |
@@ -213,13 +213,13 @@ def _schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
                 result['description'] = note
         return result
     if origin is Literal:
-        one = len(arguments) == 1
-        return {'const': arguments[0]} if one else {'enum': list(arguments), 'type': 'string'}
+        is_one = len(arguments) == 1
+        return {'const': arguments[0]} if is_one else {'enum': list(arguments), 'type': 'string'}
     if origin is not tuple:
-        return {'anyOf': [_schema(one, definitions) for one in arguments]}
+        return {'anyOf': [_schema(kind, definitions) for kind in arguments]}
     if arguments[-1] is Ellipsis:
         return {'type': 'array', 'items': _schema(arguments[0], definitions)}
-    items = [_schema(one, definitions) for one in arguments]
+    items = [_schema(kind, definitions) for kind in arguments]
     return {'type': 'array', 'prefixItems': items, 'minItems': len(items), 'maxItems': len(items)}
 
 
@@ -312,7 +312,7 @@ def _section(
         if len(default) > 40:
             default = 'see there'
         meaning = value.get('description', '') or _described(value, definitions)
-        # Escaped, as an element of a matrix is not a link.
+        # Escape brackets: an element of a matrix is not a link.
         meaning = re.sub(r'\w+(\[\d\]){2}', r'`\g<0>`', meaning)
         lines.append(f'| `{key}` | {_type(value)} | {default} | {meaning} |')
     return [*lines, '']
@@ -329,9 +329,9 @@ def _type(value: dict[str, Any]) -> str:
         return str(value['$ref'].rpartition('/')[2])
     for several in ('oneOf', 'anyOf'):
         if several in value:
-            return ' or '.join(_type(one) for one in value[several])
+            return ' or '.join(_type(part) for part in value[several])
     if 'enum' in value:
-        return ' or '.join(f'`{one}`' for one in value['enum'])
+        return ' or '.join(f'`{word}`' for word in value['enum'])
     if 'const' in value:
         return f'`{value["const"]}`'
     kind = str(value.get('type', ''))
@@ -356,10 +356,10 @@ def topics_table() -> str:
     """Write the node's topics as the rows of a Markdown table."""
     directions = {'in': INPUTS.values(), 'out': (*OUTPUTS, STATUS)}
     return '\n'.join(
-        f'| {direction} | `{one.name}` | {one.type.replace("/msg/", "/")}: {one.meaning} '
-        f'| {one.qos} |'
+        f'| {direction} | `{topic.name}` | {topic.type.replace("/msg/", "/")}: {topic.meaning} '
+        f'| {topic.qos} |'
         for direction, topics in directions.items()
-        for one in topics
+        for topic in topics
     )
 
 
@@ -369,18 +369,18 @@ def parameters_table() -> str:
 
     """
     rows = ['| parameter | type | default | range | what it does |', '|---|---|---|---|---|']
-    for one in dataclasses.fields(NodeConfig):
-        is_text = isinstance(one.default, str)
+    for field in dataclasses.fields(NodeConfig):
+        is_text = isinstance(field.default, str)
         kind, default = (
-            ('string', f"'{one.default}'") if is_text else ('double', f'{one.default:g}')
+            ('string', f"'{field.default}'") if is_text else ('double', f'{field.default:g}')
         )
         limits = ''
-        if one.metadata['bounds']:
-            limits = '{:g} .. {:g}'.format(*one.metadata['bounds'])
-        if one.metadata['choices']:
-            limits = ', '.join(f'`{choice}`' for choice in one.metadata['choices'])
+        if field.metadata['bounds']:
+            limits = '{:g} .. {:g}'.format(*field.metadata['bounds'])
+        if field.metadata['choices']:
+            limits = ', '.join(f'`{choice}`' for choice in field.metadata['choices'])
         rows.append(
-            f'| `{one.name}` | {kind} | `{default}` | {limits} | {one.metadata["description"]} |'
+            f'| `{field.name}` | {kind} | `{default}` | {limits} | {field.metadata["description"]} |'
         )
     return '\n'.join(rows) + '\n'
 

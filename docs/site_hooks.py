@@ -18,9 +18,9 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     if page.file.src_uri != 'cli.md':
         return markdown
     command = typer.main.get_command(app)
-    said = get_docs_for_click(obj=command, ctx=typer.Context(command), name='thermo_comp')
+    text = get_docs_for_click(obj=command, ctx=typer.Context(command), name='thermo_comp')
     # From the first command on; the text before it is already on the page.
-    commands = said[said.index('\n## ') :]
+    commands = text[text.index('\n## ') :]
     return markdown + re.sub(
         r'^Examples?:\n((?: +.*\n)+)', r'Example:\n\n```sh\n\1```\n', commands, flags=re.MULTILINE
     )

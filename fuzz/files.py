@@ -49,14 +49,14 @@ def _one_line(check: Callable[[], None]) -> None:
 
 
 def check_database(data: bytes) -> None:
-    """Any bytes are a database with messages, or give one clear line."""
+    """Read any bytes as a database: messages, or an error of one line."""
     path = Path(FOLDER.name, 'bag.db3')
     path.write_bytes(data)
     _one_line(lambda: _read(path, len(data)))
 
 
 def check_compressed(data: bytes) -> None:
-    """Any bytes are a compressed file of a bag, or give one clear line."""
+    """Read any bytes as a compressed file of a bag: messages, or an error of one line."""
     folder = Path(FOLDER.name, 'bag')
     folder.mkdir(exist_ok=True)
     (folder / 'metadata.yaml').write_text(METADATA, encoding='ascii')
@@ -71,12 +71,12 @@ def _read(path: Path, n_bytes: int) -> None:
 
 
 def check_csv(data: bytes) -> None:
-    """Any bytes are a table that becomes a bag, or give one clear line."""
+    """Convert any bytes as a table of text: the result is a bag, or an error of one line."""
     _check_table('log.csv', data)
 
 
 def check_parquet(data: bytes) -> None:
-    """Any bytes are a Parquet table that becomes a bag, or give one clear line."""
+    """Convert any bytes as a Parquet table: the result is a bag, or an error of one line."""
     _check_table('log.parquet', data)
 
 
@@ -91,7 +91,7 @@ def _check_table(name: str, data: bytes) -> None:
             report.findings['non_numeric'],
             report.findings['out_of_range'],
         )
-        assert report.messages['accel'] + sum(one.count for one in lost) == report.rows
+        assert report.messages['accel'] + sum(finding.count for finding in lost) == report.rows
 
     _one_line(convert)
 

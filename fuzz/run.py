@@ -6,8 +6,8 @@ Runs the fuzz targets, guided by coverage, for a time or a number of inputs.
     python fuzz/run.py [calibration|mcap|cdr|parameters|db3|zstd|csv|parquet|all] [--seconds 60]
 
 Needs the extra `fuzz` (atheris). A target fails on an exception, on an input that takes 10 s, and
-beyond 1 GiB of memory; the input is then left as `crash-*` in the working folder. What was found
-worth keeping grows in `fuzz/corpus/`, which is not under version control.
+beyond 1 GiB of memory; the input is then left as `crash-*` in the working folder. Inputs that
+reach new code are kept in `fuzz/corpus/`, which is not under version control.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def main() -> int:
     """Run one target here, or all of them one after the other."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('target', choices=(*NAMES, 'all'), nargs='?', default='all')
-    parser.add_argument('--seconds', type=int, default=60, help='per target (default 60)')
-    parser.add_argument('--inputs', type=int, default=-1, help='per target (default: no limit)')
+    parser.add_argument('--seconds', type=int, default=60, help='time per target (default 60)')
+    parser.add_argument('--inputs', type=int, default=-1, help='inputs per target (-1: no limit)')
     arguments = parser.parse_args()
     if arguments.target == 'all':
         options = [f'--seconds={arguments.seconds}', f'--inputs={arguments.inputs}']

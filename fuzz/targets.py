@@ -62,13 +62,13 @@ def small_calibration() -> Calibration:
 UNIT = small_calibration()
 #: More messages in one input reveal nothing new.
 MOST_MESSAGES = 6
-#: One for all inputs, as making it takes longer than most inputs.
+#: One compensator for all inputs, as making it takes longer than most inputs.
 COMPENSATOR = Compensator(UNIT)
 
 
 def check_calibration(data: bytes) -> None:
     """
-    Any bytes are a calibration, or give one clear line; a calibration survives its round trip.
+    Read any bytes as a calibration: an error is one line, a calibration survives its round trip.
     """
     try:
         value = parse_calibration(data, 'fuzz.yaml')
@@ -79,11 +79,11 @@ def check_calibration(data: bytes) -> None:
         return
     assert parse_calibration(dump_calibration(value).encode()) == value
     row = Compensator(value).process(START_NS, 1.0, 2.0, 3.0)
-    # There is no temperature yet; constants need none.
+    # There is no temperature yet; a correction by constants needs none.
     assert row is None or not value.needs_temperature
 
 
-#: Only the required keys, as short inputs are tried more often.
+#: Functions with the required keys only, as short inputs are tried more often.
 _FUNCTIONS = (
     '{bias_function: {kind: polynomial, coefficients: [0]}, '
     'scale_function: {kind: polynomial, coefficients: [1]}}'
@@ -105,7 +105,7 @@ noise_density_m_s2_sqrt_hz: [1, 1, 1]
 
 def check_mcap(data: bytes) -> None:
     """
-    Any bytes are a bag, or give one clear line; the output is not larger than the input can
+    Read any bytes as a bag: an error is one line, the output not larger than the input can
     contain.
     """
     with suppress(RecordingError):
@@ -156,8 +156,8 @@ def check_cdr(data: bytes) -> None:
 
 
 def check_parameters(data: bytes) -> None:
-    """Any requests to set parameters are answered; a refusal has a reason."""
-    # ROS is needed for this target and the one above only.
+    """Send any bytes as a request to set parameters: it is answered, a refusal with a reason."""
+    # ROS is needed for `parameters` and `cdr` only.
     from rcl_interfaces.msg import Parameter, ParameterValue
     from rcl_interfaces.srv import SetParameters
     from rclpy.serialization import deserialize_message
@@ -169,7 +169,7 @@ def check_parameters(data: bytes) -> None:
     try:
         messages = deserialize_message(data, SetParameters.Request).parameters
     except (RuntimeError, ValueError):
-        # Not a request, but the beginning of a value whose type is the first byte.
+        # The data are no request: the first byte is the type of a value, the rest its text.
         text = data[1:].decode(errors='replace').replace('\0', '')
         value = ParameterValue(type=data[0] if data else 0, string_value=text)
         messages = [Parameter(name=name, value=value) for name in ('frame_id', 'calibration_file')]

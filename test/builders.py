@@ -48,7 +48,7 @@ def calibration(**keys):
 
 
 def thermal_calibration():
-    """Make such a unit whose correction depends on temperature, by a negligible amount."""
+    """Make a unit whose correction depends on temperature, by a negligible amount."""
     return calibration(dynamic=regime_set(z=axis_set((0.0, 1e-12))))
 
 
@@ -105,7 +105,7 @@ def rich_calibration():
 
 
 def rich_gyroscope():
-    """Make a gyroscope with some columns of `rich_calibration` and others of its own."""
+    """Make a gyroscope with some columns of `rich_calibration` and with other columns."""
 
     def one(size):
         curve = RateCurve(Polynomial((0.0, *(size / k for k in (1e4, 1e6)))), delta=size * 1e-5)
@@ -131,8 +131,6 @@ def rich_gyroscope():
 
 @dataclass
 class Columns:
-    """Columns in file order, as a recording contains them."""
-
     accel_stamp_ns: np.ndarray
     accel: np.ndarray
     temperatures: dict = field(default_factory=dict)
@@ -150,13 +148,12 @@ def columns_from_events(events):
             n_accel += 1
         else:
             readings.setdefault(kind, []).append((stamp, value, n_accel))
+    for name, rows in readings.items():
+        readings[name] = tuple(map(np.array, zip(*rows, strict=True), (np.int64, float, np.int64)))
     return Columns(
         np.array([s for s, _ in accel], dtype=np.int64),
         np.array([v for _, v in accel], dtype=float).reshape(-1, 3),
-        {
-            name: tuple(map(np.array, zip(*rows, strict=True), (np.int64, float, np.int64)))
-            for name, rows in readings.items()
-        },
+        readings,
     )
 
 
@@ -185,8 +182,6 @@ def stream(compensator, events):
 
 @dataclass(frozen=True)
 class ArrayBlock:
-    """A block built from arrays."""
-
     accel_stamp_ns: np.ndarray
     accel: np.ndarray
     board_stamp_ns: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -204,7 +199,6 @@ class ArrayBlock:
 
 
 def source_of(*arrays, name='bag', **keys):
-    """Return a bag of one block, for a fit."""
     from thermo_comp.fitting.sources import FitSource
 
     return FitSource(name, lambda: [ArrayBlock(*arrays)], **keys)
@@ -213,4 +207,4 @@ def source_of(*arrays, name='bag', **keys):
 def arrays_of(run, every=1):
     """Return the arrays of a simulated run for a block, with some of its readings."""
     readings = (run.board_stamp_ns, run.board, run.case_stamp_ns, run.case)
-    return (run.accel_stamp_ns, run.counts.astype(float), *(one[::every] for one in readings))
+    return (run.accel_stamp_ns, run.counts.astype(float), *(part[::every] for part in readings))

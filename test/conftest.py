@@ -28,7 +28,7 @@ from hypothesis import settings
 ROOT = Path(__file__).resolve().parent.parent
 
 # One BLAS thread, as several threads for many small matrices wait for each other on a busy
-# machine. Set before numpy is imported, which reads it.
+# machine. It is set before the import of numpy, which reads the variable.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
@@ -40,7 +40,7 @@ os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WO
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.pop('ROS_STATIC_PEERS', None)
 
-# A shell starts background processes with SIGINT ignored, and children inherit that.
+# A shell starts background processes with SIGINT ignored, which their children inherit.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -53,7 +53,7 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
 #: The longest files first: parallel workers begin with them, so that no worker is left with a long
-#: one at the end (`make test` keeps this order).
+#: file at the end (`make test` keeps this order).
 _LONG = (
     *('fleet_run', 'cli_help', 'real_data', 'fitting', 'record', 'faults', 'fitting_selection'),
     *('priors', 'regime', 'docs', 'degenerate', 'gyroscope', 'cli_demo', 'few_positions'),
@@ -125,8 +125,6 @@ def _checked(finished, code):
 
 @pytest.fixture(scope='session')
 def program():
-    """Return a function that runs the command line in a separate process."""
-
     def run(*args, code=0, cwd=None, **env):
         finished = subprocess.run(
             [sys.executable, '-m', 'thermo_comp', *map(str, args)], cwd=cwd,
@@ -149,13 +147,13 @@ def _caught(name, descriptor):
         stream = open(descriptor, 'w', encoding='utf-8', closefd=False)  # noqa: SIM115
         setattr(sys, name, stream)
 
-        def said():
+        def text():
             stream.flush()
             file.seek(0)
             return file.read().decode()
 
         try:
-            yield said
+            yield text
         finally:
             setattr(sys, name, before)
             stream.close()
@@ -165,7 +163,7 @@ def _caught(name, descriptor):
 
 @contextmanager
 def _as_a_process(cwd):
-    """Give a command the state of a new process, and restore the state of this one afterwards."""
+    """Give a command the state of a new process, and restore that of this process afterwards."""
     folder, environment = Path.cwd(), dict(os.environ)
     log = logging.getLogger()
     handlers, log.handlers = log.handlers, []  # pytest's handlers keep log messages from stderr
@@ -190,7 +188,8 @@ def _as_a_process(cwd):
 @pytest.fixture(scope='session')
 def cli(program):
     """
-    Return a function that runs the command line in this process, or in a new one with variables.
+    Return a function that runs the command line in this process, or in a new process with
+    variables.
     """
     from thermo_comp.cli.app import run as run_command
 
@@ -208,7 +207,6 @@ def cli(program):
 
 @pytest.fixture
 def small_disk(tmp_path, request):
-    """Mount a file system of 4 KiB, or of the size that the test gives."""
     disk = tmp_path / 'disk'
     disk.mkdir()
     size = f'size={getattr(request, "param", 4)}k'

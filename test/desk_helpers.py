@@ -16,7 +16,7 @@ import pytest
 from conftest import ROOT
 from readme_helpers import shown
 
-#: Files that are made when an example needs them; all others are written by an example or present.
+#: Files made when an example needs them; all other files exist or are written by an example.
 MADE = (
     *('unit.yaml', 'unit42.yaml', 'unit01.yaml', 'unit02.yaml', 'unit03.yaml', 'map.yaml'),
     *('autopilot.params', 'xsens_acc.calib', 'accel_calib.yaml', 'chamber.mcap', 'unit42_p01'),
@@ -60,7 +60,6 @@ class Desk:
         (self._ready / 'config').symlink_to(ROOT / 'config')
 
     def _make(self, name):
-        """Make a file when it is first needed; return its path."""
         made = self._ready / name
         if not made.exists():
             file = Path(name).name
@@ -82,7 +81,7 @@ class Desk:
             to = ('--to', _EXPORTS[name])
             self._cli('export', self._make('unit42.yaml'), *to, '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
-            # Short, as some examples play it in real time.
+            # A short bag, as some examples play it in real time.
             self._cli('simulate', '--profile', '20 1s', '-o', path, '-q')
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
@@ -107,11 +106,10 @@ class Desk:
             write_log(path, rests(unit, upright, lambda _: off, turn_on=5.0 * MICRO_G))
         elif name == 'log.csv':
             rng = np.random.default_rng(3)
+            accel = np.array([0.2, -0.1, 9.8]) + 0.01 * rng.standard_normal((1000, 3))
             rows = [
                 f'{1.0 + 0.01 * k:.2f},{x:.4f},{y:.4f},{z:.4f},{25.0 + 1e-4 * k:.3f}'
-                for k, (x, y, z) in enumerate(
-                    np.array([0.2, -0.1, 9.8]) + 0.01 * rng.standard_normal((1000, 3))
-                )
+                for k, (x, y, z) in enumerate(accel)
             ]
             path.write_text('\n'.join(['t,ax,ay,az,temp', *rows]) + '\n')
         elif name == 'tumble.txt':
@@ -163,15 +161,10 @@ class Desk:
             is_there = (here / name).is_symlink()
             if path.name != 'bags' and str(name) not in outputs and not is_there:
                 (here / name).symlink_to(path)
-        arguments = [
-            one
-            for word in words
-            for one in (
-                sorted(str(path.relative_to(here)) for path in here.glob(word))
-                if '*' in word
-                else [word]
-            )
-        ]
+        arguments = []
+        for word in words:
+            paths = here.glob(word) if '*' in word else []
+            arguments += sorted(str(path.relative_to(here)) for path in paths) or [word]
         if arguments[0] == 'play':
             pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
             # There is no subscriber to wait for.

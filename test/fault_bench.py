@@ -4,8 +4,8 @@
 Owns the fault bench: it sends messages over DDS to the real node process and collects the output.
 
 Messages are sent at full speed in lots of some hundred; after each lot the bench waits until the
-node's diagnostics account for every sample. So no message is lost by accident, a fault shows in at
-least one report, and the result does not depend on the machine.
+node's diagnostics account for every sample. Thereby no message is lost by accident, a fault shows
+in at least one report, and the result does not depend on the machine.
 """
 
 import struct
@@ -61,8 +61,6 @@ PARAMETERS = (
 
 @dataclass
 class Heard:
-    """The node's output for one bag."""
-
     stamp_ns: np.ndarray
     force: np.ndarray
     covariance: np.ndarray
@@ -71,7 +69,6 @@ class Heard:
     values: dict[str, str] = field(default_factory=dict)
 
     def says(self, text, level):
-        """Whether a report of at least this level contains a text."""
         return any(level <= found and text in message for found, message in self.reports)
 
 
@@ -137,19 +134,18 @@ class Bench:
                 (status,) = deserialize_message(data, DiagnosticArray).status
                 self._reports.append((status.level[0], status.message))
                 self._n_reports += 1
-                self._values = {one.key: one.value for one in status.values}
+                self._values = {value.key: value.value for value in status.values}
             self._news.notify_all()
 
     def wait_for(self, condition, what):
         with self._news:
-            found = self._news.wait_for(
+            is_done = self._news.wait_for(
                 lambda: condition() or not self.process.is_alive, TIMEOUT_S
             )
         assert self.process.is_alive, self.process.said
-        assert found, f'{what} did not come true; {self._values}'
+        assert is_done, f'{what} did not come true; {self._values}'
 
     def ask(self, **values):
-        """Call the node's set_parameters; return the future of the answer."""
         assert self._client.wait_for_service(TIMEOUT_S)
         messages = [
             Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
@@ -157,7 +153,6 @@ class Bench:
         return self._client.call_async(SetParameters.Request(parameters=messages))
 
     def set_parameters(self, **values):
-        """Set parameters of the node and wait for the answer."""
         future = self.ask(**values)
         pause = threading.Event()
         # A callback of the future would wait for the executor, which waits for the next answer.
@@ -167,7 +162,6 @@ class Bench:
         return future.result().results[0]
 
     def send(self, events):
-        """Publish messages; return the number of samples."""
         n = 0
         for topic, stamp_ns, value in events:
             sec, nanosec = divmod(stamp_ns, 1_000_000_000)
@@ -216,7 +210,6 @@ class Bench:
         self.wait_for(is_done, f'{self.n_sent} samples')
 
     def play(self, events):
-        """Play messages in order of arrival; return the node's output."""
         self.take()
         for lot in lots(events):
             if self.send(lot):
@@ -228,7 +221,6 @@ class Bench:
         return self.take()
 
     def take(self):
-        """Return the output received since the last call."""
         with self._news:
             frames, self._frames = self._frames, []
             reports, self._reports = self._reports, []
@@ -246,7 +238,6 @@ def _stamp_of(frame):
 
 
 def lots(events):
-    """Divide messages into lots."""
     lot = []
     edge = None
     for event in events:
@@ -265,7 +256,7 @@ def lots(events):
 def bench(calibration, *parameters):
     """Start a node process and a peer, and wait until they have discovered each other."""
     overrides = [f'calibration_file:={calibration}', *PARAMETERS, *parameters]
-    arguments = [word for one in overrides for word in ('-p', one)]
+    arguments = [word for override in overrides for word in ('-p', override)]
     context = Context()
     rclpy.init(args=[], context=context)
     try:

@@ -60,8 +60,6 @@ Inject = Callable[[list[Event]], list[Event]]
 
 
 def unit(**changes):
-    """Return the calibration of the unit."""
-
     def one(dynamic):
         return axis_set(
             (0.0, BIAS_SLOPE, BIAS_CURVE),
@@ -144,7 +142,6 @@ def counts_of(force, case, board, memory):
 
 @cache
 def bag(rate_hz=RATE_HZ, ramp_s=RAMP_S, duration_s=DURATION_S, start_s=0.0):
-    """Return the undisturbed messages in order of arrival."""
     rng = np.random.default_rng(7)
     thermal = truth(ramp_s, duration_s)
     n = round((duration_s - start_s) * rate_hz)
@@ -203,12 +200,10 @@ def changed(topic, begin_s, end_s, change):
 
 
 def value(topic, begin_s, end_s, change):
-    """Change the values of a topic within a span."""
     return changed(topic, begin_s, end_s, lambda e: [(e[0], e[1], change(e[2]))])
 
 
 def stop(topic, begin_s, end_s):
-    """Drop the messages of a topic within a span."""
     return changed(topic, begin_s, end_s, lambda _: [])
 
 
@@ -224,8 +219,6 @@ def frozen(topic, begin_s, end_s):
 
 
 def late(topic, delay_s, begin_s, end_s):
-    """Deliver the messages of a topic later than their stamps."""
-
     def inject(events):
         def arrival(event):
             seconds = seconds_of(event[1])
@@ -247,16 +240,14 @@ def shuffled(topic, begin_s, end_s):
             for k, event in enumerate(result)
             if event[0] == topic and begin_s <= seconds_of(event[1]) < end_s
         ]
-        for one, other in zip(places[::2], places[1::2], strict=False):
-            result[one], result[other] = result[other], result[one]
+        for place, other in zip(places[::2], places[1::2], strict=False):
+            result[place], result[other] = result[other], result[place]
         return result
 
     return inject
 
 
 def chain(*steps):
-    """Apply several changes one after the other."""
-
     def inject(events):
         for step in steps:
             events = step(events)
@@ -266,8 +257,6 @@ def chain(*steps):
 
 
 def shifted(begin_s, by_s):
-    """Let the stamps of all topics jump."""
-
     def inject(events):
         by_ns = round(by_s * 1e9)
         return [

@@ -37,8 +37,6 @@ N_SAMPLES = round(RATE_HZ * DURATION_S)
 
 @dataclass(frozen=True)
 class Row:
-    """One fault."""
-
     fault: str
     inject: Inject
     #: (level, part of the message) of the required reports.
@@ -49,11 +47,11 @@ class Row:
     silent: tuple[tuple[float, float], ...] = ()
     #: Span before the fault can be detected, in which the output may be wrong.
     blind: tuple[float, float] = (0.0, 0.0)
-    #: Time from which the output is within 1 ug of the undisturbed one; 0: always; inf: never.
+    #: Time from which the output is within 1 ug of that without the fault; 0: always; inf: never.
     recovered: float = 0.0
     #: Time from which stamps are ahead of the truth, and by how much [s].
     shift: tuple[float, float] = (math.inf, 0.0)
-    #: The bag, if it is not the usual one.
+    #: The bag, if it is not that of `fault_rig`.
     source: list[Event] | None = field(default=None, repr=False)
 
 
@@ -73,7 +71,7 @@ def faster(begin_s, end_s, factor):
 
     def split(event):
         topic, stamp_ns, sample = event
-        part = tuple(float(round(one / factor)) for one in sample)
+        part = tuple(float(round(count / factor)) for count in sample)
         return [
             (topic, stamp_ns - k * step_ns, (part[0] + k % 2, *part[1:]))
             for k in reversed(range(factor))
@@ -198,7 +196,6 @@ ROWS = [*SENSOR_ROWS, *BOTH_ROWS, *SAMPLE_ROWS, *TIME_ROWS]
 
 
 def true_seconds(row, stamps):
-    """Return the times of the bag that belong to stamps."""
     seconds = (stamps - START_NS) * 1e-9
     at, by = row.shift
     return np.where(seconds >= at + by, seconds - by, seconds)

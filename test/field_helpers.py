@@ -21,7 +21,7 @@ def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G
     """
     rng = np.random.default_rng(seed)
     correction = Correction(calibration)
-    M, found = np.array(calibration.misalignment), []
+    M, logged = np.array(calibration.misalignment), []
     noise = np.array(calibration.noise_density_m_s2_sqrt_hz) / np.sqrt(10.0)
     shares = (0.0,) * len(correction.memory.lags)
     for k in range(3 * days):
@@ -41,12 +41,11 @@ def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G
             sd = noise * np.sqrt(1000.0) * np.abs(correction.K[:, 0])
             mean = tuple((bias + scale * x).tolist())
             stamp = begin + (window + 1) * 10 * 10**9
-            found.append((start, Rest(stamp, 1000, mean, tuple(sd), tuple(state[0]), shares)))
-    return found
+            logged.append((start, Rest(stamp, 1000, mean, tuple(sd), tuple(state[0]), shares)))
+    return logged
 
 
 def write_log(folder, found):
-    """Write rests as the node does, a file for each day."""
     folder.mkdir(parents=True)
     for start, rest in found:
         day = np.datetime64(rest.stamp_ns, 'ns').astype('datetime64[D]')
@@ -56,11 +55,9 @@ def write_log(folder, found):
 
 
 def upright(_rng):
-    """Give the attitude of a vehicle on level ground."""
     return np.array([0.0, 0.0, 1.0])
 
 
 def any_way(rng):
-    """Give the attitude of something that is carried."""
     u = rng.standard_normal(3)
     return np.asarray(u / np.linalg.norm(u))

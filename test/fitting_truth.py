@@ -26,7 +26,7 @@ MICRO = 1e-6 * GRAVITY
 
 @dataclass(frozen=True)
 class Truth:
-    """One unit, in m/s^2 of the nominal scale factor; weights per physical unit of the columns."""
+    """A unit, in m/s^2 of the nominal scale factor; weights per physical unit of the columns."""
 
     kappa: Floats = field(default_factory=lambda: np.array([1.0003, 0.9996, 1.0005]))
     bias: Floats = field(default_factory=lambda: np.array([5e-3, -8e-3, 2e-3]))
@@ -47,11 +47,9 @@ class Truth:
 
     @property
     def weights(self):
-        """Weights in bias and scale, shape (2, 3, m)."""
         return np.stack((self.on_bias, self.on_scale))
 
     def errors(self, regression, found):
-        """Return errors divided by claimed standard deviations, for each kind of unknown."""
         errors, sd = {}, np.sqrt(found.variance)
         for name in ('kappa', 'bias', 'misalignment', 'weights'):
             true = getattr(self, name) * (regression.rms if name == 'weights' else 1.0)
@@ -65,7 +63,7 @@ def table_of(truth, n_positions, rng, *, n_windows=40, step_s=120.0, up=None):
     """Draw a table of windows, one bag per position; also return the true directions."""
     up = positions(n_positions, 3) if up is None else up
     time = step_s * (np.arange(n_windows) + 0.5)
-    # Once up and down in each bag, slightly different each time.
+    # The temperature goes up and down once in each bag, slightly different each time.
     shapes = [_columns(time, step_s, 0.7 + 0.05 * p) for p in range(n_positions)]
     share = np.zeros((n_windows, len(GROUPS)))
     share[:, 2:4] = np.exp(-time[:, None] / TAUS)
@@ -85,8 +83,8 @@ def table_of(truth, n_positions, rng, *, n_windows=40, step_s=120.0, up=None):
         clean += truth.offset_sd * rng.standard_normal(3)
         if tilts is not None:
             across = tangent_basis(up)[p] @ tilts[p].T
-            own = tilt[p * n_windows : (p + 1) * n_windows]
-            clean += truth.kappa * GRAVITY * (own @ (A @ across).T)
+            part = tilt[p * n_windows : (p + 1) * n_windows]
+            clean += truth.kappa * GRAVITY * (part @ (A @ across).T)
         slow = rng.standard_normal((n_windows, 3)) * np.sqrt(truth.noise.ratio)
         for k in range(1, n_windows):
             slow[k] = decay * slow[k - 1] + np.sqrt(1.0 - decay**2) * slow[k]
@@ -148,7 +146,6 @@ def column_sd(names, bias_sd, scale_sd):
 
 
 def prior_of(truth, names=('curve', 'board'), **changes):
-    """Return a wide prior with the true noise parameters."""
     known = {
         'bias_mean': np.zeros(3), 'bias_sd': np.full(3, 1.0), 'scale_sd': 0.05,
         'misalignment_sd': 1e-2, 'column_sd': column_sd(names, 1e-2, 1e-3),
@@ -169,7 +166,6 @@ def candidates_of(windows, forced=()):
 
 
 def begin(windows, up):
-    """Return a regression and a state close to the truth."""
     regression = Regression(windows, GRAVITY, NOMINAL)
     turned = up + np.array([2e-3, -1e-3, 3e-3])
     turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
@@ -178,8 +174,8 @@ def begin(windows, up):
 
 def mode_of(regression, state, prior):
     """Find the mode to full precision: Newton steps from the result of a fit."""
-    found = regression.solve(state, prior, n_steps=12)
-    point = regression.at(found.state, prior)
+    solution = regression.solve(state, prior, n_steps=12)
+    point = regression.at(solution.state, prior)
     for _ in range(6):
         step, _ = point.solution
         point = point.moved(step)
@@ -187,5 +183,5 @@ def mode_of(regression, state, prior):
 
 
 def unit_of(state, layout):
-    """Return the unit's own unknowns as a vector."""
+    """Return the unknowns of the unit (not of positions and bags) as a vector."""
     return as_vector(state, layout)[: layout.n_unit]

@@ -30,23 +30,19 @@ class NodeProcess:
         return self
 
     def __exit__(self, *_):
-        """End the process as a launch system does."""
         self.stop()
         self._log.close()
 
     @property
     def is_alive(self):
-        """Whether the process still runs."""
         return self.process.poll() is None
 
     @property
     def said(self):
-        """The text on its standard output and error."""
         # Read without changing the position at which the process writes.
         return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors='replace').strip()
 
     def stop(self, number=signal.SIGTERM):
-        """Send a signal, wait for the end, return the exit code."""
         # Popen sends no signal to a process that has ended.
         self.process.send_signal(number)
         try:

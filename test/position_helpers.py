@@ -28,8 +28,6 @@ class Imu:
 
 @dataclass(frozen=True)
 class ImuBlock(ArrayBlock):
-    """A block with a gyroscope, as from a recording."""
-
     imu: Imu | None = None
 
 

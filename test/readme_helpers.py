@@ -27,19 +27,18 @@ def shown():
     """
     Return the console examples of the page: sub-command -> (words of the command line, output).
     """
-    found = {}
+    collected = {}
     for kind, text in FENCE.findall(SESSION.read_text(encoding='utf-8')):
         if kind == 'console':
             command, _, output = text.partition('\n')
             words = shlex.split(command.removeprefix('$ '))
             name = Path(words[1]).stem
             assert words[0] == ('python' if name == 'demo' else 'thermo_comp')
-            found[name] = (words[1:], output)
-    return found
+            collected[name] = (words[1:], output)
+    return collected
 
 
 def shown_of_demo():
-    """Return the output of the demonstration in the README."""
     (text,) = (text for kind, text in FENCE.findall(README) if kind == 'text')
     return str(text).splitlines()
 

@@ -28,8 +28,6 @@ START_NS = 1_600_000_000_000_000_000
 
 @dataclass
 class Message:
-    """Content of one message of a test bag."""
-
     topic: str
     log_ns: int
     stamp_ns: int = 0
@@ -80,7 +78,6 @@ def write_mcap(
     repeat=True,
     enable_crcs=True,
 ):
-    """Write a bare file with the `mcap` library."""
     with path.open('wb') as file:
         writer = McapWriter(
             file, chunk_size=chunk_size, compression=getattr(CompressionType, compression.upper()),
@@ -106,7 +103,6 @@ def write_mcap(
 
 
 def write_rosbag2(path, messages, *, storage='mcap', compression=''):
-    """Write a rosbag2 directory with `rosbags`."""
     plugin = StoragePlugin.MCAP if storage == 'mcap' else StoragePlugin.SQLITE3
     writer = Writer2(path, version=9, storage_plugin=plugin)
     if compression:
@@ -122,7 +118,6 @@ def write_rosbag2(path, messages, *, storage='mcap', compression=''):
 
 
 def write_rosbag1(path, messages):
-    """Write a ROS 1 bag with `rosbags`."""
     store = typestore(1)
     with Writer1(path) as writer:
         connections = {}
@@ -146,7 +141,6 @@ def read_with_rosbags(path):
 
 
 def columns_of(messages):
-    """Build the columns that a reader must give for messages in reading order."""
     columns = {
         f'{role}_{name}': []
         for role in ('accel', 'board', 'case')
@@ -160,16 +154,12 @@ def columns_of(messages):
         columns[f'{role}_after'].append(len(columns['accel_stamp_ns']))
         columns[f'{role}_stamp_ns'].append(message.stamp_ns)
         columns[f'{role}_log_ns'].append(message.log_ns)
-        columns[f'{role}_values'].append(
-            message.numbers[0]
-            if role != 'accel'
-            else list(message.numbers[25:28] if message.topic == IMU_IN else message.numbers)
-        )
+        value = message.numbers[25:28] if message.topic == IMU_IN else message.numbers
+        columns[f'{role}_values'].append(list(value) if role == 'accel' else value[0])
     return columns
 
 
 def assert_columns(block, messages):
-    """Check that the block holds exactly these messages in this order."""
     expected = columns_of(messages)
     accel = (block.accel_stamp_ns, block.accel, np.arange(len(block)))
     for role, (stamp_ns, values, after) in {'accel': accel, **block.temperatures}.items():

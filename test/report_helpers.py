@@ -36,13 +36,12 @@ def run(position=0):
 
 @cache
 def fitted():
-    """Fit all positions of that unit."""
     sources = []
     for position in range(N_POSITIONS):
-        one = run(position)
+        record = run(position)
         number = position + 1
         keys = {'sha256': f'{number:064x}', 'serial': 'thermostatted-0001'}
-        sources.append(source_of(*arrays_of(one), name=f'{number:02d}.mcap', **keys))
+        sources.append(source_of(*arrays_of(record), name=f'{number:02d}.mcap', **keys))
     # Without products the bank of columns is a third as large.
     groups = ('curve', 'set', 'gradient', 'board')
     return fitting.fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))
@@ -51,12 +50,12 @@ def fitted():
 @cache
 def evidence():
     """
-    Gather the evidence of that fit, with assumed left-out residuals of 1, 2, ... ug for all
+    Gather the evidence of the fit, with assumed left-out residuals of 1, 2, ... ug for all
     positions but the last.
     """
     *others, last = fitted().positions
     left_out = [
-        replace(one, left_out_rms=rms) for one, rms in zip(others, LEFT_OUT_RMS, strict=True)
+        replace(other, left_out_rms=rms) for other, rms in zip(others, LEFT_OUT_RMS, strict=True)
     ]
     positions = (*left_out, replace(last, left_out_rms=np.nan))
     return evidence_of_fit(replace(fitted(), positions=positions))
@@ -64,16 +63,15 @@ def evidence():
 
 @cache
 def certificate():
-    """Render the page of that fit once, as drawing takes seconds."""
+    """Render the page of the fit once, as drawing takes seconds."""
     return render_report(evidence())
 
 
 def write_bag(path, position=0, frame_id='imu_link', **metadata):
-    """Write the run of a position as a bag."""
-    one = run(position)
+    record = run(position)
     facts = {'serial': 'thermostatted-0001', 'truth': '{}', **metadata}
     with BagWriter(path, metadata=facts) as writer:
-        writer.write_temperature('temperature/board', one.board_stamp_ns, one.board)
-        writer.write_temperature('temperature/case', one.case_stamp_ns, one.case)
-        writer.write_counts('accel/counts', one.accel_stamp_ns, one.counts, frame_id)
+        writer.write_temperature('temperature/board', record.board_stamp_ns, record.board)
+        writer.write_temperature('temperature/case', record.case_stamp_ns, record.case)
+        writer.write_counts('accel/counts', record.accel_stamp_ns, record.counts, frame_id)
     return path

@@ -67,7 +67,6 @@ class Peer:
         self.node.destroy_node()
 
     def listen(self, kind, topic, qos=DEEP, raw=False):
-        """Collect the messages of a topic in the returned list."""
         heard = []
 
         def hear(message):
@@ -100,16 +99,16 @@ class Peer:
         """
         Wait until both ends of every topic have discovered each other, so that nothing is lost.
         """
-        topics = {one.topic_name for one in self.node.subscriptions}
-        outputs = [one for one in node.node.publishers if one.topic_name in topics]
+        topics = {subscription.topic_name for subscription in self.node.subscriptions}
+        outputs = [output for output in node.node.publishers if output.topic_name in topics]
         # Not every test has all thermometers of the unit.
-        sent = {one.topic_name for one in self.node.publishers}
-        inputs = [one for one in node.node.subscriptions if one.topic_name in sent]
+        sent = {publisher.topic_name for publisher in self.node.publishers}
+        inputs = [input_ for input_ in node.node.subscriptions if input_.topic_name in sent]
         self.poll(
             lambda: (
-                all(one.get_publisher_count() for one in inputs)
-                and all(one.get_publisher_count() for one in self.node.subscriptions)
-                and all(one.get_subscription_count() for one in outputs)
+                all(sub.get_publisher_count() for sub in inputs)
+                and all(sub.get_publisher_count() for sub in self.node.subscriptions)
+                and all(output.get_subscription_count() for output in outputs)
             ),
             'the match of all topics',
         )
@@ -147,8 +146,6 @@ def _messages(values):
 
 
 class Driver:
-    """Publishes samples and temperatures like a unit's drivers, and records what it sent."""
-
     def __init__(self, peer, kind=Vector3Stamped, topic='accel/counts', qos=DEEP):
         self._samples = peer.publisher(kind, topic, qos)
         self._board = peer.publisher(Temperature, 'temperature/board')
@@ -169,7 +166,6 @@ class Driver:
 
 
 def drive(peer, node, kind=Vector3Stamped, topic='accel/counts', qos=DEEP):
-    """Connect drivers to a node in this process."""
     driver = Driver(peer, kind, topic, qos)
     peer.join(node)
     return driver
@@ -182,8 +178,6 @@ def node_arguments(unit, *overrides):
 
 
 class Samples:
-    """Sends samples of a unit at rest and collects the node's output."""
-
     def __init__(self, peer, node):
         self._peer = peer
         self.heard = peer.listen(Imu, 'imu/data_raw')
@@ -198,20 +192,18 @@ class Samples:
         self.n_sent += n
 
     def go_on(self):
-        """Check that all samples of a further burst are published."""
         before = len(self.heard)
         self.send()
         self._peer.wait_for(lambda: len(self.heard) >= before + 20, '20 further samples')
 
 
 def status_with(peer, heard, text):
-    """Wait for the next status whose message contains a text."""
     del heard[:]
-    found = []
+    collected = []
 
     def look():
-        found.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
-        return bool(found)
+        collected.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
+        return bool(collected)
 
     peer.wait_for(look, f'{text!r} among {[a.status[0].message for a in heard][-3:]}')
-    return found[0]
+    return collected[0]

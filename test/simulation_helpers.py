@@ -10,7 +10,6 @@ from thermo_comp.simulation.campaign import Cyclogram
 
 
 def of_part(truth, node):
-    """Return the temperature [degC] of a part on the thermal grid."""
     return truth.temperatures[:, truth.unit.network.nodes.index(node)]
 
 
@@ -22,7 +21,6 @@ def ideal_regime(run, threshold_k_min=0.02):
 
 
 def noiseless(unit):
-    """Return the unit without white noise on axes and thermometers."""
     return replace(unit.with_thermometers(noise_sd=0.0), noise_density=(0.0, 0.0, 0.0))
 
 

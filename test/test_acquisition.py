@@ -16,8 +16,6 @@ UPS = [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, 1, 0), (0.8, 0.6, 0), (0, -1, 0)]
 
 
 class Stream:
-    """Samples of a unit of 300 counts per m/s^2 that a person turns."""
-
     def __init__(self, rng):
         self._rng = rng
         self._pieces = []
@@ -43,13 +41,13 @@ class Stream:
         stamp_ns = start_ns + (np.arange(len(accel)) * 1e9 / RATE).astype(np.int64)
         size = round(seconds * RATE)
         for begin in range(0, len(accel), size):
-            own = slice(begin, begin + size)
+            rows = slice(begin, begin + size)
             # One reading per second.
             places = np.arange(begin, min(begin + size, len(accel)))
             at = places[places % round(RATE) == 0]
             board = Readings(stamp_ns[at], celsius[at], at - begin)
-            log_ns = {'accel': stamp_ns[own], 'board': stamp_ns[at]}
-            yield Block(stamp_ns[own], accel[own], '', None, {'board': board}, log_ns)
+            log_ns = {'accel': stamp_ns[rows], 'board': stamp_ns[at]}
+            yield Block(stamp_ns[rows], accel[rows], '', None, {'board': board}, log_ns)
 
 
 @pytest.fixture
@@ -58,7 +56,7 @@ def stream(rng):
 
 
 def reasons(test):
-    return [one.reason for one in test.account().positions]
+    return [position.reason for position in test.account().positions]
 
 
 @pytest.mark.parametrize('seconds', [0.7, 25.0, 1e4])
@@ -69,9 +67,9 @@ def test_positions_are_found_however_the_blocks_fall(stream, seconds):
         stream.rest(up, 60.0, ramp=1.0)
         stream.turn()
     test = Acquisition(6, 50.0)
-    found = [begin for block in stream.blocks(seconds) for begin in test.add(block)]
+    starts = [begin for block in stream.blocks(seconds) for begin in test.add(block)]
     # A position begins within two cells of half a second after the turn.
-    assert np.array(found) * 1e-9 - START_NS * 1e-9 == pytest.approx(
+    assert np.array(starts) * 1e-9 - START_NS * 1e-9 == pytest.approx(
         np.array(begins[1:]) + 0.5, abs=0.6
     )
     account = test.account()
@@ -86,7 +84,7 @@ def test_positions_are_found_however_the_blocks_fall(stream, seconds):
     board = account.thermometers['board']
     assert (board.lowest, board.n) == (
         20.0,
-        sum(one.thermometers['board'].n for one in account.positions),
+        sum(position.thermometers['board'].n for position in account.positions),
     )
     assert board.highest == pytest.approx(26.0, abs=0.1)
 
@@ -94,17 +92,17 @@ def test_positions_are_found_however_the_blocks_fall(stream, seconds):
 def test_a_position_grows_until_it_is_good(stream):
     stream.rest((0, 0, 1), 40.0)
     test = Acquisition(2, 30.0)
-    told = []
+    collected = []
     for block in stream.blocks(1.0):
         test.add(block)
         account = test.account()
-        told.append((account.positions[-1].reason, account.is_still))
-    words = list(dict.fromkeys(reason for reason, _ in told))
+        collected.append((account.positions[-1].reason, account.is_still))
+    words = list(dict.fromkeys(reason for reason, _ in collected))
     assert words == ['not at rest yet', 'rests until 30 s', '']
-    assert told[-1] == ('', True)
+    assert collected[-1] == ('', True)
     assert 'positions are missing' in account.findings[0]
     assert not account.is_complete
-    # Turned upside down from this time.
+    # The unit is upside down from this time on.
     assert account.next_deg == pytest.approx(np.degrees(np.arccos(account.next_up @ account.now)))
 
 
@@ -119,14 +117,14 @@ def test_what_is_wrong_with_a_position_is_said(stream):
     stream.turn()
     stream.rest((0, -1, 0), 30.0)
     stream.turn()
-    # Knocked, then back in its place.
+    # The unit is knocked, then back in its place.
     stream.rest((0, -1, 0), 30.0)
     test = Acquisition(5, 50.0)
     for block in stream.blocks(0.5):
         test.add(block)
     account = test.account()
-    assert [one.reason for one in account.positions] == [
-        '', 'left before 50 s', 'as position 1', 'restless', '',
+    assert [position.reason for position in account.positions] == [
+        '', 'left before 50 s', 'repeats position 1', 'restless', '',
     ]  # fmt: skip
     assert account.positions[-1].n_rests == 2
 
@@ -138,7 +136,7 @@ def test_the_same_direction_does_not_count_twice(stream):
     test = Acquisition(3, 30.0)
     for block in stream.blocks(0.5):
         test.add(block)
-    assert reasons(test) == ['', '', 'as position 1']
+    assert reasons(test) == ['', '', 'repeats position 1']
 
 
 def test_a_clock_that_goes_back_begins_a_position(stream):
@@ -156,7 +154,7 @@ def test_a_dead_sensor_points_nowhere():
     log_ns = {'accel': stamp_ns}
     assert test.add(Block(stamp_ns, np.zeros((3000, 3)), '', None, {}, log_ns)) == []
     account = test.account()
-    assert [one.reason for one in account.positions] == ['reads zero']
+    assert [position.reason for position in account.positions] == ['reads zero']
     assert (account.n_good, account.hole_deg) == (0, 180.0)
 
 
@@ -168,10 +166,10 @@ def test_words_without_a_sign_have_their_zero_in_the_middle(stream):
     test = Acquisition(6, 30.0, offset=32768.0)
     for block in stream.blocks(5.0):
         test.add(replace(block, accel=block.accel + 32768.0))
-    found = test.account().positions
-    for position, up in zip(found, [*UPS, UPS[0]], strict=True):
+    positions = test.account().positions
+    for position, up in zip(positions, [*UPS, UPS[0]], strict=True):
         assert position.up @ up > np.cos(np.radians(3.0))
-    assert [one.reason for one in found] == [''] * 6 + ['as position 1']
+    assert [place.reason for place in positions] == [''] * 6 + ['repeats position 1']
 
 
 def test_nothing_has_come():
@@ -179,4 +177,4 @@ def test_nothing_has_come():
     assert not account.is_still
     assert np.isnan(account.now).all()
     assert account.findings[0] == '18 of 18 positions are missing'
-    assert [one.n_rests for one in account.positions] == [0]
+    assert [position.n_rests for position in account.positions] == [0]

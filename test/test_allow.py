@@ -14,7 +14,7 @@ from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.options import REFUSALS
 from thermo_comp.simulation.campaign import positions
 
-# The model does not matter here; this one is the fastest to fit.
+# The model does not matter here; golovach is the fastest to fit.
 COUNTS = FitOptions(gravity=GRAVITY, model='golovach')
 FORCE = replace(COUNTS, input='m/s^2')
 
@@ -71,9 +71,9 @@ def test_what_is_allowed_goes_on_to_the_end(rng, name, spoil, options, n):
         sources.append(swapped(source, rest) if name == 'swapped' else source)
     with pytest.raises(FitError, match=rf'\(override with --allow {name}\)$'):
         fit(sources, options)
-    found = fit(sources, replace(options, allow=(name,)))
-    assert any(one.name == name and 'allowed: ' in one.message for one in found.findings)
-    assert f'{name}: allowed' in ' '.join(found.calibration.provenance.notes)
+    result = fit(sources, replace(options, allow=(name,)))
+    assert any(note.name == name and 'allowed: ' in note.message for note in result.findings)
+    assert f'{name}: allowed' in ' '.join(result.calibration.provenance.notes)
 
 
 def test_what_cannot_be_allowed_is_said():
@@ -114,21 +114,21 @@ def in_kelvins(rest):
 
 
 @pytest.mark.parametrize(
-    ('spoil', 'said'),
+    ('spoil', 'text'),
     [
         (without_a_clock, r'^bag0: no temperatures .* two clocks\?$'),
         (in_thousandths, r'^bag0: 1200 readings of board are beyond 1000 degC$'),
         (dead, 'an axis is exactly zero at rest'),
     ],
 )
-def test_what_gives_no_numbers_is_a_sentence(rng, spoil, said):
-    # WHY: each of these once ended in a traceback, or its readings were dropped silently.
-    with pytest.raises(FitError, match=said):
+def test_what_gives_no_numbers_is_a_sentence(rng, spoil, text):
+    # WHY: each of these faults once ended in a traceback, or readings were dropped silently.
+    with pytest.raises(FitError, match=text):
         fit(spoilt(rng, spoil), FORCE)
 
 
 @pytest.mark.parametrize(
-    ('spoil', 'name', 'said'),
+    ('spoil', 'name', 'text'),
     [
         (two_minutes_are_lost, 'unmeasured', '^2[0-9] % of the time at rest has no temperatures'),
         (frozen, 'stuck', '^no sample at rest differs from the one before'),
@@ -139,9 +139,9 @@ def test_what_gives_no_numbers_is_a_sentence(rng, spoil, said):
         ),
     ],
 )
-def test_what_is_likely_a_mistake_is_said(rng, spoil, name, said):
-    findings = {one.name: one.message for one in fit(spoilt(rng, spoil), FORCE).findings}
-    assert re.search(said, findings[name])
+def test_what_is_likely_a_mistake_is_said(rng, spoil, name, text):
+    findings = {note.name: note.message for note in fit(spoilt(rng, spoil), FORCE).findings}
+    assert re.search(text, findings[name])
 
 
 def test_an_axis_that_is_dead_in_one_position_is_named(rng):
@@ -154,7 +154,6 @@ def test_an_axis_that_is_dead_in_one_position_is_named(rng):
 
 
 def spoilt(rng, spoil):
-    """Apply the same defect to seven positions."""
     rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
     for rest in rests:
         spoil(rest)

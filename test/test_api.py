@@ -66,7 +66,7 @@ def test_arrays_have_the_bits_of_a_replayed_bag(root, tmp_path, fitted):
 
 
 def test_no_reading_is_lost_however_many(rng):
-    # All readings once waited at the same time, and the queue is limited.
+    # WHY: all readings were queued at the same time, and the queue is limited.
     time_s = np.arange(5000) * 0.1
     readings = {name: 20.0 + rng.normal(0.0, 0.01, 5000) for name in ('board', 'case')}
     counts = rng.normal([5.0, -3.0, 2940.0], 2.0, (5000, 3)).round()
@@ -103,8 +103,6 @@ def test_any_origin_and_any_kind_of_array_will_do(arrays):
     )
 
     class Column:
-        """Offers numpy the interface of a pandas or xarray object."""
-
         def __init__(self, value):
             self.value = value
 
@@ -134,7 +132,7 @@ def test_data_are_no_exceptions_but_rows_of_nan(arrays):
     late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
-    # Without a case thermometer the board decides the regime, not earlier than with one.
+    # Without a case thermometer the board decides the regime, not earlier than a case thermometer.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
 
@@ -151,7 +149,7 @@ def test_nothing_in_is_nothing_out():
 
 
 @pytest.mark.parametrize(
-    ('change', 'said'),
+    ('change', 'text'),
     [
         ({'time_s': [[0.0, 1.0]]}, r'`time_s` must have one dimension, got the shape \(1, 2\)'),
         ({'time_s': [0.0, 1.0, 1.0]}, r'`time_s` must rise, got 1.0 at 1 and then 1.0'),
@@ -171,9 +169,9 @@ def test_nothing_in_is_nothing_out():
         ({'lid': [20.0] * 3}, r'`lid` is no thermometer of this calibration: it has board, case'),
     ],
 )
-def test_a_slip_is_said(change, said):
+def test_a_slip_is_said(change, text):
     given = {'time_s': [0.0, 1.0, 2.0], 'counts': np.ones((3, 3)), 'board': [20.0] * 3, **change}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=text):
         calibration().correct(**given)
 
 
@@ -203,10 +201,10 @@ def test_a_table_is_read_as_the_command_reads_it(tmp_path):
         for k in range(300)
     ]
     table.write_text('\n'.join(['time_s,ax,ay,az,temperature_c', *rows]))
-    found = tc.read(table)
-    np.testing.assert_allclose(np.diff(found.time_s), 0.02, atol=1e-9)
-    np.testing.assert_allclose(found.counts[1], [0.01, 0.02, 9.81], rtol=1e-12)
-    assert found.temperatures['board'][1].tolist() == [20.0, 21.0, 22.0]
+    content = tc.read(table)
+    np.testing.assert_allclose(np.diff(content.time_s), 0.02, atol=1e-9)
+    np.testing.assert_allclose(content.counts[1], [0.01, 0.02, 9.81], rtol=1e-12)
+    assert content.temperatures['board'][1].tolist() == [20.0, 21.0, 22.0]
     with pytest.raises(ValueError, match='a table needs no `imu`; it has `columns`, `rate_hz`'):
         read_log(table, imu=1)
 

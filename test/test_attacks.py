@@ -61,7 +61,7 @@ def test_a_clock_that_goes_back_or_pauses_is_none_of_the_samples(peer, tmp_path)
             )
         assert peer.set_parameters(use_sim_time=False)[0].successful
         peer.wait_for(lambda: stamp_of(told[-1]) not in times, 'the time of day')
-        stamps = [stamp_of(one) for one in heard]
+        stamps = [stamp_of(imu) for imu in heard]
         assert stamps == [START_NS + k * 10**7 for k in range(20 * len(times))]
         assert node._loop.n_failures == 0
 
@@ -91,7 +91,7 @@ def test_a_rate_that_goes_up_twentyfold_and_back_loses_nothing(peer, tmp_path):
                 sent.append(now_ns)
                 now_ns += step_ns
             peer.wait_for(lambda: len(heard) == len(sent), 'all samples')
-        assert [stamp_of(one) for one in heard] == sent
+        assert [stamp_of(imu) for imu in heard] == sent
 
 
 def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_path):
@@ -171,7 +171,7 @@ def test_links_exchanged_under_the_folder_lead_nowhere_else(tmp_path):
         thread.join()
     assert serials <= {'inside'}
     known = ('calibration_directory', 'No such file', 'Not a directory', 'Invalid argument')
-    assert [one for one in refusals if not any(text in one for text in known)] == []
+    assert [refusal for refusal in refusals if not any(text in refusal for text in known)] == []
 
 
 SAVING = """
@@ -235,7 +235,7 @@ def test_crafted_logs_are_refused_in_a_line_or_read(kind, tmp_path):
 
         write_new(path, rng)
     good = path.read_bytes()
-    n_read, said = 0, []
+    n_read, lines = 0, []
     for number in range(150):
         data = bytearray(good[:6000])
         for _ in range(rng.integers(1, 9)):
@@ -248,6 +248,6 @@ def test_crafted_logs_are_refused_in_a_line_or_read(kind, tmp_path):
             write_log(log, tmp_path / f'{number}.mcap')
             n_read += 1
         except RecordingError as error:
-            said.append(str(error))
+            lines.append(str(error))
     assert n_read < 150
-    assert not any('\n' in text for text in said)
+    assert not any('\n' in text for text in lines)

@@ -24,7 +24,7 @@ def test_they_are_small():
 @pytest.mark.parametrize('command', COMMANDS, ids=['fit', 'held_out'])
 def test_their_commands_make_them(command, tmp_path, cli):
     arguments = shlex.split(command)[1:]
-    # The same content with a faster compression.
+    # Simulate the same content with a faster compression.
     arguments[arguments.index('--level') + 1] = '1'
     cli(*arguments, cwd=tmp_path)
     made = sorted((tmp_path / 'bags').rglob('*.mcap'))
@@ -33,7 +33,7 @@ def test_their_commands_make_them(command, tmp_path, cli):
         shipped = read_recording(ROOT / path.relative_to(tmp_path))
         anew = read_recording(path)
         # The bags state the version that made them.
-        own, theirs = (dict(one.info.metadata) for one in (anew, shipped))
+        own, theirs = (dict(bag.info.metadata) for bag in (anew, shipped))
         assert own.pop('simulated_by').split()[0] == theirs.pop('simulated_by').split()[0]
         assert own == theirs, path.name
         for name in ('accel_stamp_ns', 'accel'):
@@ -53,7 +53,7 @@ def test_every_sample_can_be_corrected():
     # Both temperatures come before the first sample, so that every sample is corrected.
     for path in SHIPPED:
         block = read_recording(path).columns
-        assert [one.after[0] for one in block.temperatures.values()] == [0, 0]
+        assert [temperature.after[0] for temperature in block.temperatures.values()] == [0, 0]
         assert (np.diff(block.accel_stamp_ns) > 0).all()
 
 

@@ -44,11 +44,9 @@ def functions(draw, at_reference):
         amplitude = draw(small)
         return Exponential(at_reference - amplitude, (amplitude,), (draw(st.floats(5.0, 90.0)),))
     coefficients = tuple(draw(st.lists(small, max_size=4)))
-    return (
-        axis_set((at_reference, *coefficients)).bias_function
-        if not at_reference
-        else (axis_set(scale=(at_reference, *coefficients)).scale_function)
-    )
+    if at_reference:
+        return axis_set(scale=(at_reference, *coefficients)).scale_function
+    return axis_set((at_reference, *coefficients)).bias_function
 
 
 @st.composite
@@ -65,18 +63,15 @@ def calibrations(draw):
         return tuple(draw(numbers) for _ in range(3))
 
     terms = draw(st.lists(st.sampled_from(RICH.response), max_size=4))
+    serials = st.text(min_size=1, max_size=20).filter(lambda s: s.isprintable())
+    noted = GroupEvidence('gradient', 'bias', 1e-5, 2.5, draw(number), (draw(st.floats(0, 9)),))
     return replace(
         calibration(sensors=('case', 'frame')),
         response=tuple(replace(t, bias=weights(number), scale=weights(small)) for t in terms),
-        evidence=(
-            GroupEvidence('gradient', 'bias', 1e-5, 2.5, draw(number), (draw(st.floats(0, 9)),)),
-        ),
+        evidence=(noted,),
         static=regime_set(one(), one(), one()),
         dynamic=regime_set(one(), one(), one()),
-        unit=replace(
-            calibration().unit,
-            serial=draw(st.text(min_size=1, max_size=20).filter(lambda s: s.isprintable())),
-        ),
+        unit=replace(calibration().unit, serial=draw(serials)),
     )
 
 
@@ -211,9 +206,9 @@ def test_bytes_that_are_no_calibration(content, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
     # Peers without access to the file get the same message without quotations from it.
-    told, whole = caught.value.rule or str(caught.value), str(caught.value)
+    rule, whole = caught.value.rule or str(caught.value), str(caught.value)
     quotes = whole.startswith('not valid YAML: ')
-    assert re.fullmatch(r'not valid YAML( \(line \d+\))?', told) if quotes else told == whole
+    assert re.fullmatch(r'not valid YAML( \(line \d+\))?', rule) if quotes else rule == whole
 
 
 @given(st.data())

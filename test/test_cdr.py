@@ -22,7 +22,6 @@ frames = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size
 
 
 def process(stamp_ns, x, y, z):
-    """Replace the compensator by a function that depends on every input."""
     return (z, x, y, 1.5, 0.25, float(stamp_ns % 1009), 2.5, 0.125, 3.5)
 
 
@@ -46,7 +45,7 @@ def doubles(data):
 
 def convert(converter, *messages):
     written = (converter.convert(message, process) for message in messages)
-    return [one for one in written if one is not None]
+    return [message for message in written if message is not None]
 
 
 @given(
@@ -67,13 +66,13 @@ def test_counts_become_an_imu(order, sec, nanosec, frame, values):
     x, y, z = (pack('<', [value]) for value in values)
     force = process(sec * 10**9 + nanosec, *values)
     covariance = [force[k] for k in (3, 4, 5, 4, 6, 7, 5, 7, 8)]
-    found = doubles(written[0])
-    assert found[25:28] == [z, x, y]
-    assert b''.join(found[28:]) == pack('<', covariance)
+    fields = doubles(written[0])
+    assert fields[25:28] == [z, x, y]
+    assert b''.join(fields[28:]) == pack('<', covariance)
     # REP 145: unmeasured fields are marked, and the quaternion is still a valid one.
-    assert b''.join(found[:4]) == pack('<', [0.0, 0.0, 0.0, 1.0])
-    assert found[4] == found[16] == pack('<', [-1.0])
-    assert not any(b''.join(found[5:16] + found[17:25]))
+    assert b''.join(fields[:4]) == pack('<', [0.0, 0.0, 0.0, 1.0])
+    assert fields[4] == fields[16] == pack('<', [-1.0])
+    assert not any(b''.join(fields[5:16] + fields[17:25]))
 
 
 @given(
@@ -93,7 +92,7 @@ def test_imu_passes_everything_else_bit_for_bit(order, frame, override, values):
 
 
 def test_signalling_nan_survives_the_byte_swap():
-    # A signalling NaN may become quiet in a register; rclpy's must not.
+    # A signalling NaN may become quiet in a register; the bytes of the message must not change.
     payload = 0x7FF0_0000_0000_0001
     values = struct.pack('>37Q', *[payload] * 37)
     message = cdr('>', (1, 2), 'imu', [])[:] + values
@@ -121,10 +120,10 @@ def test_what_has_another_form_goes_through_rclpy(kind, override):
     good = cdr('<', (3, 4), 'imu', values)
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
     # rclpy accepts bytes after the end of a message; their exact plain form has none.
-    (expected,), (found,) = convert(fast, good), convert(slow, good + bytes(8))
+    (expected,), (written,) = convert(fast, good), convert(slow, good + bytes(8))
     assert (fast.traffic.n_fallback, slow.traffic.n_fallback) == (0, 1)
-    assert deserialize_message(found, Imu) == deserialize_message(expected, Imu)
-    assert doubles(found) == doubles(expected)
+    assert deserialize_message(written, Imu) == deserialize_message(expected, Imu)
+    assert doubles(written) == doubles(expected)
     assert slow.last_result == fast.last_result is not None
     # Later messages use the fast path again.
     convert(slow, good)
@@ -134,14 +133,10 @@ def test_what_has_another_form_goes_through_rclpy(kind, override):
 @pytest.mark.parametrize(
     'bad',
     [
-        b'',
-        b'\0',
-        b'\0\1',
-        cdr('<', (1, 2), 'imu', [1.0, 2.0]),
-        b'\0\1\0\0' + b'\xff' * 60,
+        b'', b'\0', b'\0\1', cdr('<', (1, 2), 'imu', [1.0, 2.0]), b'\0\1\0\0' + b'\xff' * 60,
         cdr('<', (1, 2), 'imu', [1.0, 2.0, 3.0])[:-1],
     ],
-)
+)  # fmt: skip
 def test_unreadable_bytes_are_counted_and_the_stream_goes_on(bad):
     converter = SampleConverter(Vector3Stamped)
     good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
@@ -191,5 +186,5 @@ def test_a_temperature_is_read_as_rclpy_reads_it(data):
     else:
         stamp = message.header.stamp
         expected = (stamp.sec * 10**9 + stamp.nanosec, message.temperature)
-    # Compared as text, as NaN is included.
+    # The values are compared as text, as NaN is among them.
     assert repr(read_temperature(data)) == repr(expected)

@@ -31,7 +31,6 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope='session')
 def bag(tmp_path_factory, cli):
-    """Simulate a short thermal test through the command line."""
     # 15 minutes at 10 Hz, minus the 4 samples before the board's first reading at 0.5 s: 8996.
     path = tmp_path_factory.mktemp('cli') / 'bag'
     cli('simulate', '--profile', '20 4min, 30@2 6min', '--rate-hz', '10', '-o', path)
@@ -53,11 +52,11 @@ class TestHelp:
 
 class TestOutput:
     def test_tables_pipe_as_plain_columns(self, bag, cli):
-        said = cli('info', bag).stdout
-        assert '\x1b' not in said
-        assert said.isascii()
-        assert max(map(len, said.splitlines())) <= 80
-        row = next(line for line in said.splitlines() if line.startswith('/accel/counts'))
+        printed = cli('info', bag).stdout
+        assert '\x1b' not in printed
+        assert printed.isascii()
+        assert max(map(len, printed.splitlines())) <= 80
+        row = next(line for line in printed.splitlines() if line.startswith('/accel/counts'))
         assert row.split() == ['/accel/counts', 'geometry_msgs/msg/Vector3Stamped', '8996']
 
     def test_a_reader_that_has_seen_enough_is_no_error(self, bag):
@@ -70,9 +69,9 @@ class TestOutput:
         self, bag, cli
     ):
         for no_color in (False, True):
-            said = on_a_terminal('info', str(bag), no_color=no_color)
-            assert 'reading bag' in said
-            assert bool(re.search(r'\x1b\[(3\d|9\d|38)', said)) != no_color
+            text = on_a_terminal('info', str(bag), no_color=no_color)
+            assert 'reading bag' in text
+            assert bool(re.search(r'\x1b\[(3\d|9\d|38)', text)) != no_color
         finished = cli('info', bag)
         assert 'reading bag' not in finished.stdout + finished.stderr
 
@@ -85,14 +84,13 @@ def test_a_command_computes_in_one_thread():
         "app.run = lambda _: print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS']); "
         'app.main([])'
     )
-    for wanted, said in (({}, '1'), ({'OPENBLAS_NUM_THREADS': '3'}, '3')):
+    for wanted, text in (({}, '1'), ({'OPENBLAS_NUM_THREADS': '3'}, '3')):
         environment = {k: v for k, v in os.environ.items() if k != 'OPENBLAS_NUM_THREADS'}
         finished = ran(sys.executable, '-c', code, env={**environment, **wanted}, check=True)
-        assert finished.stdout.split() == ['False', said]
+        assert finished.stdout.split() == ['False', text]
 
 
 def on_a_terminal(*arguments, no_color=False):
-    """Run the command line on a pseudo-terminal and return its output."""
     leader, follower = pty.openpty()
     environment = {**os.environ, 'COLUMNS': '80', 'TERM': 'xterm-256color'}
     environment.pop('NO_COLOR', None)
@@ -156,7 +154,7 @@ class TestSimulate:
             # Bias and drift of a MEMS unit are a few per cent of g at most.
             np.testing.assert_allclose(measured / 9.80665, truth['up'], atol=0.05)
             # Both temperatures come before the first sample, so that every sample is corrected.
-            assert [one.after[0] for one in block.temperatures.values()] == [0, 0]
+            assert [temperature.after[0] for temperature in block.temperatures.values()] == [0, 0]
         assert len({tuple(up) for up in ups}) == 3
 
     def test_a_plan_is_a_whole_test(self, tmp_path, cli):
@@ -174,9 +172,9 @@ class TestInfo:
         bent = Nonlinearity((9.8, 98.0), 1e-4, (square,))
         known = replace(rich_calibration(), nonlinearity=bent, posterior=None)
         save_calibration(known, tmp_path / 'unit.yaml')
-        said = cli('info', tmp_path / 'unit.yaml').stdout
-        assert re.search(r'^K2 +µg/g² +10 +-20 +0$', said, re.MULTILINE)
-        assert re.search(r'^K2 per kelvin +µg/g²/K +0\.1 +0 +0$', said, re.MULTILINE)
+        printed = cli('info', tmp_path / 'unit.yaml').stdout
+        assert re.search(r'^K2 +µg/g² +10 +-20 +0$', printed, re.MULTILINE)
+        assert re.search(r'^K2 per kelvin +µg/g²/K +0\.1 +0 +0$', printed, re.MULTILINE)
         assert 'nonlinearity' not in cli('info', unit).stdout
 
 
@@ -198,16 +196,16 @@ class TestTopics:
         profile.write_text('counts: /imu/raw\nboard: /t2\ntemperature/magnet: /t3\n')
         arguments = ('--topics', profile, '--topic', 'board=/t1', '--topic=case=/t2')
         seen = parsed(cli('info', named, *arguments, '--json').stdout)
-        degrees = {name: one['lowest'] for name, one in seen['thermometers'].items()}
+        degrees = {name: probe['lowest'] for name, probe in seen['thermometers'].items()}
         assert degrees == {'board': 20.0, 'case': 21.0, 'magnet': 22.0}
         assert seen['chosen'] is None
 
     def test_the_only_one_of_its_type_is_said(self, named, unit, cli):
-        said = '/imu/raw, its only Vector3Stamped, is taken for counts'
-        assert said in cli('info', named).stdout
+        text = '/imu/raw, its only Vector3Stamped, is taken for counts'
+        assert text in cli('info', named).stdout
         topics = ('--topic', 'board=/t1', '--topic', 'case=/t2')
         arguments = ('-o', named.with_name('out.mcap'), '--serial', '', *topics)
-        assert f'{named}: {said}' in cli('replay', named, '-c', unit, *arguments).stderr
+        assert f'{named}: {text}' in cli('replay', named, '-c', unit, *arguments).stderr
 
     def test_a_file_that_is_no_profile(self, named, cli):
         profile = named.with_name('lab.yaml')
@@ -221,18 +219,11 @@ class TestCells:
     @pytest.mark.parametrize(
         ('cell', 'text'),
         [
-            (None, '-'),
-            (float('nan'), '-'),
-            (float('inf'), '-'),
-            (0.0, '0'),
-            (3, '3'),
-            ('a', 'a'),
-            (12.3456, '12.35'),
-            (-0.00012345, '-0.000123'),
-            (999.96, '1000'),
+            (None, '-'), (float('nan'), '-'), (float('inf'), '-'), (0.0, '0'), (3, '3'),
+            ('a', 'a'), (12.3456, '12.35'), (-0.00012345, '-0.000123'), (999.96, '1000'),
             (123456.7, '123457'),
         ],
-    )
+    )  # fmt: skip
     def test_text(self, cell, text):
         assert output.text(cell) == text
 
@@ -248,7 +239,7 @@ class TestCells:
 
 def test_what_sets_the_exit_code_is_said_to_the_quiet(capsys):
     out = output.Output(quiet=True)
-    out.told([('01.mcap', 'the only topic', 'cut off after 3 s')])
+    out.sources([('01.mcap', 'the only topic', 'cut off after 3 s')])
     with pytest.raises(typer.Exit):
         out.end()
     assert capsys.readouterr() == ('', 'thermo_comp: 01.mcap: cut off after 3 s\n')

@@ -23,22 +23,17 @@ def needs_ros():
 def test_end_to_end(tmp_path):
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     words = [sys.executable, str(ROOT / 'benchmarks' / 'demo.py')]
-    said = subprocess.run(
-        words,
-        cwd=tmp_path,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    assert 'messages in 15407, messages out 15407' in said
-    assert 'bit for bit: yes' in said
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+    printed = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True,
+                             text=True, check=True).stdout  # fmt: skip
+    assert 'messages in 15407, messages out 15407' in printed
+    assert 'bit for bit: yes' in printed
     # The output equals that on the page of the command line and, in part, in the README, except
     # for the speed, which depends on the machine.
     speed = re.compile(r' in [\d.]+ s, \d+ times real time')
-    assert is_alike(speed.sub('', said), speed.sub('', shown()['demo'][1])), said
-    lines = speed.sub('', said).splitlines()
-    shown_lines = [speed.sub('', one) for one in shown_of_demo()]
+    assert is_alike(speed.sub('', printed), speed.sub('', shown()['demo'][1])), printed
+    lines = speed.sub('', printed).splitlines()
+    shown_lines = [speed.sub('', line) for line in shown_of_demo()]
     assert [one for one in shown_lines if not any(is_alike(line, one) for line in lines)] == []
     out = tmp_path / 'out'
     topics = inspect_recording(out / 'out.mcap').topics
@@ -47,8 +42,8 @@ def test_end_to_end(tmp_path):
     assert (out / 'report.html').stat().st_size > 10_000
     assert (out / 'figures' / '4_gravity.png').read_bytes().startswith(b'\x89PNG')
     for section in ('static', 'dynamic'):
-        rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', said, re.MULTILINE)
-        assert len(rows) == 4, said
+        rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
+        assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
         # The drift is some hundred ug. One set leaves the difference of the regimes, two sets
         # leave the lags; the noise over 20 cycles of the converter is below 10 ug.

@@ -24,7 +24,6 @@ START_NS = 1_767_225_600_000_000_000
 
 
 def bag(path, *, counts=True, board=True, case=True, serial='', n=600, up=(0.6, 0.0, 0.8)):
-    """Write a minute of a resting unit with the given topics."""
     stamps = START_NS + np.arange(n) * 100_000_000
     with BagWriter(path, metadata={'serial': serial} if serial else None) as writer:
         for topic, wanted in ((TOPICS.board, board), (TOPICS.case, case)):
@@ -135,7 +134,7 @@ class TestBags:
         path = bag(tmp_path / 'bag', board=False)
         self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--topic board=')
         refused(cli, 1, r'temperature/board', 'evaluate', path, '-c', unit)
-        # A fit recognises it.
+        # A fit recognises a bag without a board temperature.
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.8')
         assert 'no temperature was recorded' in cli('fit', path, *arguments).stdout
 
@@ -205,8 +204,8 @@ def test_a_torn_bag_is_worked_through_and_the_exit_code_tells(cli, unit, tmp_pat
         ('report', torn, '-c', unit, '-o', tmp_path / 'page.html', '--json'),
     ):
         finished = cli(*arguments, code=1)
-        said = finished.stdout + finished.stderr
-        assert 'the file is cut off at byte ' in said, said
+        text = finished.stdout + finished.stderr
+        assert 'the file is cut off at byte ' in text, text
         assert 'error' not in finished.stderr
     assert output.is_file()
     data = parsed(finished.stdout)

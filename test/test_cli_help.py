@@ -18,11 +18,11 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 def leaves(group, prefix=''):
     """Return every command by the words that call it, including those of groups."""
-    found = {}
-    for name, one in group.commands.items():
-        inner = hasattr(one, 'commands')
-        found |= leaves(one, f'{prefix}{name} ') if inner else {f'{prefix}{name}': one}
-    return found
+    collected = {}
+    for name, command in group.commands.items():
+        inner = hasattr(command, 'commands')
+        collected |= leaves(command, f'{prefix}{name} ') if inner else {f'{prefix}{name}': command}
+    return collected
 
 
 COMMANDS = leaves(get_command(app))
@@ -36,25 +36,25 @@ OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100u
 # One example of each command that prints figures and ends by itself; `play`, `report` and `fit`
 # are tested in test_cli, test_cli_errors and test_docs.
 WITH_JSON = {
-    one.split()[1]: one
-    for one in EXAMPLES
-    if one.split()[1] not in ('play', 'report')
-    and 'record --positions' not in one
-    and 'bags/unit42/*' not in one
+    example.split()[1]: example
+    for example in EXAMPLES
+    if example.split()[1] not in ('play', 'report')
+    and 'record --positions' not in example
+    and 'bags/unit42/*' not in example
 }.values()
-QUICK = [one for one in EXAMPLES if one.split()[1] in ('info', 'convert', 'export', 'import')]
+QUICK = [line for line in EXAMPLES if line.split()[1] in ('info', 'convert', 'export', 'import')]
 
 
 def test_every_command_has_an_example():
     with_example = {
         name
         for name in COMMANDS
-        if any(one.startswith(f'thermo_comp {name} ') for one in EXAMPLES)
+        if any(example.startswith(f'thermo_comp {name} ') for example in EXAMPLES)
     }
     assert with_example == set(COMMANDS)
-    assert all(f'thermo_comp {name} ' in (one.help or '') for name, one in COMMANDS.items()), (
-        'an example of another command'
-    )
+    assert all(
+        f'thermo_comp {name} ' in (command.help or '') for name, command in COMMANDS.items()
+    ), 'an example of another command'
 
 
 @pytest.mark.parametrize('example', EXAMPLES)
@@ -81,7 +81,7 @@ def test_quiet_says_nothing(example, desk):
 
 def test_commands_that_print_figures_have_json():
     lacking = {
-        name for name, one in COMMANDS.items() if not any('--json' in p.opts for p in one.params)
+        name for name, page in COMMANDS.items() if not any('--json' in p.opts for p in page.params)
     }
     assert lacking <= {'play'}
 
@@ -90,21 +90,21 @@ def test_commands_that_print_figures_have_json():
 def test_help_cuts_no_name(name, cli, monkeypatch):
     # WHY: a terminal of 80 columns showed `--reference-tempera…`, an incomplete option name.
     monkeypatch.setattr(rich_utils, 'MAX_WIDTH', 80)
-    said = cli(*name.split(), '--help').stdout
-    assert '…' not in said
-    assert max(map(len, said.splitlines())) <= 80
+    text = cli(*name.split(), '--help').stdout
+    assert '…' not in text
+    assert max(map(len, text.splitlines())) <= 80
     # The help printer takes square brackets as mark-up and drops their content.
-    assert not re.search(r' \.\s', said)
-    assert said == cli(*name.split(), '-h').stdout
+    assert not re.search(r' \.\s', text)
+    assert text == cli(*name.split(), '-h').stdout
     for parameter in COMMANDS[name].params:
-        assert all(option in said for option in parameter.opts if option.startswith('-')), said
+        assert all(option in text for option in parameter.opts if option.startswith('-')), text
 
 
 def test_every_option_says_what_it_is_for():
     bare = [
         f'{name} {parameter.name}'
-        for name, one in COMMANDS.items()
-        for parameter in one.params
+        for name, command in COMMANDS.items()
+        for parameter in command.params
         if parameter.name != 'help' and not getattr(parameter, 'help', '')
     ]
     assert bare == []

@@ -113,12 +113,12 @@ def test_each_value_by_hand():
         [[23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]]
     ).T
     assert layout.width == len(state)
-    found = ColumnTable(columns, spec, 20.0).values(state)[:, 0]
+    values = ColumnTable(columns, spec, 20.0).values(state)[:, 0]
     expected = [
         -0.7, 0.01, 0.5, -0.3, -0.9, math.tanh(0.64) * 9.0, 0.1, 0.25, 0.375, 0.125 * 27.0,
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0, 1.0, 0.5, 0.0,
     ]  # fmt: skip
-    assert found == pytest.approx(expected)
+    assert values == pytest.approx(expected)
     # t is limited to the calibrated temperatures, the lag is not.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
@@ -132,7 +132,7 @@ def test_a_bend_moves_with_the_board_and_its_lag():
     state = np.zeros((Layout(spec).width, 1))
     lag = Layout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
-    # By the number that it is computed from, and by the board at a given lag.
+    # Derivatives by the number that a column is computed from, and by the board at a given lag.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
     assert not np.any(table.slopes(state))

@@ -72,16 +72,16 @@ def test_signed_counts_and_the_printed_equations():
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
     warm(compensator)
-    found = compensator.process(1, plus, minus, 12.0)[:3]
-    assert found == pytest.approx((GRAVITY, -GRAVITY, 0.0), abs=1e-12)
+    corrected = compensator.process(1, plus, minus, 12.0)[:3]
+    assert corrected == pytest.approx((GRAVITY, -GRAVITY, 0.0), abs=1e-12)
 
 
 def test_every_term_by_hand():
-    # Static set at t = 10 K, T_case = T_board (no gradient), steady (no rate): eq of section 4.
-    one = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
+    # The formula by hand: static set at t = 10 K, T_case = T_board (no gradient), no rate.
+    axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=Axes(*[AxisReference(300.0, 7.0)] * 3),
-        static=regime_set(one, one, one),
+        static=regime_set(axis, axis, axis),
         response=(term('gradient', (9.0,) * 3, (9.0,) * 3, range=(-0.05, 0.05)),),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (2e-3, -3e-3, 1.0)),
     )
@@ -128,7 +128,7 @@ def event_list(seed):
     return events
 
 
-#: Drawn by seed, as drawing the single messages with hypothesis takes as long as the test.
+#: Messages are drawn by seed: drawing each with hypothesis takes as long as the test.
 event_lists = st.integers(0, 2**64 - 1).map(event_list)
 
 
@@ -218,7 +218,7 @@ def test_a_stamp_that_leaps_ahead_needs_a_second_one(run):
     for stamps, kept in (
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),  # a real gap
-        # Two separate damaged stamps; and one that is before the leap.
+        # Two separate damaged stamps; two damaged stamps in falling order.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -266,14 +266,14 @@ def test_readings_of_a_long_time_without_samples_all_count(n_before, ahead_s):
     after_ns = (120 - ahead_s) * SECOND_NS
     last = [('accel', after_ns + k * SECOND_NS // 100, (1.0, 2.0 + k, 2930.0)) for k in range(5)]
     block, live = (Compensator(replace(rich_calibration(), gyroscope=None)) for _ in range(2))
-    found = batch(block, [*first, *readings, *last])
+    whole = batch(block, [*first, *readings, *last])
     rows, _ = stream(live, first)
     for reading in readings:
         live.push(*reading)
         if reading[1] <= after_ns:
             live.flush(reading[1])
     more, _ = stream(live, last)
-    columns = np.column_stack([found.specific_force, found.covariance[:, UNIQUE]])
+    columns = np.column_stack([whole.specific_force, whole.covariance[:, UNIQUE]])
     np.testing.assert_array_equal(columns, np.concatenate([rows, more]))
     assert block.counters == live.counters
     assert block.counters.n_board_rejected == block.counters.n_case_rejected == 0
@@ -290,12 +290,10 @@ def test_flush_lets_the_regime_go_on_without_samples():
 def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
     # 0.025 counts = 8.5 ug, independent of time
     unit = calibration(dynamic=regime_set(axis_set(delta=0.025)))
-    compensator = Compensator(
-        unit,
-        CompensatorConfig(
-            transition_time_s=100.0, stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0
-        ),
+    config = CompensatorConfig(
+        transition_time_s=100.0, stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0
     )
+    compensator = Compensator(unit, config)
     warm(compensator, 20.0, until_s=1200)
     for k in range(1200, 1400):
         compensator.push('board', k * SECOND_NS, 20.0)
@@ -316,11 +314,11 @@ def test_what_is_not_finite_is_never_published_whatever_led_to_it(monkeypatch, b
     line = Correction.line
 
     def broken(self, start, end, slow, excess):
-        found = line(self, start, end, slow, excess)
+        corrected = line(self, start, end, slow, excess)
         # The second and third of the whole seconds of the stamps.
         at = np.asarray(start)[0]
-        found[0] = np.where((at > 21.0) & (at < 23.0), bad, found[0])
-        return found
+        corrected[0] = np.where((at > 21.0) & (at < 23.0), bad, corrected[0])
+        return corrected
 
     monkeypatch.setattr(Correction, 'line', broken)
     events = []
@@ -334,6 +332,6 @@ def test_what_is_not_finite_is_never_published_whatever_led_to_it(monkeypatch, b
     n_sent = sum(name == 'accel' for name, *_ in events)
     assert 0 < one_by_one.counters.n_unsound == n_sent - len(rows)
     assert np.isfinite(rows).all()
-    found = process_block(block, columns_from_events(events))
-    np.testing.assert_array_equal(found.specific_force, np.array(rows)[:, :3])
+    corrected = process_block(block, columns_from_events(events))
+    np.testing.assert_array_equal(corrected.specific_force, np.array(rows)[:, :3])
     assert block.counters == one_by_one.counters

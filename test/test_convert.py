@@ -118,8 +118,8 @@ def test_an_offset_is_taken_away(tmp_path):
     log = table_log(path, column_map(accel={**accel, 'offset': 32768.0}))
     assert log.clip == (-32768.0, 32767.0)
     write_log(log, tmp_path / 'bag.mcap')
-    found = read_recording(tmp_path / 'bag.mcap').columns.accel
-    np.testing.assert_allclose(found[:, 0], columns['ax'], atol=1e-9)
+    read = read_recording(tmp_path / 'bag.mcap').columns.accel
+    np.testing.assert_allclose(read[:, 0], columns['ax'], atol=1e-9)
 
 
 def test_every_odd_row_is_accounted_for(tmp_path):
@@ -273,15 +273,13 @@ class TestColumnMap:
         path = tmp_path / 'map.yaml'
         with pytest.raises(ThermoCompError, match=r'map\.yaml: .*No such file'):
             load_column_map(path)
-        path.write_text('- a\n- b\n')
-        with pytest.raises(ThermoCompError, match='a column map is a mapping'):
-            load_column_map(path)
-        path.write_text('a: [1\n')
-        with pytest.raises(ThermoCompError, match=r'map\.yaml: not valid YAML'):
-            load_column_map(path)
-        path.write_bytes(b'\xff\xfe\x00a')
-        with pytest.raises(ThermoCompError, match='UTF-8'):
-            load_column_map(path)
+        for content, reason in (
+            *((b'- a\n- b\n', 'a column map is a mapping'), (b'\xff\xfe\x00a', 'UTF-8')),
+            (b'a: [1\n', r'map\.yaml: not valid YAML'),
+        ):
+            path.write_bytes(content)
+            with pytest.raises(ThermoCompError, match=reason):
+                load_column_map(path)
 
 
 class TestCommand:
@@ -294,9 +292,9 @@ class TestCommand:
             'board: {column: board}\n'
         )
         arguments = ('convert', path, '--columns', map_path, '-o', tmp_path / 'bag')
-        said = cli(*arguments).stdout
-        assert '400 rows, 4.0 s at 100 Hz' in said
-        assert '400 imu/uncompensated' in said
+        printed = cli(*arguments).stdout
+        assert '400 rows, 4.0 s at 100 Hz' in printed
+        assert '400 imu/uncompensated' in printed
         assert cli(*arguments, code=1).stderr == (
             f'thermo_comp: error: {tmp_path / "bag"}: exists already; --force overwrites it\n'
         )

@@ -69,21 +69,21 @@ def write_ros1(path, rng):
 def test_topics_of_any_name_become_ours(tmp_path, rng, ros):
     path = write_ros1(tmp_path / 'old.bag', rng) if ros == 1 else write_ros2(tmp_path / 'new', rng)
     report = write_log(bag_log(path), tmp_path / 'bag.mcap')
-    found = read_recording(tmp_path / 'bag.mcap')
+    recording = read_recording(tmp_path / 'bag.mcap')
     assert report.messages['accel'] == N
     np.testing.assert_array_equal(
-        found.columns.accel_stamp_ns, START_NS + 10_000_000 * np.arange(N)
+        recording.columns.accel_stamp_ns, START_NS + 10_000_000 * np.arange(N)
     )
-    np.testing.assert_allclose(found.columns.accel.mean(axis=0), (0.0, 0.1 * G, G), atol=0.02)
-    np.testing.assert_array_equal(found.columns.imu.angular_velocity[0], (0.01, 0.0, 0.5))
+    np.testing.assert_allclose(recording.columns.accel.mean(axis=0), (0.0, 0.1 * G, G), atol=0.02)
+    np.testing.assert_array_equal(recording.columns.imu.angular_velocity[0], (0.01, 0.0, 0.5))
     # The thermometer in the namespace of the Imu is the board's.
     np.testing.assert_array_equal(
-        found.columns.temperatures['board'].celsius, len('/mpu/die') + np.arange(8)
+        recording.columns.temperatures['board'].celsius, len('/mpu/die') + np.arange(8)
     )
     np.testing.assert_array_equal(
-        found.columns.temperatures['case'].celsius, len('/baro/air') + np.arange(8)
+        recording.columns.temperatures['case'].celsius, len('/baro/air') + np.arange(8)
     )
-    assert found.info.metadata['topic_board'] == '/mpu/die'
+    assert recording.info.metadata['topic_board'] == '/mpu/die'
 
 
 def test_unit_is_checked_at_rest(tmp_path, rng):
@@ -109,7 +109,7 @@ def present(imu, temperature=(), pressure=()):
         ((), (), None, None),
         (('/t',), (), '/t', None),
         (('/imu/t', '/air'), (), '/imu/t', '/air'),
-        # The thermometer beside the barometer is the case's, even without another.
+        # The thermometer beside the barometer is the case's, even without a board thermometer.
         (('/baro/t',), ('/baro/p',), None, '/baro/t'),
         (('/imu/t', '/baro/t', ), ('/baro/p',), '/imu/t', '/baro/t'),
         (('/robot/imu/t', '/robot/baro/t'), ('/robot/baro/p',), '/robot/imu/t', '/robot/baro/t'),
@@ -118,8 +118,8 @@ def present(imu, temperature=(), pressure=()):
 )  # fmt: skip
 def test_neighbours_tell_the_thermometers(temperature, pressure, board, case):
     imu = '/robot/imu/data' if temperature and temperature[0].startswith('/robot') else '/imu/data'
-    found = find_topics(present([imu], temperature, pressure), None, None, None)
-    assert found == {'imu': imu, 'board': board, 'case': case}
+    topics = find_topics(present([imu], temperature, pressure), None, None, None)
+    assert topics == {'imu': imu, 'board': board, 'case': case}
 
 
 def test_what_neighbours_cannot_tell_is_asked():
@@ -188,7 +188,6 @@ def test_nothing_is_said_against_what_may_be_true():
 
 
 def shaken(rng, n, scale, noise):
-    """At rest, except for a shaken middle fifth."""
     accel = scale * np.array([0.6, 0.0, 0.8]) + noise * rng.standard_normal((n, 3))
     middle = slice(2 * n // 5, 3 * n // 5)
     accel[middle] += 20.0 * noise * rng.standard_normal((len(accel[middle]), 3))
@@ -199,28 +198,28 @@ def shaken(rng, n, scale, noise):
 def test_movement_is_found_in_any_unit(rng, scale):
     n = 5000
     stamp_ns = np.arange(1, n + 1) * 10_000_000
-    found = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
+    stillness = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
     # 50 s in cells of half a second: the middle fifth is 20..30 s, on the edges of cells.
-    assert [(t0 * 1e-9, t1 * 1e-9) for t0, t1 in found.moving_ns] == [
+    assert [(t0 * 1e-9, t1 * 1e-9) for t0, t1 in stillness.moving_ns] == [
         (pytest.approx(20.01), pytest.approx(30.01))
     ]
     # The mean over 2 s of noise of 0.1 % has an sd of 0.1 % / sqrt(200).
-    assert found.magnitude == pytest.approx(scale, rel=3e-4)
-    assert found.noise == pytest.approx(1e-3 * scale, rel=0.1)
-    assert found.still_s == pytest.approx(40.0, abs=0.5)
+    assert stillness.magnitude == pytest.approx(scale, rel=3e-4)
+    assert stillness.noise == pytest.approx(1e-3 * scale, rel=0.1)
+    assert stillness.still_s == pytest.approx(40.0, abs=0.5)
 
 
 def test_a_sensor_that_shows_no_noise_is_not_moving(rng):
-    # Rounded to steps larger than the noise, the value changes by a step from time to time.
+    # A value rounded to steps larger than the noise changes by a step from time to time.
     accel = np.tile([0.0, 0.0, 1.0], (1000, 1))
     accel[::97, 0] = 0.1
-    found = find_stillness(np.arange(1000) * 10_000_000, accel)
-    assert found.moving_ns == ()
-    assert found.magnitude == pytest.approx(1.0, rel=1e-3)
+    stillness = find_stillness(np.arange(1000) * 10_000_000, accel)
+    assert stillness.moving_ns == ()
+    assert stillness.magnitude == pytest.approx(1.0, rel=1e-3)
 
 
 def test_too_short_to_tell():
-    found = find_stillness(np.arange(5), np.ones((5, 3)))
-    assert np.isnan(found.magnitude)
-    assert found.moving_ns == ()
+    stillness = find_stillness(np.arange(5), np.ones((5, 3)))
+    assert np.isnan(stillness.magnitude)
+    assert stillness.moving_ns == ()
     assert np.isnan(find_stillness(np.arange(1), np.ones((1, 3))).magnitude)

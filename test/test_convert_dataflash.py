@@ -29,8 +29,6 @@ STEP_US = 20_000
 
 
 class DataflashWriter:
-    """A minimal DataFlash log: formats, then messages."""
-
     def __init__(self):
         self.body = b''
         self.types = {}
@@ -150,7 +148,7 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
 @pytest.mark.parametrize(
     ('course', 'kept', 'share'),
     [
-        # Switched on in flight, then off.
+        # INS_TCAL1_ENABLE is switched on in flight, then off.
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
         # WHY: a log of the learning was refused, because ArduPilot sets 1 after it.
@@ -159,7 +157,7 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
 )
 def test_what_was_corrected_is_left_out(tmp_path, rng, course, kept, share):
     path = tmp_path / 'log.BIN'
-    force = write_new(path, rng, [('INS_TCAL1_ENABLE', *one) for one in course])
+    force = write_new(path, rng, [('INS_TCAL1_ENABLE', *step) for step in course])
     read = read_autopilot(path)
     np.testing.assert_array_equal(read.accel, force[0][kept])
     assert f'INS_TCAL1_ENABLE was 1 for {share} % of the samples' in read.chosen
@@ -178,7 +176,7 @@ def test_torn_log_is_read_up_to_the_tear(tmp_path, rng):
     path = tmp_path / 'torn.BIN'
     force = write_new(path, rng)
     whole = path.read_bytes()
-    # 40 bytes into the last message of the last IMU row.
+    # The cut is 40 bytes into the last message of the last IMU row.
     cut = whole.rindex(b'\xa3\x95\x81') + 40
     path.write_bytes(whole[:cut])
     log = read_autopilot(path, imu=1)
@@ -207,7 +205,7 @@ def test_other_files_are_refused(tmp_path, content):
     ('columns', 'message'),
     [
         (NEW_IMU[1].replace('GH', 'EG'), 'format of IMU has a column twice'),
-        (NEW_IMU[1], 'format of IMU is longer than it says'),
+        (NEW_IMU[1], 'format of IMU is longer than its stated length'),
     ],
 )
 def test_damaged_formats_are_refused(tmp_path, rng, columns, message):

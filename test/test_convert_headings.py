@@ -53,14 +53,13 @@ def test_what_is_no_date_is_no_stamp(text):
 
 
 def times(kind):
-    """Write the stamps of the rows in a program's format."""
     if kind == 'pandas':
         zone = timezone(timedelta(hours=2))
         ticks = (START.astimezone(zone) + timedelta(microseconds=k * 10**4) for k in range(N))
-        return [str(one) for one in ticks]
+        return [str(tick) for tick in ticks]
     if kind == 'actipy':
         ticks = (START + timedelta(microseconds=k * 10**4) for k in range(N))
-        return [f'{one:%Y-%m-%d %H:%M:%S.%f}'[:-3] + '+0000 [Europe/London]' for one in ticks]
+        return [f'{tick:%Y-%m-%d %H:%M:%S.%f}'[:-3] + '+0000 [Europe/London]' for tick in ticks]
     if kind == 'epoch':
         return [f'{START_NS // 10**9 + k / 100:.2f}' for k in range(N)]
     return [str(START_NS + k * STEP_NS) for k in range(N)]
@@ -120,26 +119,26 @@ def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
     columns = {'label': ['walk'] * N, 'timestamp': time, 'temperature': np.full(N, 20.5)}
     columns |= {f'acc_{axis}': accel[:, k] for k, axis in enumerate('xyz')}
     pq.write_table(pa.table(columns), tmp_path / 'log.parquet')
-    found = guess_columns(tmp_path / 'log.parquet')
-    assert found.accel.unit == 'g'
-    log = table_log(tmp_path / 'log.parquet', found)
+    guess = guess_columns(tmp_path / 'log.parquet')
+    assert guess.accel.unit == 'g'
+    log = table_log(tmp_path / 'log.parquet', guess)
     assert log.stamp_ns.tolist() == stamp_ns.tolist()
     np.testing.assert_array_equal(log.accel, accel)
     assert log.temperatures['board'].celsius[0] == 20.5
 
 
 def test_the_right_triad_and_thermometers_are_taken():
-    found = read_headings(
+    names = read_headings(
         [
             *('now[ms]', 'magx', 'magy', 'magz', 'linear_acc_x', 'linear_acc_y', 'linear_acc_z'),
             *('acc_x [mg]', 'acc_y [mg]', 'acc_z [mg]', 'gx[deg/s]', 'gy[deg/s]', 'gz[deg/s]'),
             *('gtemp', 'AHT_tmp[C]', 'BMP_temp[K]'),
         ]
     )
-    assert (found.time, found.time_unit, found.accel_unit) == ('now[ms]', 'ms', 'mg')
-    assert found.accel == ('acc_x [mg]', 'acc_y [mg]', 'acc_z [mg]')
-    assert (found.gyro, found.gyro_unit) == (('gx[deg/s]', 'gy[deg/s]', 'gz[deg/s]'), 'deg/s')
-    assert found.thermometers == {
+    assert (names.time, names.time_unit, names.accel_unit) == ('now[ms]', 'ms', 'mg')
+    assert names.accel == ('acc_x [mg]', 'acc_y [mg]', 'acc_z [mg]')
+    assert (names.gyro, names.gyro_unit) == (('gx[deg/s]', 'gy[deg/s]', 'gz[deg/s]'), 'deg/s')
+    assert names.thermometers == {
         'board': ('gtemp', 'degC'),
         'case': ('AHT_tmp[C]', 'degC'),
         't2': ('BMP_temp[K]', 'K'),
@@ -175,8 +174,8 @@ def test_the_guessed_map_is_printed(tmp_path, rng, cli):
     accel = UP + 0.002 * rng.standard_normal(UP.shape)
     rows = [f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f}' for k, (x, y, z) in enumerate(accel)]
     (tmp_path / 'log.csv').write_text('\n'.join(['time (s),ax,ay,az', *rows]))
-    said = cli('convert', tmp_path / 'log.csv', '-o', tmp_path / 'bag').stdout
-    head, *lines = said.splitlines()
+    printed = cli('convert', tmp_path / 'log.csv', '-o', tmp_path / 'bag').stdout
+    head, *lines = printed.splitlines()
     assert 'guessed column map; if it is wrong, edit it and give it as --columns' in head
     own = yaml.safe_load('\n'.join(takewhile(lambda line: line.startswith('  '), lines)))
     assert own['stamp'] == {'column': 'time (s)', 'unit': 's'}
@@ -202,17 +201,17 @@ def write(path, rng, unit, **columns):
 
 
 @pytest.mark.parametrize(
-    ('unit', 'said'), [(9.80665, 'm/s^2'), (1.0, 'g'), (1000.0, 'mg'), (4096.0, 'counts')]
+    ('unit', 'text'), [(9.80665, 'm/s^2'), (1.0, 'g'), (1000.0, 'mg'), (4096.0, 'counts')]
 )
-def test_the_unit_is_that_of_gravity(tmp_path, rng, unit, said):
+def test_the_unit_is_that_of_gravity(tmp_path, rng, unit, text):
     path = write(tmp_path / 'log.txt', rng, unit, time=0.01 * np.arange(len(UP)))
     columns = guess_columns(path)
-    assert spoken_columns(columns) == f'time [s], x y z [{said}]'
+    assert spoken_columns(columns) == f'time [s], x y z [{text}]'
     log = table_log(path, columns)
-    assert log.input == ('counts' if said == 'counts' else 'imu')
+    assert log.input == ('counts' if text == 'counts' else 'imu')
     write_log(log, tmp_path / 'bag.mcap')
     force = read_recording(tmp_path / 'bag.mcap', require=('accel',)).columns.accel
-    expected = unit if said == 'counts' else 9.80665
+    expected = unit if text == 'counts' else 9.80665
     np.testing.assert_allclose(np.linalg.norm(force, axis=1), expected, rtol=0.02)
 
 
@@ -267,17 +266,18 @@ def test_a_hand_s_turns_tell_the_unit_of_the_rate(tmp_path, rng, fastest, unit):
 def test_what_does_not_tell_itself_is_asked_for(tmp_path, rng):
     path = tmp_path / 'log.txt'
     time = 0.01 * np.arange(len(UP))
-    with pytest.raises(RecordingError, match='it has no times; give --rate-hz'):
-        guess_columns(write(path, rng, 9.8))
-    with pytest.raises(RecordingError, match='its column 0 has the times'):
-        guess_columns(write(path, rng, 9.8, time=time), 100.0)
-    with pytest.raises(RecordingError, match='its column 0 is not a rising time'):
-        guess_columns(write(path, rng, 9.8, time=time[::-1]))
-    with pytest.raises(RecordingError, match=r'not gravity in any known unit: give a column map'):
-        guess_columns(write(path, rng, 3.3, time=time))
-    path.write_text('t,a,b,c\n' + '0,0,0,9.8\n' * 100)
-    with pytest.raises(RecordingError, match='its headings name no accelerometer'):
-        guess_columns(path)
-    path.write_text('0 0 0 9.8 20\n' * 100)
-    with pytest.raises(RecordingError, match='5 columns without headings cannot be identified'):
-        guess_columns(path)
+    for size, columns, rate_hz, reason in (
+        (9.8, {}, None, 'the table has no times; give --rate-hz'),
+        (9.8, {'time': time}, 100.0, 'its column 0 has the times'),
+        (9.8, {'time': time[::-1]}, None, 'its column 0 is not a rising time'),
+        (3.3, {'time': time}, None, 'not gravity in any known unit: give a column map'),
+    ):
+        with pytest.raises(RecordingError, match=reason):
+            guess_columns(write(path, rng, size, **columns), rate_hz)
+    for content, reason in (
+        ('t,a,b,c\n' + '0,0,0,9.8\n' * 100, 'its headings name no accelerometer'),
+        ('0 0 0 9.8 20\n' * 100, '5 columns without headings cannot be identified'),
+    ):
+        path.write_text(content)
+        with pytest.raises(RecordingError, match=reason):
+            guess_columns(path)

@@ -69,11 +69,8 @@ def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path, separator):
 def test_a_column_may_begin_late(tmp_path):
     # WHY: a thermometer that reports later than the accelerometer is the last column.
     rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
-    table = read_text(
-        write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows])),
-        ['t', 'celsius'],
-        ROWS_ALONE,
-    )
+    path = write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows]))
+    table = read_text(path, ['t', 'celsius'], ROWS_ALONE)
     np.testing.assert_array_equal(table.values['t'], np.arange(60.0))
     assert np.isnan(table.values['celsius'][:20]).all()
     assert table.values['celsius'][20] == 40.0
@@ -207,19 +204,14 @@ def test_stamps_that_ros_cannot_hold(tmp_path, suffix, unit):
         pq.write_table(pa.table(columns), path)
         return path
 
-    chart = build(
-        ColumnMap,
-        {
-            'stamp': {'column': 't', 'unit': unit},
-            'accel': {'columns': ['x', 'y', 'z'], 'unit': 'm/s^2', 'output': 'imu'},
-        },
-    )
+    accel = {'columns': ['x', 'y', 'z'], 'unit': 'm/s^2', 'output': 'imu'}
+    chart = build(ColumnMap, {'stamp': {'column': 't', 'unit': unit}, 'accel': accel})
     for stamps in (rows, good + bad[1:]):
         report = write_log(table_log(written(stamps), chart), tmp_path / 'bag.mcap', force=True)
         left_out = report.findings['out_of_range'].count + report.findings['non_numeric'].count
         assert (report.messages['accel'], left_out) == (40, len(stamps) - 40)
         bag = read_recording(tmp_path / 'bag.mcap', Topics(input='imu'), require=('accel',))
-        found = bag.columns.accel_stamp_ns
-        assert found.tolist() == [stamp * scale for stamp in good]
+        accel_stamp_ns = bag.columns.accel_stamp_ns
+        assert accel_stamp_ns.tolist() == [stamp * scale for stamp in good]
     with pytest.raises(RecordingError, match=r'before 1970 or after January 2038|holds numbers'):
         write_log(table_log(written(bad[1:]), chart), tmp_path / 'none.mcap')

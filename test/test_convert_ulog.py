@@ -29,8 +29,6 @@ STEP_US = 10_000
 
 
 class UlogWriter:
-    """A minimal ULog: header, flag bits, formats, subscriptions, data."""
-
     def __init__(self, *formats):
         self.body = b'ULog\x01\x12\x35\x01' + struct.pack('<Q', 0)
         self.message('B', bytes(40))
@@ -67,12 +65,8 @@ def write_two_imus(path, rng, gyro_every=1):
         now = 5_000_000 + k * STEP_US
         for i, number in enumerate(ids):
             x, y, z = force[i][k]
-            log.data(
-                number,
-                struct.pack(
-                    '<QQIffffI3B', now + 400, now + i, 77 + i, x, y, z, celsius[i][k], 0, 0, 0, 0
-                ),
-            )
+            row = (now + 400, now + i, 77 + i, x, y, z, celsius[i][k], 0, 0, 0, 0)
+            log.data(number, struct.pack('<QQIffffI3B', *row))
         if k % gyro_every == 0:
             log.data(gyro_id, struct.pack('<QQfff', now + 400, now, 0.001 * k, 0.0, -0.5))
         if k % 50 == 0:
@@ -159,15 +153,18 @@ def test_torn_log_is_read_up_to_the_tear(flight):
     np.testing.assert_array_equal(read.accel, truth['force'][0][:n])
 
 
+def refused(folder, content, message):
+    (folder / 'refused.ulg').write_bytes(content)
+    with pytest.raises(RecordingError, match=message):
+        read_autopilot(folder / 'refused.ulg')
+
+
 def test_simulator_is_refused(tmp_path):
     log = UlogWriter(OLD_ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k in range(N):
         log.data(number, struct.pack('<Qffff', 1_000_000 + k * STEP_US, 0.0, 0.0, -9.80665, 35.0))
-    path = tmp_path / 'sitl.ulg'
-    path.write_bytes(log.body)
-    with pytest.raises(RecordingError, match=r'no noise at all.*simulator'):
-        read_autopilot(path)
+    refused(tmp_path, log.body, r'no noise at all.*simulator')
 
 
 COMBINED = 'sensor_combined:uint64_t timestamp;float[3] gyro_rad;uint32_t gyro_integral_dt;'
@@ -219,9 +216,9 @@ def test_the_combined_sensor_stands_in(tmp_path, rng, cli):
     # The barometer's thermometer is the only one, so it must become the board's.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, 40.0 + np.arange(6))
     assert 'case' not in read.temperatures
-    said = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
-    assert 'sensor_accel is missing' in said
-    assert 'add 4 to SDLOG_PROFILE' in said
+    printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
+    assert 'sensor_accel is missing' in printed
+    assert 'add 4 to SDLOG_PROFILE' in printed
 
 
 def test_a_combined_sensor_that_px4_compensated_is_refused(tmp_path, rng):
@@ -252,32 +249,23 @@ def test_a_log_of_1_hz_says_what_it_is_good_for(tmp_path, rng, cli):
         log.data(number, struct.pack('<Qffff', (1 + k) * 1_000_000, *force, 31.5 + 0.01 * k))
     path = tmp_path / 'slow.ulg'
     path.write_bytes(log.body)
-    said = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
-    assert '1 Hz: good for soaks of minutes' in said
-    assert 'sensor_accel at 10 Hz' in said
+    printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
+    assert '1 Hz: good for soaks of minutes' in printed
+    assert 'sensor_accel at 10 Hz' in printed
 
 
 def test_log_without_an_accelerometer(tmp_path):
     log = UlogWriter(BARO)
     log.data(log.subscribe('sensor_baro', 0), struct.pack('<QQIffI', 1, 1, 9, 1e5, 20.0, 0))
-    path = tmp_path / 'baro.ulg'
-    path.write_bytes(log.body)
-    with pytest.raises(RecordingError, match='the log holds no IMU'):
-        read_autopilot(path)
+    refused(tmp_path, log.body, 'the log holds no IMU')
 
 
-@pytest.mark.parametrize('content', [b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10])
-def test_other_files_are_refused(tmp_path, content):
-    path = tmp_path / 'other.ulg'
-    path.write_bytes(content)
-    with pytest.raises(RecordingError, match='not a ULog file'):
-        read_autopilot(path)
+def test_other_files_are_refused(tmp_path):
+    for content in (b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10):
+        refused(tmp_path, content, 'not a ULog file')
 
 
 def test_format_without_a_time_stamp_is_left_out(tmp_path):
     log = UlogWriter('sensor_accel:float x;float y;float z;')
     log.data(log.subscribe('sensor_accel', 0), struct.pack('<fff', 0.0, 0.0, 1.0))
-    path = tmp_path / 'damaged.ulg'
-    path.write_bytes(log.body)
-    with pytest.raises(RecordingError, match=r'not a ULog file|holds no IMU'):
-        read_autopilot(path)
+    refused(tmp_path, log.body, r'not a ULog file|holds no IMU')

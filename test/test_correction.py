@@ -60,15 +60,12 @@ def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
             for name in ('group', 'kind', 'sensor', 'tau_s', 'width_k', 'power', 'during')
         }
         edge = 1.0 if column.kind == 'gradient_even' else 4.0 + 4.0 * rng.random()
-        terms.append(
-            ResponseTerm(
-                **keys, range=(-edge, edge), bias=tuple(bias.tolist()), scale=tuple(scale.tolist())
-            )
-        )
-    one = axis_set((0.0, 0.3, 1e-3), (1.0, 7e-5), residual_sd_m_s2=1e-5)
+        weights = {'bias': tuple(bias.tolist()), 'scale': tuple(scale.tolist())}
+        terms.append(ResponseTerm(**keys, range=(-edge, edge), **weights))
+    static = axis_set((0.0, 0.3, 1e-3), (1.0, 7e-5), residual_sd_m_s2=1e-5)
     two = axis_set((0.0, 0.3, 2e-3), (1.0, 6e-5), delta=0.05)
     unit = calibration(
-        static=regime_set(one, one, one),
+        static=regime_set(static, static, static),
         dynamic=regime_set(two, two, two),
         sensors=SENSORS,
         response=tuple(terms),
@@ -110,7 +107,7 @@ def assert_same(blocks, rows):
 def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
-    # Within 5 .. 35 degC, along the tangent, and beyond the quarter of the span.
+    # The run passes 5 .. 35 degC, the tangents of the curves, and the quarter of the span beyond.
     events = run_of(rng, seconds=50, swing_k=75.0)
     rows = stream(Compensator(unit, UNCHECKED), events)[0]
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
@@ -134,13 +131,13 @@ def test_columns_of_one_axis_leave_every_bit_of_the_others(rng):
 def states_of(unit, rng, n=5):
     """Return a tracker in the middle of a run, and states of the run."""
     tracker = ThermalTracker(unit.detector, Correction(unit).memory)
-    found = []
+    collected = []
     for k, (kind, stamp, value) in enumerate(run_of(rng, seconds=1200, rate=1)):
         if kind != 'accel':
             tracker.read(kind, stamp, value)
         if k % (4800 // n) == 4799 // n:
-            found.append((stamp, tracker.sample(stamp), tracker.memory.start_shares(stamp)))
-    return tracker, found
+            collected.append((stamp, tracker.sample(stamp), tracker.memory.start_shares(stamp)))
+    return tracker, collected
 
 
 def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_posterior(rng):
@@ -176,9 +173,9 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
     for k, state in enumerate(pair.T.tolist()):
         for axis, (a, b, c) in enumerate(np.reshape(slow.at(state, nobody), (3, 3))):
             for x in (-9.8, 0.0, 9.8):
-                found = np.var(scatter[:, 0, axis, k] + scatter[:, 1, axis, k] * x)
+                variance = np.var(scatter[:, 0, axis, k] + scatter[:, 1, axis, k] * x)
                 # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %: 4 sigma.
-                assert a + b * x + c * x * x == pytest.approx(found, rel=0.33)
+                assert a + b * x + c * x * x == pytest.approx(variance, rel=0.33)
 
 
 def drawn(unit, layout, d):
@@ -192,28 +189,22 @@ def drawn(unit, layout, d):
 
     def moved(regime_set_, start):
         axes = []
-        for axis, one in enumerate(regime_set_.axes()):
+        for axis, curves in enumerate(regime_set_.axes()):
             bias, scale = start(layout.bias[axis]), start(layout.scale[axis])
-            fs, fc = one.bias_function, one.scale_function
+            fs, fc = curves.bias_function, curves.scale_function
             bias_function = fs.with_free(moved_by(fs.free_coefficients, bias + 1), 0.0)
             scale_function = fc.with_free(moved_by(fc.free_coefficients, scale + 1), 1.0)
-            axes.append(
-                replace(
-                    one,
-                    delta=one.delta + d[bias],
-                    bias_function=bias_function,
-                    scale_function=scale_function,
-                )
-            )
+            axes.append(replace(curves, delta=curves.delta + d[bias], bias_function=bias_function,
+                                scale_function=scale_function))  # fmt: skip
         return replace(regime_set_, x=axes[0], y=axes[1], z=axes[2])
 
     response = tuple(
         replace(
-            one,
-            bias=tuple(w + d[layout.bias[i].response + k] for i, w in enumerate(one.bias)),
-            scale=tuple(w + d[layout.scale[i].response + k] for i, w in enumerate(one.scale)),
+            term,
+            bias=tuple(w + d[layout.bias[i].response + k] for i, w in enumerate(term.bias)),
+            scale=tuple(w + d[layout.scale[i].response + k] for i, w in enumerate(term.scale)),
         )
-        for k, one in enumerate(unit.response)
+        for k, term in enumerate(unit.response)
     )
     return replace(
         unit,
@@ -236,14 +227,14 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     state = np.array(state)
     moved = np.repeat(state[:, np.newaxis], len(draws), axis=1)
     wide = replace(
-        unit, response=tuple(replace(one, range=(-4000.0, 4000.0)) for one in unit.response)
+        unit, response=tuple(replace(term, range=(-4000.0, 4000.0)) for term in unit.response)
     )
     # Squares of lags are nonlinear: the spread is tested for small changes.
     small = 0.05
     moved[places] += small * (draws * np.array(shares)).T
-    found = Correction(wide).bias_scale(moved)
+    values = Correction(wide).bias_scale(moved)
     for axis, (a, b, c) in enumerate(np.reshape(slow, (3, 3))):
-        bias, scale = found[:, axis]
+        bias, scale = values[:, axis]
         for x in (-9.8, 0.0, 9.8):
             expected = np.var(bias / 300.0 + scale / 300.0 * x) / small**2
             # 4000 draws: 2.2 %; 4 sigma.
@@ -256,27 +247,27 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
     compensator = Compensator(unit, UNCHECKED)
     noise = compensator.thermal.correction.noise[0]
     begin = 1_000_000_000_003
-    found = []
+    collected = []
     for k in range(120):
         stamp = begin * 1_000 + k * SECOND_NS
         flicker = 1e-5 * (-1) ** k
         compensator.push('board', stamp, 20.0 + flicker)
         compensator.push('case', stamp, 20.0 - flicker)
         row = compensator.process(stamp, 0.0, 0.0, 1.0)
-        found.append((stamp, row[3] - noise))
+        collected.append((stamp, row[3] - noise))
     last = {}
     sd = 0.387 * 30.0 / 300.0
-    for stamp, variance in found[30:]:
+    for stamp, variance in collected[30:]:
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
         # Within a span only the thermometer's part changes, 30 counts/K of some mK.
-        own = (30.0 / 300.0 * 0.005) ** 2
+        part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
-        age = (stamp - found[0][0]) * 1e-9 + 1.0
+        age = (stamp - collected[0][0]) * 1e-9 + 1.0
         expected = (sd * math.exp(-age / 60.0)) ** 2
-        assert variance == pytest.approx(expected, rel=0.01, abs=own)
-        assert [v for _, v in span] == pytest.approx([variance] * len(span), abs=own)
+        assert variance == pytest.approx(expected, rel=0.01, abs=part)
+        assert [v for _, v in span] == pytest.approx([variance] * len(span), abs=part)
 
 
 def test_a_further_sensor_that_is_lost_is_paid_for():
@@ -356,7 +347,7 @@ def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
         response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
     )  # fmt: skip
     assert sd_at(unit, 35.0) == pytest.approx(1e-6, rel=1e-6)
-    # Times the factor far outside, for 6 K of half a range of 15 K.
+    # The sd of the slope times the factor for 6 K outside, of half a range of 15 K.
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
 
@@ -384,7 +375,7 @@ def test_beyond_the_range_curves_go_on_along_their_tangent_for_a_quarter_of_the_
     one, two = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
     unit = calibration(static=regime_set(one), dynamic=regime_set(two))
     for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
-        at_edge, *found = np.moveaxis(
+        at_edge, *outside = np.moveaxis(
             curves_at(unit, edge + sign * np.array([0.0, 1e-9, 3.0, 7.5, 7.5 + 1e-9, 300.0])), 2, 0
         )
         t = edge - 20.0
@@ -392,7 +383,7 @@ def test_beyond_the_range_curves_go_on_along_their_tangent_for_a_quarter_of_the_
             [np.polynomial.Polynomial(c).deriv()(t) for c in rows]
             for rows in ((BENT, (1.0, 1e-4, 2e-6)), (WAVY, (1.0, 5e-5)))
         ]
-        for value, beyond in zip(found, (1e-9, 3.0, 7.5, 7.5, 7.5), strict=True):
+        for value, beyond in zip(outside, (1e-9, 3.0, 7.5, 7.5, 7.5), strict=True):
             expected = at_edge + sign * beyond * np.array(slopes)
             np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
 
@@ -436,12 +427,12 @@ def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng)
         Correction(each).bias_scale(states) for each in (drawn(unit, layout, change), unit)
     )
     regressors = Correction(unit).curves.regressors(states, np.zeros((0, 9)))
-    found = moved - nominal
-    found[1] /= 300.0
+    moved_by = moved - nominal
+    moved_by[1] /= 300.0
     for axis in range(3):
         for block, of, row in (
-            (layout.bias[axis], regressors[axis], found[0, axis]),
-            (layout.scale[axis], regressors[axis + 3], found[1, axis]),
+            (layout.bias[axis], regressors[axis], moved_by[0, axis]),
+            (layout.scale[axis], regressors[axis + 3], moved_by[1, axis]),
         ):
             expected = change[block.static : block.end] @ of
             np.testing.assert_allclose(row, expected, rtol=1e-9, atol=1e-12)

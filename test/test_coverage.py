@@ -47,7 +47,7 @@ def test_columns_are_the_derivatives_of_the_measured_force(rng):
     for k, step_of in enumerate(step * np.eye(9)):
         slope = (force(step_of) - force(-step_of)) / (2.0 * step)
         np.testing.assert_allclose(force_columns(up)[:, :, k], slope, atol=1e-9)
-        norm = [np.linalg.norm(force(one), axis=1) for one in (step_of, -step_of)]
+        norm = [np.linalg.norm(force(step), axis=1) for step in (step_of, -step_of)]
         np.testing.assert_allclose(
             norm_columns(up)[:, k], (norm[0] - norm[1]) / (2.0 * step), atol=1e-9
         )
@@ -89,7 +89,7 @@ def test_the_next_direction_lowers_the_mean_variance(n, rng):
     proposed = next_direction(covariance, SD, up)
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
-    others = [before - mean_variance(np.vstack([up, one]), at) for one in units(rng, 300)]
+    others = [before - mean_variance(np.vstack([up, unit]), at) for unit in units(rng, 300)]
     # An easily held face is chosen even with half the benefit of the best direction.
     assert gain > 0.45 * max(others)
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
@@ -102,7 +102,7 @@ def test_who_follows_the_proposals_gets_a_good_test():
         up = np.vstack([up, next_direction(covariance, SD, up)])
     # First the faces, starting upright; then directions that determine the misalignment.
     assert up[0].tolist() == [0.0, 0.0, 1.0]
-    assert {tuple(one) for one in up[:6]} == {tuple(one) for one in FACES}
+    assert {tuple(row) for row in up[:6]} == {tuple(face) for face in FACES}
     proposed = worst_sd(constants_covariance(up, np.full(18, SD)))
     spread = worst_sd(constants_covariance(positions(18), np.full(18, SD)))
     assert proposed < 1.1 * spread

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Degenerate inputs through the real commands: those that once needed gigabytes, hung, or lost data
+Degenerate inputs through the real commands: inputs that once needed gigabytes, hung, or lost data
 silently.
 
 `benchmarks/degenerate.py` runs every command on every input.
@@ -14,18 +14,12 @@ import pytest
 @pytest.mark.parametrize(
     ('name', 'command'),
     [
-        ('jump of a year', 'evaluate'),
-        ('jump from 1970', 'fit'),
-        ('equal stamps', 'replay'),
-        ('reversed stamps', 'fit'),
-        ('stamps of the limits', 'info'),
-        ('one sample', 'fit'),
-        ('all zeros', 'fit'),
-        ('readings of one stamp', 'info'),
-        ('all values 1e308', 'report'),
-        ('name not UTF-8', 'replay'),
+        ('jump of a year', 'evaluate'), ('jump from 1970', 'fit'), ('equal stamps', 'replay'),
+        ('reversed stamps', 'fit'), ('stamps of the limits', 'info'), ('one sample', 'fit'),
+        ('all zeros', 'fit'), ('readings of one stamp', 'info'),
+        ('all values 1e308', 'report'), ('name not UTF-8', 'replay'),
     ],
-)
+)  # fmt: skip
 def test_it_ends_with_a_sentence_in_bounded_memory(name, command, tmp_path):
     folder = tmp_path / 'in' / 'unit'
     folder.mkdir(parents=True)
@@ -38,7 +32,7 @@ def test_it_ends_with_a_sentence_in_bounded_memory(name, command, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('name', 'said'),
+    ('name', 'text'),
     [
         ('zeros by turns', '50 % of its samples are exactly zero, between others: two sources'),
         ('no acceleration in it', '(linear_acceleration_covariance[0] = -1): another topic'),
@@ -50,10 +44,10 @@ def test_it_ends_with_a_sentence_in_bounded_memory(name, command, tmp_path):
         ('axes that lean', 'with one unit for three axes at right angles?'),
     ],
 )
-def test_the_cause_is_said_in_the_users_words(name, said, tmp_path, cli):
+def test_the_cause_is_said_in_the_users_words(name, text, tmp_path, cli):
     path = degenerate.INPUTS[name].make(tmp_path)
     failed = cli('fit', path, '--gravity', '9.81', '-o', tmp_path / 'out.yaml', code=1)
-    (line,) = [one for one in failed.stderr.splitlines() if ': error: ' in one]
-    assert said in line
+    (line,) = [text for text in failed.stderr.splitlines() if ': error: ' in text]
+    assert text in line
     # The message names the topic if it was chosen by its type.
     assert 'bag.mcap (/imu/data)' in line or name in {'stamps all zero', 'axes that lean'}

@@ -31,7 +31,7 @@ ELSEWHERE = (
 
 def commands():
     """Return page, command, and the output shown for it (empty for none)."""
-    found = []
+    collected = []
     for page in PAGES:
         for kind, text in FENCE.findall(page.read_text(encoding='utf-8')):
             if (page.name == 'cli.md' and kind == 'console') or kind not in ('console', 'sh'):
@@ -42,8 +42,8 @@ def commands():
                 line, _, output = part.partition('\n')
                 command = re.sub(r'\s+#.*', '', line).strip()
                 if command.startswith('thermo_comp ') and command not in ELSEWHERE:
-                    found.append((page.name, command, output if kind == 'console' else ''))
-    return found
+                    collected.append((page.name, command, output if kind == 'console' else ''))
+    return collected
 
 
 COMMANDS = commands()
@@ -80,7 +80,7 @@ def test_every_page_is_in_the_site_s_menu():
         if isinstance(entry, str):
             return [entry]
         inner = entry.values() if isinstance(entry, dict) else entry
-        return [page for one in inner for page in listed(one)]
+        return [page for part in inner for page in listed(part)]
 
     nav = yaml.safe_load((ROOT / 'mkdocs.yml').read_text())['nav']
     assert sorted(listed(nav)) == sorted(page.name for page in [*PAGES[1:], TUTORIAL])
@@ -105,10 +105,10 @@ def test_the_tutorial_prints_what_it_shows(monkeypatch):
             continue
         shown = ''.join(''.join(out.get('text', '')) for out in cell['outputs'])
         drawn = [out for out in cell['outputs'] if 'image/png' in out.get('data', {})]
-        said = io.StringIO()
-        with contextlib.redirect_stdout(said):
+        text = io.StringIO()
+        with contextlib.redirect_stdout(text):
             exec(''.join(cell['source']), names)  # noqa: S102 - our own page
-        assert is_alike(said.getvalue(), shown), said.getvalue()
+        assert is_alike(text.getvalue(), shown), text.getvalue()
         assert len(plt.get_fignums()) == len(drawn)
         n_figures += len(drawn)
         plt.close('all')

@@ -62,10 +62,10 @@ def test_the_node_finds_the_type_while_it_runs(peer, unit, is_file):
 
     def values(**expected):
         def look():
-            found = {one.key: one.value for array in heard for one in array.status[0].values}
+            shown = {value.key: value.value for array in heard for value in array.status[0].values}
             return all(
-                found.get(name, 'x').replace('.', '').lstrip('-').isdecimal()
-                and abs(float(found[name]) - value) < 1e-6
+                shown.get(name, 'x').replace('.', '').lstrip('-').isdecimal()
+                and abs(float(shown[name]) - value) < 1e-6
                 for name, value in expected.items()
             )
 
@@ -115,15 +115,15 @@ def test_a_drivers_imu_data_raw_needs_another_output(unit, capfd):
         *node_arguments(unit, 'topics:=imu=/imu/data_raw'),
     ]
     assert main(command) == 1
-    said = '/imu/data_raw: is both input and output: remap imu/data_raw to another name'
-    assert said in capfd.readouterr().err
+    text = '/imu/data_raw: is both input and output: remap imu/data_raw to another name'
+    assert text in capfd.readouterr().err
     names = 'imu=/imu/data_raw,output=/imu/compensated'
     with node_in_thread(*node_arguments(unit, f'topics:={names}')) as node:
         assert node.node.count_publishers('/imu/compensated') == 1
 
 
 def test_record_writes_them_as_temperatures(peer):
-    found = {}
+    outputs = {}
     pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
     messages = [
         ('accel', sample(START_NS)),
@@ -142,17 +142,17 @@ def test_record_writes_them_as_temperatures(peer):
             """
             Send each message after the previous one has arrived; return when all have arrived.
             """
-            if len(found) == len(sent) < len(messages):
+            if len(outputs) == len(sent) < len(messages):
                 role, message = messages[len(sent)]
                 sent.append(role)
                 publishers[role].publish(message)
             pause.wait(0.02)
-            return len(found) == len(messages) or time.monotonic() > deadline
+            return len(outputs) == len(messages) or time.monotonic() > deadline
 
         for news in live.blocks(wait):
             for role, own in news[0].raw.items() if news else ():
-                found.setdefault(role, []).extend(own)
-    case, board = (deserialize_message(found[one][0], Temperature) for one in ('case', 'board'))
+                outputs.setdefault(role, []).extend(own)
+    case, board = (deserialize_message(outputs[one][0], Temperature) for one in ('case', 'board'))
     # A reading without a stamp gets that of the previous sample.
     assert (case.temperature, case.header.stamp.sec) == (23.0, START_NS // SECOND_NS)
     assert (board.temperature, board.header.stamp.nanosec) == (25.0, 5)
@@ -165,10 +165,10 @@ def test_a_live_field_reads_what_rclpy_wrote():
         field = LiveField('/pack', 'sensor_msgs/msg/BatteryState', path)
         assert field.read(data) == (START_NS + 7, value)
     assert LiveField('/pack', 'sensor_msgs/msg/BatteryState', 'cell_voltage[3]').read(data) is None
-    for kind, path, said in (
+    for kind, path, text in (
         ('px4_msgs/msg/SensorAccel', 'temperature', '/t: its type px4_msgs.* is not installed'),
         ('sensor_msgs/msg/Imu', 'temperature', 'Imu has no number `temperature`'),
         ('sensor_msgs/msg/Imu', 'header', 'Imu has no number `header`'),
     ):
-        with pytest.raises(ThermoCompError, match=said):
+        with pytest.raises(ThermoCompError, match=text):
             LiveField('/t', kind, path)

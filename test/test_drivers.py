@@ -80,14 +80,13 @@ BIAS, SLOPE, NOISE = np.array([0.05, -0.03, 0.08]), np.array([1e-3, -2e-3, 3e-3]
 
 @pytest.fixture(scope='module')
 def store():
-    found = get_typestore(Stores.ROS2_JAZZY)
+    types = get_typestore(Stores.ROS2_JAZZY)
     for kind in reversed(OWN):
-        found.register(get_types_from_msg(OWN[kind], kind))
-    return found
+        types.register(get_types_from_msg(OWN[kind], kind))
+    return types
 
 
 def message(store, kind, stamp_ns, celsius, force):
-    """Make a message of a type."""
     types, zeros = store.types, np.zeros(9)
     header = types['std_msgs/msg/Header'](
         types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 10**9)), 'imu_link'
@@ -98,8 +97,8 @@ def message(store, kind, stamp_ns, celsius, force):
         still = vector(0.0, 0.0, 0.0)
         return types[kind](header, level, zeros, still, zeros, vector(*force), zeros)
     if kind == MIP:
-        own = types['microstrain_inertial_msgs/msg/MipHeader'](header, 0)
-        return types[kind](own, celsius - 1.0, celsius + 1.0, celsius)
+        head = types['microstrain_inertial_msgs/msg/MipHeader'](header, 0)
+        return types[kind](head, celsius - 1.0, celsius + 1.0, celsius)
     if kind == PX4:
         return types[kind](1, 1, 7, *force, celsius, 0, np.zeros(3, np.uint8), 1)
     if kind == MAGNETIC:
@@ -111,7 +110,7 @@ def message(store, kind, stamp_ns, celsius, force):
 
 @pytest.fixture
 def bag(request, tmp_path, store):
-    """Write a tumble with a driver's topics: samples at 10 Hz, the rest at 1 Hz."""
+    """Write a tumble with a driver's topics: samples at 10 Hz, other messages at 1 Hz."""
     path, noise = tmp_path / 'bag', np.random.default_rng(40)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         links = {
@@ -126,8 +125,8 @@ def bag(request, tmp_path, store):
                 if kind == IMU or row % RATE == 0:
                     # A barometer lags.
                     celsius = 20.0 + warmer - (2.0 if 'baro' in link.topic else 0.0)
-                    own = message(store, kind, stamp_ns, celsius, force)
-                    writer.write(link, stamp_ns + 1, store.serialize_cdr(own, kind))
+                    sent = message(store, kind, stamp_ns, celsius, force)
+                    writer.write(link, stamp_ns + 1, store.serialize_cdr(sent, kind))
     return path
 
 
@@ -135,7 +134,7 @@ def test_every_driver_has_a_layout_and_a_line_in_the_page():
     assert {path.stem for path in FILES} == LAYOUTS.keys()
     page = (ROOT / 'docs' / 'drivers.md').read_text()
     for path in FILES:
-        (line,) = [one for one in page.splitlines() if one.endswith(f'| `{path.stem}` |')]
+        (line,) = [row for row in page.splitlines() if row.endswith(f'| `{path.stem}` |')]
         for name, topic in read_names(path).items():
             assert name == 'output' or topic.partition(':')[0] in line, (path.stem, topic)
 
@@ -146,27 +145,27 @@ def test_every_driver_has_a_layout_and_a_line_in_the_page():
 def test_every_command_works_on_the_drivers_bag(path, bag, tmp_path, cli):
     names, topics = read_names(path), ('--topics', path)
     has_board = path.stem not in LACKS
-    told = cli('info', bag, *topics).stdout
-    assert f'{SECONDS * RATE} samples of imu, {RATE} Hz' in told
-    assert f'{len(UPS)} still intervals' in told
+    printed = cli('info', bag, *topics).stdout
+    assert f'{SECONDS * RATE} samples of imu, {RATE} Hz' in printed
+    assert f'{len(UPS)} still intervals' in printed
     # The thermometers are those of the file only; other numbers of their messages are not used.
-    assert re.findall(r'^(board|case) +1\.000 +(\S+) +(\S+)', told, re.MULTILINE) == [
+    assert re.findall(r'^(board|case) +1\.000 +(\S+) +(\S+)', printed, re.MULTILINE) == [
         (name, f'{20.0 - lag:.2f}', f'{46.2 - lag:.2f}')
         for name, lag in (('board', 0.0), ('case', 2.0))
         if name in names
     ]
-    assert 'is taken for board' not in told
-    assert ('no case temperature' in told) == ('case' not in names)
-    assert ('--topic case=TOPIC\n' in told) == ('case' not in names)
+    assert 'is taken for board' not in printed
+    assert ('no case temperature' in printed) == ('case' not in names)
+    assert ('--topic case=TOPIC\n' in printed) == ('case' not in names)
 
     fitted = tmp_path / 'unit.yaml'
     save_calibration(warming_unit(), tmp_path / 'warm.yaml')
     if path.stem in FITTED | LACKS:
-        said = cli('fit', bag, *topics, '-o', fitted, '--gravity', str(GRAVITY))
-        assert ('no temperature was recorded' in said.stdout) == (not has_board)
+        finished = cli('fit', bag, *topics, '-o', fitted, '--gravity', str(GRAVITY))
+        assert ('no temperature was recorded' in finished.stdout) == (not has_board)
         # The noise of a minute's mean is 4 ug; constants alone would leave 23 K of 1 mm/s^2 per K.
-        found = parsed(cli('evaluate', bag, '-c', fitted, *topics, '--json', code=None).stdout)
-        left = found['sections_m_s2']['all']['rms'] / MICRO_G
+        judged = parsed(cli('evaluate', bag, '-c', fitted, *topics, '--json', code=None).stdout)
+        left = judged['sections_m_s2']['all']['rms'] / MICRO_G
         assert left < 10.0 if has_board else 500.0 < left < 2500.0
     else:
         fitted = tmp_path / 'warm.yaml'
@@ -205,12 +204,12 @@ def test_the_node_works_as_the_file_says(path, tmp_path):
     layout = LAYOUTS[path.stem]
     save_calibration(warming_unit(), tmp_path / 'unit.yaml')
     words = [f'calibration_file:={tmp_path / "unit.yaml"}', f'topics:={path}', 'input:=imu']
-    with node_in_thread(*(word for one in words for word in ('-p', one))) as node:
-        heard_topics = {one.topic_name for one in node.node.subscriptions}
+    with node_in_thread(*(word for text in words for word in ('-p', text))) as node:
+        heard_topics = {subscription.topic_name for subscription in node.node.subscriptions}
         topics = {topic.partition(':')[0] for name, topic in names.items() if name != 'output'}
         board, _, field = names['board'].partition(':')
         if field:
-            # Its message package is not installed here; if it is, the type is looked up when the
+            # The message package is not installed here; an installed type is looked up when the
             # driver sends.
             assert topics - {board} <= heard_topics
             with pytest.raises(ThermoCompError, match=f'{board}: its type .* is not installed'):

@@ -46,13 +46,8 @@ def calibration_of(bias, **change):
 
 @pytest.fixture
 def cubic():
-    return calibration_of(
-        [
-            Polynomial((0.0, 1e-3, 2e-5, -3e-7)),
-            Polynomial((0.0, -2e-3)),
-            Polynomial((0.0, 5e-4, -1e-5)),
-        ]
-    )
+    curves = (0.0, 1e-3, 2e-5, -3e-7), (0.0, -2e-3), (0.0, 5e-4, -1e-5)
+    return calibration_of([Polynomial(curve) for curve in curves])
 
 
 @pytest.mark.parametrize('to', TOOLS)
@@ -125,8 +120,8 @@ def test_ardupilot_import_has_no_bias_where_it_was_calibrated(cubic):
 
 def test_the_angular_rate_goes_both_ways(cubic):
     curves = [(0.0, 2e-4, -3e-6, 1e-8), (0.0, -1e-4, 2e-6, 0.0), (0.0, 5e-5, 0.0, -2e-8)]
-    own = RateSet(*(RateCurve(Polynomial(curve)) for curve in curves))
-    gyroscope = Gyroscope((0.02, -0.01, 0.03), own, own, (1e-4,) * 3)
+    rates = RateSet(*(RateCurve(Polynomial(curve)) for curve in curves))
+    gyroscope = Gyroscope((0.02, -0.01, 0.03), rates, rates, (1e-4,) * 3)
     unit = replace(cubic, gyroscope=gyroscope)
     celsius = np.linspace(*unit.static.temperature_range_c, 7)
     true = np.array(gyroscope.bias_rad_s) + np.column_stack(
@@ -134,8 +129,8 @@ def test_the_angular_rate_goes_both_ways(cubic):
     )
 
     def again(text):
-        found = import_calibration(text, serial='7')
-        triad = rate_triad(found)
+        imported = import_calibration(text, serial='7')
+        triad = rate_triad(imported)
         return bias_and_scale(triad, ramp_states(triad, celsius))[0]
 
     px4 = export_calibration(unit, 'px4')
@@ -170,12 +165,10 @@ def test_the_angular_rate_goes_both_ways(cubic):
 
 def test_counts_are_divided_by_the_scale_factor(cubic):
     axes = Axes(*(AxisReference(300.0, 300.0 * bias) for bias in (0.1, -0.2, 0.3)))
-    scaled = [
-        replace(
-            one, bias_function=Polynomial(tuple(300.0 * c for c in one.bias_function.coefficients))
-        )
-        for one in cubic.static.axes()
-    ]
+    scaled = []
+    for axis in cubic.static.axes():
+        bias = Polynomial(tuple(300.0 * c for c in axis.bias_function.coefficients))
+        scaled.append(replace(axis, bias_function=bias))
     regime = RegimeSet((5.0, 45.0), (-2.0, 2.0), *scaled)
     counts = replace(
         cubic, unit=Unit('7', 'counts', 32767.0, 0.005), axes=axes, static=regime, dynamic=regime
@@ -198,7 +191,7 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic):
         re.search(r'scale over temperature is lost: up to 2.5e\+03 ppm', n) for n in plain.notes
     )
     # 100 ppm/K of 9.81 m/s^2 on z, nothing on x.
-    slope = [numbers(one.text, '\t')['TC_A0_X1_2'] for one in (plain, level)]
+    slope = [numbers(export.text, '\t')['TC_A0_X1_2'] for export in (plain, level)]
     assert slope[1] - slope[0] == pytest.approx(9.81e-4, rel=1e-5)
     assert numbers(plain.text, '\t')['TC_A0_X1_0'] == numbers(level.text, '\t')['TC_A0_X1_0']
 
@@ -278,12 +271,13 @@ def test_an_absent_set_and_an_empty_range_are_refused(cubic):
 
 
 def test_impossible_arguments_are_refused(cubic):
-    with pytest.raises(ValueError, match=r'`number` must be 0\.\.3, got 4'):
-        export_calibration(cubic, 'px4', number=4)
-    with pytest.raises(ValueError, match=r'`number` must be 1\.\.3, got 0'):
-        export_calibration(cubic, 'ardupilot', number=0)
-    with pytest.raises(ValueError, match='`up` must be a unit vector'):
-        export_calibration(cubic, 'px4', up=(0.0, 0.0, 9.81))
+    for to, given, reason in (
+        ('px4', {'number': 4}, r'`number` must be 0\.\.3, got 4'),
+        ('ardupilot', {'number': 0}, r'`number` must be 1\.\.3, got 0'),
+        ('px4', {'up': (0.0, 0.0, 9.81)}, '`up` must be a unit vector'),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            export_calibration(cubic, to, **given)
 
 
 @pytest.fixture
@@ -304,9 +298,8 @@ def ours(calibration, raw):
 
 
 def turn(notes):
-    """Build the rotation from the roll, pitch and yaw of a note, one axis at a time."""
-    said = next(note for note in notes if 'roll' in note)
-    roll, pitch, yaw = (float(number) for number in said.split()[-4:-1])
+    text = next(note for note in notes if 'roll' in note)
+    roll, pitch, yaw = (float(number) for number in text.split()[-4:-1])
     x = [[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]]
     y = [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
     z = [[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
@@ -357,7 +350,7 @@ def test_tumble_round_trip(tumbled, to):
 
 
 def test_a_file_that_imu_tk_saved_is_read():
-    # Six digits in columns, as its stream writes them; the formula by hand.
+    # imu_tk's stream writes columns of six digits; `theirs` is its formula by hand.
     text = (
         '          1 -0.00354989 -0.00890444\n          0           1 -0.0213032\n'
         '          0           0           1\n\n'
@@ -367,13 +360,8 @@ def test_a_file_that_imu_tk_saved_is_read():
     back = import_calibration(text, serial='7')
     assert back.unit.input == 'counts'
     x = (RAW - [33124.2, 33275.2, 32364.4]) * [0.00241278, 0.00242712, 0.00241168]
-    theirs = np.column_stack(
-        [
-            x[:, 0] - 0.00354989 * x[:, 1] - 0.00890444 * x[:, 2],
-            x[:, 1] - 0.0213032 * x[:, 2],
-            x[:, 2],
-        ]
-    )
+    theirs = x @ np.array([[1.0, -0.00354989, -0.00890444], [0.0, 1.0, -0.0213032],
+                           [0.0, 0.0, 1.0]]).T  # fmt: skip
     rotation = turn(back.provenance.notes)
     np.testing.assert_allclose(ours(back, RAW) @ rotation.T, theirs, atol=1e-4)
 
@@ -391,14 +379,14 @@ def test_a_full_matrix_is_taken_apart_into_ours_and_a_turn():
 
 
 def test_kalibr_without_bias_and_with_several_imus():
-    one = '  accelerometers:\n    M: [[1.01, 0, 0], [0.01, 0.99, 0], [0.02, -0.01, 1.02]]\n'
-    back = import_calibration(f'imu0:\n{one}  update_rate: 200.0\n', serial='7')
+    imu = '  accelerometers:\n    M: [[1.01, 0, 0], [0.01, 0.99, 0], [0.02, -0.01, 1.02]]\n'
+    back = import_calibration(f'imu0:\n{imu}  update_rate: 200.0\n', serial='7')
     assert back.unit.input == 'm/s^2'
     assert 'no bias' in back.provenance.notes[0]
     # M a by hand, with a = (1, 2, 3).
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
     with pytest.raises(CalibrationError, match='choose one of the IMUs: there are imu0, imu1'):
-        import_calibration(f'imu0:\n{one}imu1:\n{one}', serial='7')
+        import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')
 
 
 def test_px4_rates_of_different_degree_keep_their_own_reference(cubic):

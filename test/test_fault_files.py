@@ -84,14 +84,14 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
     options = ('--positions', '1', '--soak', '30min', '-o', small_disk)
     finished = cli('record', bag, *options, '-q', code=1)
     (line,) = finished.stderr.strip().splitlines()
-    found = re.fullmatch(
+    match = re.fullmatch(
         rf'thermo_comp: error: {small_disk}/01.mcap: cannot be written: No space left on device; '
         r'the part written is in (\S+)',
         line,
     )
-    assert found, line
+    assert match, line
     (kept,) = small_disk.iterdir()
-    assert kept.name == found[1]
+    assert kept.name == match[1]
     torn = read_recording(kept, require=['accel'])
     assert torn.info.truncated
     assert 1000 < len(torn.columns) < n
@@ -160,7 +160,7 @@ def test_a_killed_command_leaves_the_old_file(folder, name, point):
     # The file that remains has another name, which no tool takes for the output.
     assert rest.name.startswith('.')
     if point == 'before':
-        # It was complete already.
+        # The hidden file was complete already.
         if name == 'unit.yaml':
             assert load_calibration(rest).unit.serial
         elif name == 'bag.mcap':
@@ -182,12 +182,11 @@ def test_a_command_that_is_asked_to_end_leaves_nothing(folder, name):
 
 
 def rewritten(torn, whole):
-    """Write the readable part of a damaged bag as a complete bag."""
-    found = read_recording(torn).columns
+    columns = read_recording(torn).columns
     with BagWriter(whole) as bag:
-        bag.write_temperature('temperature/board', *found.temperatures['board'][:2])
-        bag.write_temperature('temperature/case', *found.temperatures['case'][:2])
-        bag.write_counts('accel/counts', found.accel_stamp_ns, found.accel, found.frame_id)
+        bag.write_temperature('temperature/board', *columns.temperatures['board'][:2])
+        bag.write_temperature('temperature/case', *columns.temperatures['case'][:2])
+        bag.write_counts('accel/counts', columns.accel_stamp_ns, columns.accel, columns.frame_id)
 
 
 def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder, cli):
@@ -200,9 +199,9 @@ def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder, cli):
         output = folder / f'{bag.stem}.yaml'
         finished = cli('fit', bag, FIT[1], *GRAVITY, '-o', output, code=code, cwd=folder)
         results.append((finished.stderr, load_calibration(output)))
-    (said, from_torn), (nothing, from_whole) = results
-    assert f'torn.mcap: the file is cut off at byte {len(content) // 2}: ' in said
+    (text, from_torn), (nothing, from_whole) = results
+    assert f'torn.mcap: the file is cut off at byte {len(content) // 2}: ' in text
     assert 'torn.mcap' not in nothing
-    assert 'Traceback' not in said
+    assert 'Traceback' not in text
     for name in ('axes', 'misalignment', 'static', 'dynamic'):
         assert getattr(from_torn, name) == getattr(from_whole, name)

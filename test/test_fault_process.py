@@ -36,7 +36,6 @@ def node(path):
 
 
 def sigmas(heard):
-    """Return the largest error in units of the published standard deviation."""
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
     return float((np.abs(heard.force - force_at(seconds)) / sd).max())
@@ -142,10 +141,10 @@ def test_calibration_files_that_go_bad(path, tmp_path):
             assert reason in result.reason
             assert '\n' not in result.reason
     # The calibration in use stays in use.
-    n = sum(len(one.force) for one in heard)
+    n = sum(len(block.force) for block in heard)
     table = corrected(events)[1][:n, :3]
     np.testing.assert_allclose(
-        np.concatenate([one.force for one in heard]), table, rtol=0.0, atol=1e-9
+        np.concatenate([block.force for block in heard]), table, rtol=0.0, atol=1e-9
     )
     assert n == sum(e[0] == 'counts' for e in events if seconds_of(e[1]) < 80.0)
 
@@ -154,7 +153,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path):
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
-    # Long enough for any machine; the loop ends with the last answer.
+    # The time is enough for any machine; the loop ends with the last answer.
     events = bag(rate_hz=1000.0, duration_s=60.0)
     n_reloads = 100
     with bench(path) as node:
@@ -206,10 +205,11 @@ def test_a_signal_while_samples_flow(path, number):
 def test_slope_and_its_error(rng):
     time = np.arange(3600.0)
     values = 100.0 + 7.0 * time / 3600.0 + rng.standard_normal(3600)
-    # The start is not counted.
+    # The slope leaves out the first 300 s.
     values[:300] += 50.0
     slope, sd = soak.slope(list(zip(time.tolist(), values.tolist(), strict=True)), 60.0)
-    # Sd of a mean of 60, divided by sqrt(sum of squared hours) of 54 windows over 0.9 h.
+    # Sd of a slope: that of a mean of 60, divided by sqrt(sum of squared hours) of 54 windows over
+    # 0.9 h.
     assert sd == pytest.approx(1.0 / 60**0.5 / (54 * 0.9**2 / 12) ** 0.5, rel=0.3)
     assert abs(slope - 7.0) < 4.0 * sd
     assert soak.slope([(0.0, 1.0), (1.0, 1.0)], 60.0) is None

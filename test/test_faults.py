@@ -34,10 +34,9 @@ OVER_DDS = (
 
 
 def direct(events):
-    """Return what the node publishes for these messages, computed without DDS."""
     compensator = Compensator(unit(), CONFIG)
     loaded = LoadedCalibration(compensator.calibration, 'unit.yaml', '')
-    before = dict.fromkeys((one.name for one in fields(Traffic)), 0)
+    before = dict.fromkeys((field.name for field in fields(Traffic)), 0)
     before |= {'n_in': 0, 'n_failures': 0, **asdict(compensator.counters)}
     before_ns, parts, reports = None, [], []
     for lot in lots(events):
@@ -49,9 +48,9 @@ def direct(events):
         if before_ns is not None and status.stamp_ns > before_ns and new['n_in']:
             rate = new['n_in'] / (1e-9 * (status.stamp_ns - before_ns))
         before, before_ns = counts, status.stamp_ns
-        found = list(findings_of(loaded, status, new, rate, silence_s=0.0))
-        reports.append((max((one for one, _ in found), default=0), '; '.join(t for _, t in found)))
-    stamps, table = (np.concatenate(one) for one in zip(*parts, strict=True))
+        notes = list(findings_of(loaded, status, new, rate, silence_s=0.0))
+        reports.append((max((one for one, _ in notes), default=0), '; '.join(t for _, t in notes)))
+    stamps, table = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     covariance = table[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
     return Heard(stamps, table[:, :3], covariance, reports)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Few positions: what they determine is right, and the rest stays at its prior."""
+"""Few positions: the parameters that they determine are right, the others stay at their prior."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def left_by(pair, **options):
     calibration = tc.fit(bags, gravity=9.80665, **options)
     held_out = tc.read(BAGS / 'held_out.mcap')
     corrected = calibration.correct(held_out.time_s, held_out.counts, **held_out.temperatures)
-    # In a new attitude the constants are uncertain, and the covariance includes that.
+    # In a new attitude the constants are uncertain, and the covariance includes this uncertainty.
     sd = np.sqrt(np.nanmedian(np.einsum('nii->ni', corrected.covariance), axis=0))
     assert (sd > 1000.0 * MICRO_G).any()
     return np.asarray(minutes(corrected.specific_force).std(axis=0))
@@ -77,9 +77,9 @@ def turned(rng, ups, rest_s=20.0):
 def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
     at = np.array([-3.0, 12.0])
     for axis, slope in zip(one_position.calibration.static.axes(), SLOPE, strict=True):
-        found = np.diff(axis.bias_function.value(at))[0] / 15.0 / MG
+        fitted = np.diff(axis.bias_function.value(at))[0] / 15.0 / MG
         # 15000 samples of 3 mg over 16 K: some hundredths of a mg/K.
-        assert found == pytest.approx(slope, abs=0.2)
+        assert fitted == pytest.approx(slope, abs=0.2)
 
 
 def test_one_position_leaves_the_scale_at_its_prior(one_position):
@@ -93,7 +93,7 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
         assert sd[block.static] == pytest.approx(0.05, rel=0.3)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-3, rtol=0.02)
     assert 'keep their prior' in next(
-        one.message for one in one_position.findings if one.name == 'positions'
+        finding.message for finding in one_position.findings if finding.name == 'positions'
     )
 
 
@@ -127,7 +127,7 @@ def test_positions_without_temperature(rng):
     out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
-    # Noise of a sample, 0.02, plus the uncertainty of the tumble.
+    # Noise of a sample, 0.02 m/s^2, plus the uncertainty of the tumble.
     np.testing.assert_allclose(
         np.sqrt(np.diagonal(out.covariance[0])), np.hypot(left, 0.02), rtol=0.05
     )

@@ -56,8 +56,8 @@ def jump_of(size, day):
 def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     # Every column and both sets, on a ramp; the second route is a difference of two evaluations.
     unit = rich_calibration()
-    found = rests(unit, any_way, no_error, days=1, rate=0.5 / 60.0)
-    series = series_of(found, unit)
+    logged = rests(unit, any_way, no_error, days=1, rate=0.5 / 60.0)
+    series = series_of(logged, unit)
     values, scale = parameters_of(unit), np.array([axis.scale_factor for axis in unit.axes])
     covariance = unit.posterior.covariance()
     layout = parameter_layout(unit)
@@ -68,21 +68,21 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
         step = 1e-7
         moved = values.copy()
         if k in levels:
-            continue  # below: both levels of a scale move together, as K does
+            continue  # checked below: both levels of a scale move together, as K does
         if k in {block.static for block in layout.bias}:
             continue
         moved[k] += step
-        miss = series_of(found, with_parameters(unit, scale, moved, covariance)).miss
+        miss = series_of(logged, with_parameters(unit, scale, moved, covariance)).miss
         slope = (series.miss - miss) / step
         assert np.allclose(slope, series.by_parameter[:, k], atol=2e-4 * abs(slope).max() + 1e-9)
     for axis, block in enumerate(layout.scale):
         factor = np.where(np.arange(3) == axis, 1.0 + 1e-6, 1.0)
-        miss = series_of(found, with_parameters(unit, scale * factor, values, covariance)).miss
+        miss = series_of(logged, with_parameters(unit, scale * factor, values, covariance)).miss
         slope = (series.miss - miss) / 1e-6
         by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
         assert np.allclose(slope, by_level, atol=1e-4)
         both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
-        # A level is relative to K, and the rest of the scale, within a percent of it.
+        # A level of the scale is relative to K, and so are the other parameters, within a percent.
         assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
 
 
@@ -96,7 +96,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         # The filter takes the rests of the series, one by one.
         first = int(series.n_windows[:k].sum())
         windows = [r for _, r in history.rests[first : first + int(series.n_windows[k])]]
-        mean = np.mean([one.mean for one in windows], axis=0) / field_units.K
+        mean = np.mean([window.mean for window in windows], axis=0) / field_units.K
         warmth = series.temperature[k] - field_units.REFERENCE_C
         variance = field_units.NOISE**2 / (10.0 * len(windows))
         now = history.rests[first][0].start_ns / 86400e9 - field_units.DAY_ZERO
@@ -110,17 +110,18 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         places = [layout.scale[axis].static, layout.scale[axis].dynamic]
         to_file[places, axis + 3] = 1.0 / field_units.G
     model = Model(rows, unit, float(field_units.DAY_ZERO))
-    found = solve(model, ageing, to_file, np.zeros((len(to_file), 3)), 0.0)
+    solved = solve(model, ageing, to_file, np.zeros((len(to_file), 3)), 0.0)
     for axis in range(3):
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
-        sd = np.sqrt(found.posterior[bias, bias]) / field_units.K
+        sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # Six sums of each start instead of all its rests, its mean time: a fifth of the sd.
-        assert abs(found.shift[bias] / field_units.K - expected) < 0.2 * sd
+        # The series has six sums of each start at its mean time instead of all its rests: the
+        # error is below a fifth of the sd.
+        assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
         expected = best.state[6 + axis] + best.state[18 + axis]
-        assert abs(found.shift[scale] - expected) < 0.2 * np.sqrt(found.posterior[scale, scale])
+        assert abs(solved.shift[scale] - expected) < 0.2 * np.sqrt(solved.posterior[scale, scale])
 
 
 def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave():
@@ -130,10 +131,10 @@ def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave():
         process = field_units.Process(shock_day=11.5)
         history = field_units.live(kind, seed, 30, process)
         unit = field_units.calibration()
-        found = update(series_of(history.rests, unit), unit)
-        assert found.judged.is_better
+        updated = update(series_of(history.rests, unit), unit)
+        assert updated.judged.is_better
         before, truth = history.states[10], history.states[-1]
-        jumps = [one.time for one in found.changes if one.time is not None]
+        jumps = [change.time for change in updated.changes if change.time is not None]
         shock = history.states[11][15:18] - before[15:18]
         if np.abs(shock[2:] if kind == 'level' else shock).max() > 200 * MICRO_G:
             (jump,) = jumps
@@ -144,12 +145,12 @@ def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave():
         thermal = (field_units.REFERENCE_C, *rest.state[1:])
         after = series_of([(start, replace(rest, mean=tuple(counts), state=thermal))], unit)
         new = series_of(
-            [(start, replace(rest, mean=tuple(counts), state=thermal))], found.calibration
+            [(start, replace(rest, mean=tuple(counts), state=thermal))], updated.calibration
         )
         squares.append((float(after.miss[0]), float(new.miss[0])))
         ratios.append(float(new.miss[0] / new.claim[0]))
         if kind == 'level':
-            assert abs(found.ageing.turn_on / (20 * MICRO_G) - 1.0) < 0.5
+            assert abs(updated.ageing.turn_on / (20 * MICRO_G) - 1.0) < 0.5
     before, left = np.sqrt(np.mean(np.square(squares), axis=0)) / MICRO_G
     # A filter that knows the process leaves 12 ug (benchmarks/field.py).
     assert before > 100.0
@@ -159,17 +160,18 @@ def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave():
 
 def test_axes_that_no_rest_shows_keep_their_bits():
     unit = known()
-    found = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
-    new = found.calibration
-    assert [one.is_determined for one in found.moved] == [False, False, True]
+    updated = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
+    new = updated.calibration
+    assert [axis_change.is_determined for axis_change in updated.moved] == [False, False, True]
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
-    # Upright, bias and scale of z are one number: 300 ug, a third of the turn-on's 20 ug.
-    assert found.moved[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
+    # Upright rests give only the sum of bias and scale of z: 300 ug, to 15 ug with a turn-on of 20
+    # ug.
+    assert updated.moved[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
     old_sd, new_sd = (
-        np.sqrt(np.diag(one.posterior.covariance()))[layout.bias[0].static] for one in (unit, new)
+        np.sqrt(np.diag(cal.posterior.covariance()))[layout.bias[0].static] for cal in (unit, new)
     )
     assert new_sd > old_sd
 
@@ -194,26 +196,26 @@ def test_a_curve_that_has_changed_is_found_and_mended():
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )
-    found = rests(unit, upright, no_error, days=30)
+    logged = rests(unit, upright, no_error, days=30)
     bent = [
         (s, replace(r, mean=(*r.mean[:2], r.mean[2] + 300.0 * 5 * MICRO_G * (r.state[0] - 20.0))))
-        for s, r in found
+        for s, r in logged
     ]
     result = update(series_of(bent, unit), unit)
-    assert [one.time for one in result.changes] == [None]
+    assert [change.time for change in result.changes] == [None]
     curves = [
-        one.static.z.bias_function.coefficients[1] / 300.0 for one in (unit, result.calibration)
+        cal.static.z.bias_function.coefficients[1] / 300.0 for cal in (unit, result.calibration)
     ]
     assert curves[1] - curves[0] == pytest.approx(5.0 * MICRO_G, abs=1.5 * MICRO_G)
 
 
 def test_a_start_that_contradicts_all_others_is_left_out():
     unit = known()
-    found = rests(unit, upright, jump_of(100.0, 8.0), days=15)
-    wrong = found[80][0]
+    logged = rests(unit, upright, jump_of(100.0, 8.0), days=15)
+    wrong = logged[80][0]
     bad = [
         (s, replace(r, mean=(*r.mean[:2], r.mean[2] + 300.0 * 0.02)) if s == wrong else r)
-        for s, r in found
+        for s, r in logged
     ]
     result = update(series_of(bad, unit), unit)
     assert result.n_outliers == 1
@@ -222,9 +224,9 @@ def test_a_start_that_contradicts_all_others_is_left_out():
 
 def test_too_few_starts_are_refused():
     unit = known()
-    found = rests(unit, upright, no_error, days=1)[:8]
+    logged = rests(unit, upright, no_error, days=1)[:8]
     with pytest.raises(FitError, match='rests of 2 starts, need 3 at least'):
-        update(series_of(found, unit), unit)
+        update(series_of(logged, unit), unit)
 
 
 def test_the_first_passage_is_that_of_the_reflection_principle():
@@ -234,7 +236,7 @@ def test_the_first_passage_is_that_of_the_reflection_principle():
         s, k = np.sqrt(rate * days), np.arange(-40, 41)
         inside = norm.cdf((2 * k + 1) * bound / s) - norm.cdf((2 * k - 1) * bound / s)
         assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.005)
-    # From nearer to a bound it is earlier, and a unit that does not age never arrives.
+    # From nearer to a bound the passage is earlier; a unit that does not age never reaches it.
     assert passage(30.0, 0.0, rate, bound)[1] < passage(0.0, 0.0, rate, bound)[1]
     assert passage(0.0, 0.0, 1e-12, bound) == (np.inf,) * 3
 
@@ -270,18 +272,18 @@ def unit_file(tmp_path):
 @pytest.mark.usefixtures('no_figures')
 def test_update_by_the_command_line(tmp_path, unit_file, cli):
     unit = load_calibration(unit_file)
-    found = rests(unit, upright, jump_of(300.0, 10.0))
-    log, new = write_log(tmp_path / 'rests', found), tmp_path / 'new.yaml'
-    said = cli('update', unit_file, log, '-o', new)
-    assert 'the rests do not determine x, y' in said.stdout
-    assert 'a shock, not ageing' in said.stdout
+    logged = rests(unit, upright, jump_of(300.0, 10.0))
+    log, new = write_log(tmp_path / 'rests', logged), tmp_path / 'new.yaml'
+    finished = cli('update', unit_file, log, '-o', new)
+    assert 'the rests do not determine x, y' in finished.stdout
+    assert 'a shock, not ageing' in finished.stdout
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
-    # The new file removes what the old one leaves, and the history shows both.
+    # The new file removes the residual of the old file, and the history shows both.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
-    assert [one['constant'] for one in parsed(history.stdout)['history']][2] == 'bias z'
+    assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'
     again = cli('evaluate', log, '-c', new)
     assert '240 windows took part in its last update' in again.stdout
     again = cli('update', new, log, '-o', tmp_path / 'newer.yaml', code=1)
@@ -291,8 +293,8 @@ def test_update_by_the_command_line(tmp_path, unit_file, cli):
 def test_nothing_gained_writes_nothing(tmp_path, unit_file, cli):
     unit = load_calibration(unit_file)
     log = write_log(tmp_path / 'rests', rests(unit, upright, no_error))
-    said = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', '--json', code=3)
-    data = parsed(said.stdout)
+    finished = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', '--json', code=3)
+    data = parsed(finished.stdout)
     assert data['output'] is None
     assert data['is_better'] is False
     assert not (tmp_path / 'new.yaml').exists()
@@ -317,8 +319,8 @@ def test_mistakes_end_in_one_sentence(tmp_path, unit_file, cli):
     rich = tmp_path / 'rich.yaml'
     save_calibration(rich_calibration(), rich)
     log = write_log(tmp_path / 'own', rests(unit, upright, no_error, days=2))
-    said = cli('update', rich, log, *new, code=1).stderr
-    assert 'logged with a calibration that has other columns' in said
+    printed = cli('update', rich, log, *new, code=1).stderr
+    assert 'logged with a calibration that has other columns' in printed
 
 
 def test_the_newest_of_many_starts_are_used(monkeypatch):

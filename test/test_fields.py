@@ -36,14 +36,14 @@ PX4 = {
 
 @pytest.fixture(scope='module')
 def store():
-    found = get_typestore(Stores.ROS2_JAZZY)
+    types = get_typestore(Stores.ROS2_JAZZY)
     for kind, text in PX4.items():
-        found.register(get_types_from_msg(text, kind))
-    return found
+        types.register(get_types_from_msg(text, kind))
+    return types
 
 
 def serialized(store, kind, values, is_little=True):
-    data = [bytes(store.serialize_cdr(one, kind, little_endian=is_little)) for one in values]
+    data = [bytes(store.serialize_cdr(value, kind, little_endian=is_little)) for value in values]
     return Messages.of(data, np.zeros(len(data)), np.arange(len(data)))
 
 
@@ -72,7 +72,7 @@ def test_any_field_of_any_layout(store, rows, cells, is_little):
         store.types[kind](
             header(store, START_NS + row, frame),
             names,
-            [part(*one) for one in own],
+            [part(*values) for values in own],
             np.array([7, -8, row], np.int16),
             np.array(cells, np.float32),
             True,
@@ -99,7 +99,7 @@ def test_any_field_of_any_layout(store, rows, cells, is_little):
 
 
 @pytest.mark.parametrize(
-    ('path', 'said'),
+    ('path', 'text'),
     [
         ('temp', r'has the fields header, names, parts.*, no `temp`'),
         ('last.celsius.x', 'a number has the fields none, no `x`'),
@@ -109,8 +109,8 @@ def test_any_field_of_any_layout(store, rows, cells, is_little):
         ('raw[', 'no `raw\\['),
     ],
 )
-def test_a_path_that_leads_nowhere_is_said(store, path, said):
-    with pytest.raises(RecordingError, match=said):
+def test_a_path_that_leads_nowhere_is_said(store, path, text):
+    with pytest.raises(RecordingError, match=text):
         Field('lab_msgs/msg/Deep', path, store.fielddefs)
 
 
@@ -182,13 +182,13 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
 def test_a_bag_with_a_drivers_own_type(tmp_path, store, storage):
     celsius = driver_bag(tmp_path / 'bag', store, storage)
     names = {'board': '/fmu/out/sensor_accel:temperature', 'case': '/case'}
-    found = read_recording(tmp_path / 'bag', Topics.named(names))
-    assert 'board, case without a stamp' in str(found.info.chosen)
-    board, case = (found.columns.temperatures[name] for name in ('board', 'case'))
+    recording = read_recording(tmp_path / 'bag', Topics.named(names))
+    assert 'board, case without a stamp' in str(recording.info.chosen)
+    board, case = (recording.columns.temperatures[name] for name in ('board', 'case'))
     # The first reading is before any sample; the others get the stamp of the previous sample.
     assert board.celsius.tolist() == celsius[1:]
     assert board.stamp_ns.tolist() == [START_NS + (row - 1) * 10**7 for row in range(5, 50, 5)]
-    assert case.celsius.tolist() == [one - 1.0 for one in celsius]
+    assert case.celsius.tolist() == [celsiu - 1.0 for celsiu in celsius]
     assert case.stamp_ns.tolist() == [START_NS + row * 10**7 for row in range(0, 50, 5)]
 
 
@@ -212,8 +212,10 @@ def test_two_fields_of_one_message_are_no_twins(tmp_path, store):
 def test_info_names_what_could_be_a_second_thermometer(tmp_path, store):
     driver_bag(tmp_path / 'bag', store)
     topics = Topics.named({'board': '/case'})
-    said = [one for one in survey_recording(tmp_path / 'bag', topics).findings if 'no case' in one]
-    assert said[0].endswith('with --topic case=TOPIC: /fmu/out/sensor_accel:temperature')
+    messages = [
+        text for text in survey_recording(tmp_path / 'bag', topics).findings if 'no case' in text
+    ]
+    assert messages[0].endswith('with --topic case=TOPIC: /fmu/out/sensor_accel:temperature')
     both = Topics.named({'board': '/case', 'case': '/fmu/out/sensor_accel:temperature'})
     with open_recording(tmp_path / 'bag', both) as reader:
         assert unused_thermometers(reader) == []

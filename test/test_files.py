@@ -166,8 +166,8 @@ def test_of_two_writers_one_wins(tmp_path, kind):
         thread.join()
     (winner,) = won
     assert lost == ['exists already; --force overwrites it'] * 7
-    found = tmp_path / 'out' / 'metadata.yaml' if kind.is_folder else tmp_path / 'out'
-    assert found.read_text() == winner
+    target = tmp_path / 'out' / 'metadata.yaml' if kind.is_folder else tmp_path / 'out'
+    assert target.read_text() == winner
     assert [path.name for path in tmp_path.iterdir()] == ['out']
 
 
@@ -240,5 +240,5 @@ def test_a_bag_has_no_other_suffix(folder, cli, suffix):
 def test_a_table_and_a_page_are_what_their_suffix_says(kind, name, tmp_path):
     with pytest.raises(OutputError, match=rf'{name}: cannot be written: \.\w+ is not \*'):
         check_output(tmp_path / name, kind)
-    for good in (Path(name).with_suffix(one).name for one in ('', *kind.suffixes)):
+    for good in (Path(name).with_suffix(suffix).name for suffix in ('', *kind.suffixes)):
         check_output(tmp_path / good, kind)

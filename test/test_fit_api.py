@@ -37,8 +37,8 @@ def left_by(groups):
     unit = tc.fit(bags, gravity=G, input='m/s^2', groups=groups, mounting_sd=1e-7)
     up = np.array([0.3, -0.5, 0.8])
     time_s, force, board = recording(up, rng)
-    found = unit.correct(time_s, force, board=(time_s[::5], board[::5])).specific_force
-    error = found[600:] - G * up / np.linalg.norm(up)
+    specific_force = unit.correct(time_s, force, board=(time_s[::5], board[::5])).specific_force
+    error = specific_force[600:] - G * up / np.linalg.norm(up)
     minutes = error.reshape(-1, 60, 3).mean(axis=1)
     return unit, float(np.sqrt(np.mean(minutes**2)) / MICRO_G)
 
@@ -46,10 +46,10 @@ def left_by(groups):
 def test_a_knee_of_the_bias_is_found():
     unit, left = left_by(('curve', 'bend'))
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
-    # Knees stand a kelvin apart: those on both sides of the true one are used.
+    # Knees stand a kelvin apart: the fit uses the knees on both sides of the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # Between two knees the slope of the mean of both: at most 20 ug/K times a quarter of their
-    # distance, over a kelvin of the 22 that the recording goes through.
+    # Between two knees the fitted slope is the mean of both sides: an error of at most 20 ug/K
+    # times a quarter of their distance, over one of the 22 kelvins of the recording.
     assert left < 1.5
 
 
@@ -63,12 +63,12 @@ def test_a_thermometer_on_two_topics_is_one():
     bags = []
     for copies in (('board',), ('board', 'case')):
         rng = np.random.default_rng(9)
-        own = []
+        collected = []
         for k, up in enumerate(UPS[:3]):
             time_s, force, board = recording(up, rng)
             readings = dict.fromkeys(copies, (time_s[::5], board[::5]))
-            own.append(tc.Columns(time_s, force, readings, name=f'rest{k}'))
-        bags.append(own)
+            collected.append(tc.Columns(time_s, force, readings, name=f'rest{k}'))
+        bags.append(collected)
     one, two = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
     assert one.static == two.static
     assert one.axes == two.axes
@@ -77,20 +77,20 @@ def test_a_thermometer_on_two_topics_is_one():
 
 
 def columns_of(slopes):
-    """Record a position each, with the slopes given."""
+    """Record one position for each of the given slopes."""
     rng = np.random.default_rng(10)
-    found = []
+    bags = []
     for k, (up, slope) in enumerate(zip(UPS, slopes, strict=False)):
         time_s, force, board = recording(up, rng, slope)
-        found.append(tc.Columns(time_s, force, {'board': (time_s[::5], board[::5])}, name=f'r{k}'))
-    return found
+        bags.append(tc.Columns(time_s, force, {'board': (time_s[::5], board[::5])}, name=f'r{k}'))
+    return bags
 
 
 def sd_of_a_correction(unit):
     """Claimed sd of the axes at the end of a recording [ug]."""
     time_s, force, board = recording(UPS[0], np.random.default_rng(11))
-    found = unit.correct(time_s[3::4], force[3::4], board=(time_s[::5], board[::5])).covariance[-1]
-    return np.sqrt(np.diag(found)) / MICRO_G
+    last = unit.correct(time_s[3::4], force[3::4], board=(time_s[::5], board[::5])).covariance[-1]
+    return np.sqrt(np.diag(last)) / MICRO_G
 
 
 def test_a_bag_of_another_environment_takes_no_part_and_is_claimed():
@@ -103,11 +103,11 @@ def test_a_bag_of_another_environment_takes_no_part_and_is_claimed():
     later = tc.fit(with_another[-1:], gravity=G, input='m/s^2', prior=alone)
     assert later.axes == alone.axes
     for unit in (joint, later):
-        (note,) = [one for one in unit.provenance.notes if one.startswith('environment: r4')]
+        (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'took no part' in note
         # The other bag is off by 5 times 20 ug/K over the 11 K above the knee, or half of it (z).
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 600.0
     # One more bag of the same environment is no contradiction.
     again = tc.fit(columns_of([SLOPE] * 5)[-1:], gravity=G, input='m/s^2', prior=alone)
-    assert not [one for one in again.provenance.notes if one.startswith('environment')]
+    assert not [note for note in again.provenance.notes if note.startswith('environment')]

@@ -49,7 +49,7 @@ def constants(calibration):
 
 
 def claimed(calibration):
-    """Their sd, that of K relative."""
+    """Sd of bias and of the elements of M, and the relative sd of K."""
     layout, sd = (
         parameter_layout(calibration),
         np.sqrt(np.diag(calibration.posterior.covariance())),
@@ -78,20 +78,16 @@ def pulls(found, unit):
     (bias, scale, M), (bias_sd, scale_sd, M_sd) = (
         constants(found.calibration), claimed(found.calibration)
     )  # fmt: skip
-    return np.concatenate(
-        (
-            (bias - unit.bias_at_reference) / bias_sd,
-            (scale / unit.scale_factor - 1.0) / scale_sd,
-            (M - np.array(unit.M)[[1, 2, 2], [0, 0, 1]]) / M_sd,
-        )
-    )
+    return np.concatenate(((bias - unit.bias_at_reference) / bias_sd,
+                           (scale / unit.scale_factor - 1.0) / scale_sd,
+                           (M - np.array(unit.M)[[1, 2, 2], [0, 0, 1]]) / M_sd))  # fmt: skip
 
 
 def test_truth_lies_within_the_claimed_sd(response):
     # Nine numbers that share the reference temperature and the directions.
-    found = pulls(response, OWN_LAGS)
-    assert np.abs(found).max() < 4.0
-    assert np.sqrt(np.mean(found**2)) < 2.0
+    pull = pulls(response, OWN_LAGS)
+    assert np.abs(pull).max() < 4.0
+    assert np.sqrt(np.mean(pull**2)) < 2.0
     # The claimed sd is small: micro-g and ppm, for a drift of hundreds.
     bias_sd, scale_sd, M_sd = claimed(response.calibration)
     assert (bias_sd / np.array(OWN_LAGS.counts_per_micro_g)).max() < 5.0
@@ -120,10 +116,10 @@ def test_the_paper_s_model_on_its_own_physics(golovach):
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        # Each regime has a curve of its own, so that there is not a single one.
+        # Each regime has a curve, so that the calibration has no single curve.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
-    # A linear static set and a quadratic dynamic one.
+    # A linear static set and a quadratic dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
     # The residual of the model in this unit's ramps changes its levels, which are as good as the
@@ -147,7 +143,7 @@ def test_the_evidence_is_complete(response):
     assert {finding.level for finding in response.findings} <= {'advice', 'good'}
     assert 'refusal' not in {finding.level for finding in response.findings}
     # The file contains the contribution of each group.
-    judged = {(one.part, one.group) for one in calibration.evidence}
+    judged = {(group.part, group.group) for group in calibration.evidence}
     assert {('bias', 'curve'), ('scale', 'curve')} <= judged
     # A term with zero weight is only needed for the covariance.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
@@ -166,17 +162,17 @@ def test_the_compensator_does_what_the_fit_promised(response):
     up = np.array([[0.48, -0.6, 0.64]])
     (record,) = records_of(OWN_LAGS, up, 77)
     compensator = Compensator(response.calibration)
-    found = process_block(compensator, ArrayBlock(*arrays_of(record)))
+    after = process_block(compensator, ArrayBlock(*arrays_of(record)))
     per_window = round(60.0 * RATE_HZ)
-    n = len(found.index) // per_window
-    force = found.specific_force[: n * per_window].reshape(n, per_window, 3).mean(axis=1)
+    n = len(after.index) // per_window
+    force = after.specific_force[: n * per_window].reshape(n, per_window, 3).mean(axis=1)
     # The uncertainty of the lags' start dominates until it has decayed.
     late = force[45:]
     rms = residual_statistics(norm_residual(late, STANDARD_GRAVITY)).rms
     assert rms < 2.0 * response.residuals[-1].left_out.rms
     density = np.array(response.calibration.noise_density_m_s2_sqrt_hz)
-    variance = found.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)
-    # White noise and rounding average out, the rest does not.
+    variance = after.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)
+    # White noise and rounding average out, the other errors do not.
     variance += density**2 / 60.0 - np.array(compensator.thermal.correction.noise)
     error = (force - record.truth.specific_force) / np.sqrt(variance)
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
@@ -189,7 +185,7 @@ def test_six_faces_leave_misalignment_at_its_prior():
     # Six faces do not determine M: 0 within 1 mrad.
     np.testing.assert_allclose(M, 0.0, atol=1e-5)
     np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
-    finding = next(one for one in result.findings if one.name == 'misalignment')
+    finding = next(finding for finding in result.findings if finding.name == 'misalignment')
     assert (finding.level, finding.message.startswith('6 positions')) == ('advice', True)
     # Bias and scale are determined, except for the effect of M of 1 mrad on the faces: half its
     # square.
@@ -198,13 +194,13 @@ def test_six_faces_leave_misalignment_at_its_prior():
 
 
 def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng):
-    # WHY: both were fitted without a message. A triad without drift only has constants.
+    # WHY: both were fitted without a message. The triad without drift has constants only.
     records = records_of(PLAIN, positions(9, 1), 4)
     bias, scale, M = PLAIN.bias_at_reference, PLAIN.scale_factor, np.array(PLAIN.M)
 
     def fit_of(correct, **options):
         recorded = [(stamps, correct(n), *rest) for stamps, n, *rest in map(arrays_of, records)]
-        sources = [source_of(*one, name=str(k)) for k, one in enumerate(recorded)]
+        sources = [source_of(*record, name=str(k)) for k, record in enumerate(recorded)]
         options |= {'gravity': STANDARD_GRAVITY, 'groups': ('curve',)}
         return fit(sources, FitOptions(**options))
 
@@ -237,12 +233,12 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach):
         compensator = Compensator(golovach.calibration)
         if weight is not None:
             compensator.thermal.tracker.weight_at = lambda _stamp_ns: weight
-        found = process_block(compensator, ArrayBlock(*arrays_of(record)))
+        corrected = process_block(compensator, ArrayBlock(*arrays_of(record)))
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
-        return found.specific_force
+        return corrected.specific_force
 
-    # All three have the same noise, which cancels; the change of weight along the difference of
-    # the sets remains.
+    # The three outputs have the same noise, which cancels; the change of weight along the
+    # difference of the sets remains.
     output, static, dynamic = forces(None), forces(0.0), forces(1.0)
     gap = dynamic - static
     size = np.linalg.norm(gap, axis=1)
@@ -298,8 +294,8 @@ def test_saturated_samples_are_refused(rng):
 
 
 def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mountings():
-    # Misalignments of some mrad explain the norms of nine positions. Mountings of 5 mg would, too,
-    # and leave the constants wrong by as much. The noise of a minute is 22 ug.
+    # Misalignments of some mrad explain the norms of nine positions. Mountings of 5 mg would
+    # explain them, too, with constants wrong by 5 mg. The noise of a minute is 22 ug.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
     calibration = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY)).calibration

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A board warmer than its case by self-heating: effects of temperature changes are even about that.
+A board warmer than its case by self-heating: effects of temperature changes are even about the
+gradient at rest.
 """
 
 from itertools import pairwise
@@ -22,7 +23,6 @@ NOISE = 4.0 * MICRO
 
 
 def lagged(values, tau):
-    """First-order lag that starts in equilibrium."""
     share = 1.0 - np.exp(-STEP_S / tau)
     return lfilter([share], [1.0, share - 1.0], values - values[0]) + values[0]
 
@@ -45,7 +45,7 @@ def recorded(rng, up, name, targets):
     force = GRAVITY * up * (1.0 + 6e-5 * t[:, None])
     stamps = 10**18 + np.rint(time * 1e9).astype(np.int64)
     board, case = (
-        np.round(one + 0.003 * rng.standard_normal(len(time)), 4) for one in (board, case)
+        np.round(celsius + 0.003 * rng.standard_normal(len(time)), 4) for celsius in (board, case)
     )
     accel = force + bias * MICRO + NOISE * rng.standard_normal((len(time), 3))
     return source_of(stamps, accel, stamps, board, stamps + 1, case, name=name)
@@ -55,21 +55,21 @@ def test_what_a_change_does_is_found_about_rest(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # Two readings of 3 mK a minute for about twenty hours: 0.1 mK, and rates of minutes.
+    # Noise of 0.1 mK (two readings of 3 mK a minute, twenty hours), and rates of minutes.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
-    found, about_0 = (
+    about_rest, about_0 = (
         fit(bags, FitOptions(gravity=GRAVITY, input='m/s^2', groups=names))
         for names in (groups, groups[:-1])
     )
-    kept = {column.group for column in found.calibration.response}
+    kept = {column.group for column in about_rest.calibration.response}
     assert 'gradient_even_about_rest' in kept
     assert 'gradient_even' not in kept
     # Means of a minute; columns even about 0 leave a part of the effect.
     floor = NOISE / np.sqrt(30.0)
-    assert found.residuals[-1].fitted.rms < 1.1 * floor
+    assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor
-    assert about_0.residuals[-1].left_out.rms > 1.5 * found.residuals[-1].left_out.rms
+    assert about_0.residuals[-1].left_out.rms > 1.5 * about_rest.residuals[-1].left_out.rms
 
 
 def test_what_is_forced_takes_part_beside_the_groups_that_may(rng):

@@ -122,9 +122,9 @@ def test_ratio_and_time_are_found(rng, noise):
     # 3 axes x 9 positions x 300 windows of a minute: 240 or more correlation times determine the
     # variance of the process to sqrt(2 / 240) = 9 %, its time to about 15 %.
     whitener, weight, series = drawn(rng, 9, 300, noise)
-    found = whitener.estimate(5.0 * series, weight)
-    assert 0.5 < found.ratio / noise.ratio < 2.0
-    assert 0.5 < found.time_s / noise.time_s < 2.0
+    fitted = whitener.estimate(5.0 * series, weight)
+    assert 0.5 < fitted.ratio / noise.ratio < 2.0
+    assert 0.5 < fitted.time_s / noise.time_s < 2.0
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):

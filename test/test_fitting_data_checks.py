@@ -61,8 +61,8 @@ def good(rng):
 
 
 def test_a_good_test_passes(good):
-    found = findings_of(*good)
-    assert {finding.level for finding in found.values()} == {'good'}
+    findings = findings_of(*good)
+    assert {finding.level for finding in findings.values()} == {'good'}
 
 
 @pytest.mark.parametrize(
@@ -83,10 +83,10 @@ def test_a_good_test_passes(good):
 )  # fmt: skip
 def test_what_a_test_lacks_is_said(good, name, changed, message):
     windows, up = good
-    found = findings_of(replace(windows, **changed(windows)), up)
-    assert re.search(message, found[name].message)
-    assert (found[name].level == 'refusal') == (name == 'swapped')
-    assert name != 'temperature' or set(found) == {'positions', 'temperature'}
+    findings = findings_of(replace(windows, **changed(windows)), up)
+    assert re.search(message, findings[name].message)
+    assert (findings[name].level == 'refusal') == (name == 'swapped')
+    assert name != 'temperature' or set(findings) == {'positions', 'temperature'}
 
 
 def test_a_missing_case_is_said(good):
@@ -138,23 +138,22 @@ def test_refusals_stop_and_may_be_allowed():
 
 
 def judged(raw, fitted, slow, left_out=None, **options):
-    """Judge residuals with a given RMS [ug]."""
     steps = [
-        residual_statistics(np.full(0 if one is None else 9, (one or 0.0) * MICRO_G))
-        for one in (raw, raw, raw, fitted, left_out)
+        residual_statistics(np.full(0 if rms is None else 9, (rms or 0.0) * MICRO_G))
+        for rms in (raw, raw, raw, fitted, left_out)
     ]
-    found = judge_result(
+    findings = judge_result(
         np.full(3, 990.0), [ResidualRow('all', *steps)], slow * MICRO_G,
         FitOptions(gravity=9.81, **options),
     )  # fmt: skip
-    return {finding.name: finding for finding in found}
+    return {finding.name: finding for finding in findings}
 
 
 def test_what_the_fit_left_is_said():
     good = judged(100.0, 1.0, 0.2, 1.5)
     assert set(good) == {'residual'}
     assert '100.0 ug RMS raw, 1.5 ug on data left out, 1.0 ug' in good['residual'].message
-    # If no position can be left out, there is no such number.
+    # If no position can be left out, there is no residual on positions left out.
     assert 'left out' not in judged(100.0, 1.0, 0.2)['residual'].message
 
 

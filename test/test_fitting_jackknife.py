@@ -28,15 +28,15 @@ def ratio(path):
     posterior = result.fit.posterior
     calibration, data = result.calibration, result.fit.windows.data
     K = np.array([axis.scale_factor for axis in calibration.axes])
-    found = []
+    collected = []
     for p in range(data.n_positions):
         kept = np.flatnonzero(data.position != p)
         rest = Regression(rows_of(data, kept), STANDARD_GRAVITY, K / posterior.state.kappa)
         others = np.arange(data.n_positions) != p
         local = {name: getattr(posterior.state, name)[others] for name in ('up', 'offset', 'tilt')}
         state = rest.solve(replace(posterior.state, **local), posterior.prior, n_steps=3).state
-        found.append(np.concatenate((state.kappa, state.bias, state.misalignment)))
-    scatter = np.var(np.array(found), axis=0) * (len(found) - 1)
+        collected.append(np.concatenate((state.kappa, state.bias, state.misalignment)))
+    scatter = np.var(np.array(collected), axis=0) * (len(collected) - 1)
     variance = np.diag(calibration.posterior.covariance())
     layout = parameter_layout(calibration)
     levels = [variance[[block.static for block in part]] for part in (layout.scale, layout.bias)]

@@ -69,7 +69,7 @@ def table(rng, k2=0.0, kq=0.0, k3=0.0, *, share=0.01, radius_sd=0.0, radius_erro
 
 
 def chosen(rng, **terms):
-    """Fit such windows and choose the terms: the fit, the terms, and their sd by kind."""
+    """Fit windows of a centrifuge; return the fit, the chosen terms, and their sd by kind."""
     truth, regression, state = table(rng, **terms)
     prior = prior_of(truth, (), nonlinear_sd=starting_sd(regression.forces, OPTIONS))
     posterior = regression.solve(state, prior, n_steps=12)
@@ -102,22 +102,22 @@ def test_derivatives_are_those_of_differences(rng):
                     for sign in (1.0, -1.0)
                 )
                 expected = (below - above) / 2e-6
-                found = derivatives[p, axis, :, column]
+                derived = derivatives[p, axis, :, column]
                 # Rounding of 1e-14 over 1e-6 of forces up to 95 m/s^2, and of cubes.
                 scale = np.abs(expected).max()
-                np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)
+                np.testing.assert_allclose(derived, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)
 
 
 def test_square_and_cube_are_found_within_their_claims(rng):
     _, posterior, terms = chosen(rng, k2=1e-5, k3=-1e-6)
-    assert [one.kind for one in terms] == ['square', 'cube']
+    assert [term.kind for term in terms] == ['square', 'cube']
     places = posterior.layout.nonlinear[:, [0, 2, 3, 5]]
     sd = np.sqrt(posterior.variance[places])
     away = posterior.state.nonlinear[:, [0, 2, 3, 5]] - np.array([1e-5, -1e-6, 1e-7, -1e-8])
     assert np.abs(away / sd).max() < 4.0
-    # To 2 % as the requirement says.
+    # K2 and K3 to 2 %, as required.
     assert np.abs(away[:, :2] / [1e-5, 1e-6]).max() < 0.02
-    assert all(one.left_out_gain > 1.0 and one.log_evidence_change > 100.0 for one in terms)
+    assert all(term.left_out_gain > 1.0 and term.log_evidence_change > 100.0 for term in terms)
 
 
 def test_terms_that_are_not_there_leave_and_nothing_else_moves(rng):
@@ -133,19 +133,19 @@ def test_terms_that_are_not_there_leave_and_nothing_else_moves(rng):
 
 def test_an_odd_square_joins_only_where_it_is(rng):
     _, posterior, terms = chosen(rng, kq=1e-5, share=0.0)
-    assert [one.kind for one in terms] == ['odd_square']
+    assert [term.kind for term in terms] == ['odd_square']
     assert posterior.state.nonlinear[:, 1] == pytest.approx(1e-5, rel=0.02)
-    # Its change with temperature is not there: it left.
+    # The change with temperature was removed.
     assert not posterior.state.nonlinear[:, 4].any()
 
 
 def test_a_radius_is_estimated(rng):
     truth, regression, state = table(rng, 1e-5, radius_sd=0.01, radius_error=0.004)
     prior = prior_of(truth, (), nonlinear_sd=prior_sd(regression.forces, OPTIONS))
-    found = regression.solve(state, prior, n_steps=15)
-    sd = math.sqrt(found.variance[found.layout.radius[0]])
+    solution = regression.solve(state, prior, n_steps=15)
+    sd = math.sqrt(solution.variance[solution.layout.radius[0]])
     assert sd < 1e-5
-    assert abs(found.state.radius[0] - 0.004) < 4.0 * sd
+    assert abs(solution.state.radius[0] - 0.004) < 4.0 * sd
 
 
 def test_a_table_of_sections_states_the_force_of_each_rest():
@@ -169,8 +169,12 @@ def test_a_bag_states_its_force_and_the_user_has_the_last_word(tmp_path):
     stamps = 10**18 + np.arange(0, 20 * 10**9, 10**8)
     rate = np.zeros((200, 3))
     rate[:, 2] = np.where(np.arange(200) < 100, 0.0, 5.0)
-    said = {ROTATION: 'table/rate', 'rotation_radius_m': '2', 'rotation_radius_sd_m': '0.01'}
-    for name, metadata in (('a', {MAGNITUDE: '30'}), ('b', said), ('c', {ROTATION: 'table/rate'})):
+    by_rate = {ROTATION: 'table/rate', 'rotation_radius_m': '2', 'rotation_radius_sd_m': '0.01'}
+    for name, metadata in (
+        ('a', {MAGNITUDE: '30'}),
+        ('b', by_rate),
+        ('c', {ROTATION: 'table/rate'}),
+    ):
         with BagWriter(tmp_path / f'{name}.mcap', metadata=metadata) as writer:
             writer.write_counts('accel/counts', stamps, rate)
             writer.write_counts('table/rate', stamps, rate)
@@ -212,9 +216,9 @@ def test_a_constant_rotation_is_a_rest_and_its_change_is_none(rng):
     noise = 1e-3 * rng.standard_normal((2, len(time), 3))
     turning = np.column_stack((0.0 * time, 0.0 * time, rate))
     cells.add((time * 1e9).astype(np.int64), force + noise[0], turning + noise[1])
-    found = cells.finish()
-    still = still_intervals(without_rotation(found), 3.0)
-    edges = [(found.time[a], found.time[b - 1]) for a, b in still]
+    summed = cells.finish()
+    still = still_intervals(without_rotation(summed), 3.0)
+    edges = [(summed.time[a], summed.time[b - 1]) for a, b in still]
     # After a change the median takes 5 s to follow; cells beside a motion do not count.
     assert len(edges) == 3
     for (a, b), (begun, ended) in zip(edges, ((0, 80), (100, 180), (190, 240)), strict=True):
@@ -224,21 +228,21 @@ def test_a_constant_rotation_is_a_rest_and_its_change_is_none(rng):
 
 def test_simulated_forces_are_those_of_a_rotation():
     spin = Spin(*steps((10.0,), (2.0,), 20.0, 5.0), 1.5, np.array([1.0, 0.0, 0.0]))
-    found = spin.forces(np.array([0.0, 0.0, G]), np.array([5.0, 20.0, 60.0]))
-    np.testing.assert_allclose(found, [[0, 0, G], [6.0, 0, G], [0, 0, G]])
+    force = spin.forces(np.array([0.0, 0.0, G]), np.array([5.0, 20.0, 60.0]))
+    np.testing.assert_allclose(force, [[0, 0, G], [6.0, 0, G], [0, 0, G]])
     assert spin.sections(G)[1] == (15.0, 35.0, math.hypot(G, 6.0))
     read = Bend((10.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.01).added(np.full((1, 3), 2 * G), np.ones(1))
     np.testing.assert_allclose(read / (1.01 * MICRO * G / GRAVITY), [[40.0, 8.0, 0.0]])
 
 
 def source(run, spin, name):
-    sections = tuple(Section(*one, 0.0) for one in spin.sections(G)) if spin else ()
+    sections = tuple(Section(*section, 0.0) for section in spin.sections(G)) if spin else ()
     force = KnownForce(name, sections) if spin else None
     return source_of(*arrays_of(run), name=name, force=force)
 
 
 def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
-    # At one temperature, to be quick: nine mountings at 1, 3 and 8 g.
+    # A single temperature, for speed: nine mountings at 1, 3 and 8 g.
     unit = replace(triad('plain', 3), bend=Bend((10.0, -10.0, 10.0), (1.0, 1.0, -1.0)))
     time, rate = steps((150.0,), tuple(np.sqrt([3.0 * G, 8.0 * G])), 150.0, 20.0)
     program = Cyclogram((0.0, 560.0), (20.0, 20.0))
@@ -249,14 +253,14 @@ def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
         stations.append(Position(program, up / np.linalg.norm(up), spin))
     runs = arrays(unit, stations, 3, rate_hz=2.0)
     sources = [
-        source(run, one.spin, f'run{k}')
-        for k, (run, one) in enumerate(zip(runs, stations, strict=True))
+        source(run, station.spin, f'run{k}')
+        for k, (run, station) in enumerate(zip(runs, stations, strict=True))
     ]
     result = fit(sources, FitOptions(gravity=G, model='golovach'))
-    found = {one.name: one for one in nonlinear_coefficients(result.calibration)}
+    terms = {term.name: term for term in nonlinear_coefficients(result.calibration)}
     for name, true in (('K2', unit.bend.square), ('K3', unit.bend.cube)):
-        assert np.abs((found[name].value - true) / found[name].sd).max() < 4.0
-        assert found[name].value == pytest.approx(np.array(true), rel=0.02)
+        assert np.abs((terms[name].value - true) / terms[name].sd).max() < 4.0
+        assert terms[name].value == pytest.approx(np.array(true), rel=0.02)
     judged = judge_bags(result.bags, result.calibration)
     assert [round(size / G, 1) for size in judged.by_force] == [1.0, 3.2, 8.1]
     *_, most = judged.by_force.values()
@@ -266,22 +270,22 @@ def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
     outside = judge_bags(result.bags, replace(result.calibration, nonlinearity=narrow))
     assert outside.sections['outside'].n == most.n
     rows = results(evidence_of_fit(result), CertificateInfo(), ())
-    assert {'K2 x', 'K3 z'} < {one.quantity for one in rows}
+    assert {'K2 x', 'K3 z'} < {row.quantity for row in rows}
     # A tumble at 1 g later keeps what the centrifuge has shown.
-    still = [Position(program, one) for one in positions(6, 2)]
+    still = [Position(program, position) for position in positions(6, 2)]
     later = arrays(unit, still, 9, rate_hz=2.0)
     tumble = [source(run, None, f'still{k}') for k, run in enumerate(later)]
     again = fit(tumble, FitOptions(gravity=G, prior=result.calibration)).calibration
-    for one in nonlinear_coefficients(again):
-        before = found[one.name]
-        assert np.abs(one.value - before.value).max() < 3.0 * before.sd.max()
+    for coefficient in nonlinear_coefficients(again):
+        before = terms[coefficient.name]
+        assert np.abs(coefficient.value - before.value).max() < 3.0 * before.sd.max()
     siblings = [
         replace(again, unit=replace(again.unit, serial=f'{k}'), gyroscope=None) for k in range(3)
     ]
     assert population(siblings).nonlinearity is None
     # From a tumble alone a bound of the data sheet stays, and the fit says so.
     alone = fit(tumble, FitOptions(gravity=G, model='golovach', k2_sd=5e-5))
-    assert [one.name for one in alone.findings].count('nonlinearity') == 1
+    assert [finding.name for finding in alone.findings].count('nonlinearity') == 1
     (square, *_) = nonlinear_coefficients(alone.calibration)
     assert square.sd == pytest.approx(50.0, rel=0.2)
 
@@ -293,7 +297,7 @@ def test_a_claim_has_the_terms_and_the_radius_as_the_posterior_has_them(rng):
     typical = np.outer([1.0, 0.1], regression.windows.kelvins)
     claim = claim_of(regression, posterior, typical)
     for name in ('nonlinear', 'radius', 'misalignment'):
-        before, after = (getattr(one, name) for one in (posterior.layout, claim.layout))
+        before, after = (getattr(layout, name) for layout in (posterior.layout, claim.layout))
         used = before >= 0
-        found = np.diag(claim.covariance)[after[used]]
-        np.testing.assert_allclose(found, posterior.variance[before[used]], rtol=1e-6)
+        claimed = np.diag(claim.covariance)[after[used]]
+        np.testing.assert_allclose(claimed, posterior.variance[before[used]], rtol=1e-6)

@@ -57,15 +57,15 @@ def still(rng, seconds, level):
 
 def test_chunks_do_not_matter(rng):
     whole = block(np.rint(still(rng, 61.0, (10.0, -3000.0, 50.0))))
-    one = reduced([whole])
+    at_once = reduced([whole])
     for n_parts in (2, 7, 50):
         other = reduced(split(whole, n_parts))
-        for a, b in zip(one.intervals, other.intervals, strict=True):
+        for a, b in zip(at_once.intervals, other.intervals, strict=True):
             np.testing.assert_array_equal(a.count, b.count)
             # The same sums in another order of addition: only rounding differs.
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
-        np.testing.assert_array_equal(one.board.value, other.board.value)
+        np.testing.assert_array_equal(at_once.board.value, other.board.value)
 
 
 @pytest.mark.parametrize('rest_s', [30, 45])
@@ -76,9 +76,9 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
     bag = reduced([tumble], min_rest_s=None, full_scale=None)
     assert len(bag.intervals) >= 18
-    for one in bag.intervals:
-        size = np.linalg.norm(one.mean, axis=1)
-        # 5 ug of each sample, in windows of ten and the short ones at the end.
+    for interval in bag.intervals:
+        size = np.linalg.norm(interval.mean, axis=1)
+        # The noise is 5 ug per sample, in windows of ten samples and shorter ones at the end.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
     # A long rest has cells of the same length as before.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])
@@ -249,13 +249,13 @@ def course(quantum, noise, rng):
 
 @pytest.mark.parametrize(('quantum', 'noise'), [(0.0, 0.005), (0.0, 0.05), (0.0625, 0.005)])
 def test_a_thermometer_is_known_from_its_readings(quantum, noise, rng):
-    found = learn_thermometer([course(quantum, noise, rng)], ThermometerSettings())
-    assert found.quantum_c == pytest.approx(quantum, rel=1e-6)
+    learned = learn_thermometer([course(quantum, noise, rng)], ThermometerSettings())
+    assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
     # Noise below a tenth of the quantum is invisible; a tenth is assumed.
-    assert found.noise_sd_c == pytest.approx(max(noise, 0.1 * quantum), rel=0.1)
+    assert learned.noise_sd_c == pytest.approx(max(noise, 0.1 * quantum), rel=0.1)
     # An onset through the lag, in means of a minute: determined to a third.
-    assert found.lag_s == pytest.approx(300.0, rel=0.35)
-    assert found.fastest_ramp_k_min >= 1.0
+    assert learned.lag_s == pytest.approx(300.0, rel=0.35)
+    assert learned.fastest_ramp_k_min >= 1.0
 
 
 def test_whole_degrees_are_seen():
@@ -277,7 +277,7 @@ def test_a_slow_ramp_is_not_to_be_missed(rng):
     readings = Readings(stamps(n, 1.0), celsius)
     bag = reduced([block(still(rng, 30.0, (0.0, 0.0, 3000.0)))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
-    # The ramp is 0.15 K/min: seven tenths of it.
+    # The detector expects seven tenths of the ramp of 0.15 K/min.
     assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)
     assert slow.relaxed_rate_k_min < slow.smallest_ramp_k_min / 1.5
 

@@ -120,26 +120,26 @@ def solved(request):
 
 
 def test_the_mode_is_that_of_the_dense_problem(solved):
-    regression, prior, found = solved
-    dense = Dense(regression, prior, found)
+    regression, prior, mode = solved
+    dense = Dense(regression, prior, mode)
     at = dense.residual(np.zeros(dense.n))
-    gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(found.variance)
-    # In sds: Gauss-Newton is repeated until it converges.
+    gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(mode.variance)
+    # In units of sd: Gauss-Newton is repeated until it converges.
     assert np.abs(gradient).max() < 1e-4
     other = least_squares(
-        dense.residual, np.zeros(dense.n), x_scale=np.sqrt(found.variance), method='trf'
+        dense.residual, np.zeros(dense.n), x_scale=np.sqrt(mode.variance), method='trf'
     ).x
-    assert np.abs(other / np.sqrt(found.variance)).max() < 1e-3
+    assert np.abs(other / np.sqrt(mode.variance)).max() < 1e-3
 
 
 def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
-    regression, prior, found = solved
+    regression, prior, fitted = solved
     np.testing.assert_allclose(regression.start_root @ regression.start_root.T, START, atol=1e-12)
     beside = []
     for share in (prior.start_share, 0.1):
-        one = replace(prior, start_share=share)
-        mode = mode_of(regression, found.state, one)
-        dense = Dense(regression, one, mode)
+        wide = replace(prior, start_share=share)
+        mode = mode_of(regression, fitted.state, wide)
+        dense = Dense(regression, wide, mode)
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
@@ -151,7 +151,7 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
         # Laplace: -2 ln Z = misfit + ln det of noise, of prior and of Hessian; directions have no
         # prior.
-        precision = regression.precision(one, mode.layout)
+        precision = regression.precision(wide, mode.layout)
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
@@ -164,18 +164,18 @@ def test_truth_comes_out_without_noise(rng):
     windows, up = table_of(truth, 12, rng)
     regression, state = begin(windows, up)
     prior = replace(prior_of(truth), sigma=np.full(3, MICRO))
-    found = mode_of(regression, state, prior).state
+    mode = mode_of(regression, state, prior).state
     # The priors shift the result by 1e-6 of the sd, which is of the order of 1 ug.
-    np.testing.assert_allclose(found.kappa, truth.kappa, atol=1e-9)
-    np.testing.assert_allclose(found.bias, truth.bias, atol=1e-8)
-    np.testing.assert_allclose(found.misalignment, truth.misalignment, atol=1e-8)
-    np.testing.assert_allclose(found.up, up, atol=1e-8)
+    np.testing.assert_allclose(mode.kappa, truth.kappa, atol=1e-9)
+    np.testing.assert_allclose(mode.bias, truth.bias, atol=1e-8)
+    np.testing.assert_allclose(mode.misalignment, truth.misalignment, atol=1e-8)
+    np.testing.assert_allclose(mode.up, up, atol=1e-8)
     for part, atol in ((0, 1e-8), (1, 1e-9)):
-        weights = found.weights[part] / regression.rms
+        weights = mode.weights[part] / regression.rms
         np.testing.assert_allclose(weights, truth.weights[part], atol=atol)
-    np.testing.assert_allclose(found.start, 0.0, atol=1e-2)
+    np.testing.assert_allclose(mode.start, 0.0, atol=1e-2)
     # As in the compensator: forward and back again.
-    force = regression.force(found)
+    force = regression.force(mode)
     np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
 
 
@@ -190,7 +190,7 @@ def test_claimed_sd_is_the_scatter():
         windows, up = table_of(truth, 12, rng, n_windows=15, step_s=320.0)
         regression, state = begin(windows, up)
         errors.append(truth.errors(regression, regression.solve(state, prior_of(truth))))
-    every = {name: np.concatenate([one[name] for one in errors]) for name in errors[0]}
+    every = {name: np.concatenate([error[name] for error in errors]) for name in errors[0]}
     for name, values in every.items():
         assert 0.7 < np.sqrt(np.mean(values**2)) < 1.4, name
     assert np.sqrt(np.mean(np.concatenate([*every.values()]) ** 2)) == pytest.approx(1.0, abs=0.1)
@@ -206,56 +206,59 @@ def refit_of(whole, regression, prior, kept):
         whole.state, weights=whole.state.weights * units,
         **{name: getattr(whole.state, name)[there] for name in ('up', 'offset', 'tilt', 'start')},
     )  # fmt: skip
-    found = mode_of(rest, state, replace(prior, column_sd=prior.column_sd * units)).state
-    return replace(found, weights=found.weights / units)
+    mode = mode_of(rest, state, replace(prior, column_sd=prior.column_sd * units)).state
+    return replace(mode, weights=mode.weights / units)
 
 
-#: Linear in everything except directions, which are determined to some urad: exact except for
-#: rounding. Otherwise first order (positions) or two steps (sections): the remainder is the
-#: product of two changes, of the start and of the weight.
+#: With LINEAR groups the problem is linear in everything except directions, which are determined
+#: to some urad: the result is exact except for rounding. With PRODUCTS it is of first order
+#: (positions) or two steps (sections): the remainder is the product of the changes of start and
+#: weight.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
+
+
+def scored(groups, n, rng, *, n_windows, step_s, **changes):
+    """Fit a unit whose errors are of these groups; return its windows, ups and fit."""
+    used = np.isin(GROUPS, groups)
+    truth = Truth(on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used, start_sd=0.3,
+                  **changes)  # fmt: skip
+    windows, up = table_of(truth, n, rng, n_windows=n_windows, step_s=step_s)
+    regression, state = begin(windows, up)
+    prior = prior_of(truth, groups)
+    whole = mode_of(regression, state, prior)
+    return windows, up, regression, prior, whole, score_of(regression, whole)
 
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.2)])
 def test_leaving_a_position_out_is_a_fit_without_it(rng, groups, tolerance):
-    used = np.isin(GROUPS, groups)
-    truth = Truth(
-        on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used,
-        offset_sd=3.0 * MICRO, noise=Noise(0.1, 1000.0), start_sd=0.3,
+    windows, _, regression, prior, whole, score = scored(
+        groups, 14, rng, n_windows=20, step_s=240.0, offset_sd=3.0 * MICRO,
+        noise=Noise(0.1, 1000.0),
     )  # fmt: skip
-    windows, up = table_of(truth, 14, rng, n_windows=20, step_s=240.0)
-    regression, state = begin(windows, up)
-    prior = prior_of(truth, groups)
-    whole = mode_of(regression, state, prior)
-    score = score_of(regression, whole)
     before = regression.force(whole.state)
     for p in (0, 6, 13):
-        own = windows.position == p
-        expected = regression.force(refit_of(whole, regression, prior, ~own))[own]
-        size = np.linalg.norm(expected - before[own])
+        left = windows.position == p
+        expected = regression.force(refit_of(whole, regression, prior, ~left))[left]
+        size = np.linalg.norm(expected - before[left])
         assert size > 1e-7
-        assert np.linalg.norm(score.force[own] - expected) < tolerance * size
+        assert np.linalg.norm(score.force[left] - expected) < tolerance * size
         drift = expected - expected.mean(axis=0)
-        np.testing.assert_allclose(score.drift[own], drift, atol=tolerance * size)
-        assert score.positions.square[p] == pytest.approx(np.mean(score.drift[own] ** 2))
-        norm = np.linalg.norm(score.force[own], axis=1) - GRAVITY
+        np.testing.assert_allclose(score.drift[left], drift, atol=tolerance * size)
+        assert score.positions.square[p] == pytest.approx(np.mean(score.drift[left] ** 2))
+        norm = np.linalg.norm(score.force[left], axis=1) - GRAVITY
         assert score.norms.square[p] == pytest.approx(np.mean(norm**2))
 
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.05)])
 def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
-    used = np.isin(GROUPS, groups)
-    truth = Truth(on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used, start_sd=0.3)
-    windows, up = table_of(truth, 12, rng, n_windows=24, step_s=200.0)
-    regression, state = begin(windows, up)
-    prior = prior_of(truth, groups)
-    whole = mode_of(regression, state, prior)
-    score = score_of(regression, whole)
+    windows, up, regression, prior, whole, score = scored(
+        groups, 12, rng, n_windows=24, step_s=200.0
+    )
     for section in range(windows.n_sections):
-        own = windows.section == section
-        force = regression.force(refit_of(whole, regression, prior, ~own))
+        left = windows.section == section
+        force = regression.force(refit_of(whole, regression, prior, ~left))
         expected = np.concatenate(
-            [force[own & at] - force[~own & at].mean(axis=0)
+            [force[left & at] - force[~left & at].mean(axis=0)
              for at in (windows.position == p for p in range(12))]
         )  # fmt: skip
         size = np.sqrt(np.mean(expected**2))
@@ -275,15 +278,15 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
     regression, state = begin(windows, up)
     prior = prior_of(truth, misalignment_sd=1e-3)
-    found = mode_of(regression, state, prior)
-    score = score_of(regression, found)
+    mode = mode_of(regression, state, prior)
+    score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift needs neither; M keeps its value and its uncertainty.
+    # The drift needs neither bias nor scale; M keeps its value and its uncertainty.
     assert np.isfinite(score.positions.square).all()
-    np.testing.assert_allclose(found.state.misalignment, 0.0, atol=1e-6)
-    places = found.layout.misalignment
-    np.testing.assert_allclose(np.sqrt(found.variance[places]), 1e-3, rtol=1e-3)
+    np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
+    places = mode.layout.misalignment
+    np.testing.assert_allclose(np.sqrt(mode.variance[places]), 1e-3, rtol=1e-3)
 
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
@@ -297,25 +300,26 @@ def test_no_step_goes_uphill(seed):
     regression, state = begin(windows, up)
     prior, sizes = prior_of(truth), []
     for _ in range(10):
-        found = regression.solve(state, prior, n_steps=1)
-        state, dense = found.state, Dense(regression, prior, found)
+        solution = regression.solve(state, prior, n_steps=1)
+        state, dense = solution.state, Dense(regression, prior, solution)
         sizes.append(0.5 * float(np.sum(dense.residual(np.zeros(dense.n)) ** 2)))
     assert np.diff(sizes).max() < 1e-9 * sizes[0]
 
 
 def test_what_takes_no_part_any_more_is_gone(solved):
-    regression, prior, found = solved
+    regression, prior, mode = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
     # The result also holds for a state to which no step has been applied.
-    state = regression.solve(found.state, narrow, n_steps=0).state
+    state = regression.solve(mode.state, narrow, n_steps=0).state
     assert not state.weights[0, :, 2:4].any()
-    np.testing.assert_array_equal(state.weights[1], found.state.weights[1])
+    np.testing.assert_array_equal(state.weights[1], mode.state.weights[1])
 
 
 def test_published_huygens_coefficients_come_back(rng):
     # Huygens HASI accelerometer: sf = 1.30675e-3 - 1.35046e-7 T + 4.02821e-10 T^2 [A/g] and
-    # offset = -8.9642327e-4 + 3.83652e-6 T - 7.61e-9 T^2 [g], T in kelvin. Sampled on a chamber's
-    # program, fitted in our variables (t from 20 degC, counts of 1 pA), converted back.
+    # offset = -8.9642327e-4 + 3.83652e-6 T - 7.61e-9 T^2 [g], T in kelvin. The test samples the
+    # curves on a chamber's program, fits in our variables (t from 20 degC, counts of 1 pA) and
+    # converts back.
     sf, offset = (1.30675e-3, -1.35046e-7, 4.02821e-10), (-8.9642327e-4, 3.83652e-6, -7.61e-9)
     counts_per_ampere = 1e9
     windows, up = table_of(Truth(misalignment=np.zeros(3)), 12, rng)
@@ -337,17 +341,17 @@ def test_published_huygens_coefficients_come_back(rng):
     prior = prior_of(
         Truth(), column_sd=np.repeat([[1e-2], [1e-3]], 4, axis=1), sigma=np.full(3, 1e-6 * MICRO)
     )
-    found = mode_of(regression, state, prior).state
+    mode = mode_of(regression, state, prior).state
     for axis in range(3):
-        relative = np.append(1.0, found.weights[1, axis] / regression.rms)
-        scale = K0 * found.kappa[axis] * relative
+        relative = np.append(1.0, mode.weights[1, axis] / regression.rms)
+        scale = K0 * mode.kappa[axis] * relative
         shifted = np.polynomial.Polynomial([-293.15, 1.0])
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
         printed = [f'{got[0]:.5e}', f'{got[1]:.5e}', f'{got[2]:.5e}']
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
         # The bias is in counts, sf times offset: the offset in g is their ratio.
         bias = K0 * polynomial.polyval(
-            t[:40], np.append(found.bias[axis], found.weights[0, axis] / regression.rms)
+            t[:40], np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
         )
         ratio = bias / (polynomial.polyval(t[:40], scale) * GRAVITY)
         got = np.polynomial.Polynomial.fit(kelvin[:40], ratio, 2).convert().coef
@@ -367,14 +371,14 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise):
     posterior = mode_of(regression, state, prior)
     inactive = regression.inactive(posterior, asked)
     wide = column_sd(('board', 'idle'), 1e-2, 1e-3)
-    found = mode_of(regression, posterior.state, replace(prior, column_sd=prior.column_sd + wide))
-    places = found.layout.weights[:, :, asked].transpose(0, 2, 1).ravel()
-    covariance, expected = found.covariance[np.ix_(places, places)], np.linalg.inv(inactive.S)
+    mode = mode_of(regression, posterior.state, replace(prior, column_sd=prior.column_sd + wide))
+    places = mode.layout.weights[:, :, asked].transpose(0, 2, 1).ravel()
+    covariance, expected = mode.covariance[np.ix_(places, places)], np.linalg.inv(inactive.S)
     sd = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(
         covariance / np.outer(sd, sd), expected / np.outer(sd, sd), atol=0.01
     )
-    weights = found.state.weights[:, :, asked].transpose(0, 2, 1).ravel()
+    weights = mode.state.weights[:, :, asked].transpose(0, 2, 1).ravel()
     np.testing.assert_allclose(weights / sd, expected @ inactive.Q / sd, atol=0.05)
     gains = []
     for part in 10.0 ** np.arange(-2.0, -0.4, 0.25):
@@ -383,7 +387,7 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise):
     gain = max(gains) - posterior.log_evidence
     assert gain > 100.0
     assert inactive.gain(wide, asked) == pytest.approx(gain, rel=0.01)
-    # One after another, those that the data have: never what they do not, none twice.
+    # The columns that the data contain come one after another: no other column, none twice.
     chosen = inactive.chosen(wide, asked, 4.0, 9)
     assert np.array(GROUPS)[chosen].tolist() == ['board'] * (np.array(GROUPS) == 'board').sum()
     assert inactive.chosen(wide, asked, 4.0, 1).sum() == 1
@@ -393,10 +397,10 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise):
 def test_only_the_matrix_that_rounding_made_indefinite_gets_more_jitter(rng):
     root = rng.standard_normal((3, 3))
     good, bad = root @ root.T, np.ones((3, 3)) - 1e-10 * np.eye(3)
-    found = factored(np.stack((good, bad)))
-    np.testing.assert_array_equal(found[0], factored(good))
-    np.testing.assert_allclose(found[0] @ found[0].T, good, rtol=1e-11)
-    np.testing.assert_allclose(found[1] @ found[1].T, bad, atol=2e-9)
+    factor = factored(np.stack((good, bad)))
+    np.testing.assert_array_equal(factor[0], factored(good))
+    np.testing.assert_allclose(factor[0] @ factor[0].T, good, rtol=1e-11)
+    np.testing.assert_allclose(factor[1] @ factor[1].T, bad, atol=2e-9)
     with pytest.raises(np.linalg.LinAlgError):
         factored(np.stack((good, bad - 0.5 * np.eye(3))))
 

@@ -48,11 +48,11 @@ def selected_of(truth, windows, up, forced=()):
     regression, state = begin(windows, up)
     candidates = candidates_of(windows, forced)
     parts = []
-    found = select(regression, state, constants(truth), candidates, parts.append)
+    selection = select(regression, state, constants(truth), candidates, parts.append)
     # Progress rises.
     assert parts == sorted(parts)
     assert 0.0 < parts[0] <= parts[-1] <= 1.0
-    return regression, found
+    return regression, selection
 
 
 def chosen_groups(found):
@@ -80,36 +80,36 @@ def calm():
 
 
 def test_what_explains_nothing_is_not_chosen(calm):
-    regression, found, _ = calm
-    np.testing.assert_array_equal(found.posterior.prior.column_sd > 0.0, [~IDLE, ~IDLE])
-    assert chosen_groups(found) == {'curve', 'board'}
-    evidence = group_evidence(regression, found.posterior)
-    assert {(one.part, one.group) for one in evidence} == {
+    regression, chosen, _ = calm
+    np.testing.assert_array_equal(chosen.posterior.prior.column_sd > 0.0, [~IDLE, ~IDLE])
+    assert chosen_groups(chosen) == {'curve', 'board'}
+    evidence = group_evidence(regression, chosen.posterior)
+    assert {(group.part, group.group) for group in evidence} == {
         (part, group) for part in ('bias', 'scale') for group in ('curve', 'board')
     }
-    # Its weights are exactly 0.
-    assert not found.posterior.state.weights[..., IDLE].any()
+    # The weights of a column left out are exactly 0.
+    assert not chosen.posterior.state.weights[..., IDLE].any()
 
 
 def test_models_that_were_looked_at_show_their_left_out_errors(calm):
-    _, found, truth = calm
-    rms = {trial.groups: trial.score.rms for trial in found.trials}
+    _, selected, truth = calm
+    rms = {trial.groups: trial.score.rms for trial in selected.trials}
     # The trials contain the constants, then the curve; the error is the size of the missing
     # effect.
     assert [*rms][:2] == [(), ('curve',)]
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
-    (chosen,) = (trial for trial in found.trials if trial.is_chosen)
-    assert chosen.score is found.score
-    # Left-out windows have their white noise, plus the uncertainty of the fit to the others.
-    assert 1.0 < found.score.rms / truth.sigma[0] < 1.15
-    assert all(is_better(trial.score, found.score) for trial in found.trials[:2])
+    (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
+    assert chosen.score is selected.score
+    # Errors of left-out windows: white noise, plus the uncertainty of the fit to the others.
+    assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
+    assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
 
 def test_what_is_forced_stays(calm):
     regression, _, truth = calm
-    _, found = selected_of(truth, regression.windows, calm[1].posterior.state.up, ('idle',))
-    assert chosen_groups(found) == set(ALL)
-    assert (found.posterior.prior.column_sd[:, IDLE] > 0.0).all()
+    _, chosen = selected_of(truth, regression.windows, calm[1].posterior.state.up, ('idle',))
+    assert chosen_groups(chosen) == set(ALL)
+    assert (chosen.posterior.prior.column_sd[:, IDLE] > 0.0).all()
 
 
 @pytest.mark.parametrize(
@@ -126,9 +126,9 @@ def test_a_group_must_explain_more_than_an_accident(where, is_chosen):
     }[where]  # fmt: skip
     added = np.outer(windows.columns[:, 4] * rows, [20.0, -30.0, 25.0]) * MICRO
     table = replace(windows, mean=windows.mean + NOMINAL * added)
-    _, found = selected_of(truth, table, up)
-    assert any('idle' in trial.groups for trial in found.trials)
-    assert ('idle' in chosen_groups(found)) == is_chosen
+    _, chosen = selected_of(truth, table, up)
+    assert any('idle' in trial.groups for trial in chosen.trials)
+    assert ('idle' in chosen_groups(chosen)) == is_chosen
 
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
@@ -141,15 +141,15 @@ def test_a_part_that_lags_is_found_although_no_curve_helps_alone(n_positions, st
     windows, up = table_of(
         truth, n_positions, np.random.default_rng(5), n_windows=30, step_s=step_s
     )
-    _, found = selected_of(truth, windows, up)
-    assert chosen_groups(found) == {'curve', 'board'}
-    assert found.score.rms < 1.2 * truth.sigma[0]
+    _, chosen = selected_of(truth, windows, up)
+    assert chosen_groups(chosen) == {'curve', 'board'}
+    assert chosen.score.rms < 1.2 * truth.sigma[0]
 
 
 def test_noises_come_out(noisy):
-    _, found, truth = noisy
-    prior = found.posterior.prior
-    assert {'curve', 'board'} <= chosen_groups(found)
+    _, chosen, truth = noisy
+    prior = chosen.posterior.prior
+    assert {'curve', 'board'} <= chosen_groups(chosen)
     # 1080 windows per axis: white noise is determined to 3 %, slightly worse with the slow noise.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
     # Positions last six correlation times, and curves absorb a part of the slow noise.
@@ -161,20 +161,20 @@ def test_noises_come_out(noisy):
 
 
 def test_white_noise_is_not_taken_for_slow_noise(calm):
-    _, found, truth = calm
-    np.testing.assert_allclose(found.posterior.prior.sigma, truth.sigma, rtol=0.12)
-    assert found.posterior.prior.noise == Noise()
+    _, chosen, truth = calm
+    np.testing.assert_allclose(chosen.posterior.prior.sigma, truth.sigma, rtol=0.12)
+    assert chosen.posterior.prior.noise == Noise()
 
 
 def test_prior_sds_are_those_of_the_weights(calm):
     # The fixed point: sd^2 = sum of squares / effective parameters, three if all are determined;
     # the hyperprior of a factor of ten shifts it by 1 / (2 x 3 x 5.3) of the distance.
-    regression, found, truth = calm
+    regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
-    np.testing.assert_allclose(found.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
-    for one in group_evidence(regression, found.posterior):
-        assert 0.0 < one.effective_parameters <= 6.0 + 1e-9
-        assert len(one.prior_sd) == 2
+    np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
+    for group in group_evidence(regression, chosen.posterior):
+        assert 0.0 < group.effective_parameters <= 6.0 + 1e-9
+        assert len(group.prior_sd) == 2
 
 
 def test_no_weight_is_believed_steeper_than_a_data_sheet():
@@ -184,15 +184,15 @@ def test_no_weight_is_believed_steeper_than_a_data_sheet():
     regression, state = begin(windows, up)
     candidates = candidates_of(windows)
     prior = replace(constants(truth), column_sd=candidates.typical)
-    found = settle(regression, state, prior, candidates).prior
-    assert (found.column_sd <= candidates.largest).all()
-    per_kelvin = found.column_sd[0, 0] / windows.kelvins[0]
+    settled = settle(regression, state, prior, candidates).prior
+    assert (settled.column_sd <= candidates.largest).all()
+    per_kelvin = settled.column_sd[0, 0] / windows.kelvins[0]
     assert per_kelvin == pytest.approx(STEEPEST[0])
 
 
 def test_truth_lies_within_the_claimed_sd(noisy):
-    regression, found, truth = noisy
-    errors = truth.errors(regression, found.posterior)
+    regression, chosen, truth = noisy
+    errors = truth.errors(regression, chosen.posterior)
     # Pruned weights have no sd; the true weights of the idle columns are 0.
     every = np.concatenate([*errors.values()])
     # About thirty numbers: their RMS is determined to 13 %, slightly less with estimated prior sd.
@@ -202,15 +202,15 @@ def test_truth_lies_within_the_claimed_sd(noisy):
 
 
 def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
-    # Savage-Dickey against brute force: solve without the group, with the same prior for the rest.
-    # Exact in a linear problem; the directions are linear to noise / g.
+    # Savage-Dickey against brute force: solve without the group, with the same prior for all other
+    # groups. Exact in a linear problem; the directions are linear to noise / g.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
     prior = prior_of(truth, column_sd=column_sd(ALL, 3e-4, 3e-5))
     posterior = mode_of(regression, state, prior)
     evidence = group_evidence(regression, posterior)
-    assert [(one.part, one.group) for one in evidence] == [
+    assert [(group.part, group.group) for group in evidence] == [
         (part, group) for part in ('bias', 'scale') for group in ALL
     ]
     for one in evidence:
@@ -219,16 +219,16 @@ def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
         without = mode_of(regression, posterior.state, replace(prior, column_sd=rest))
         fall = posterior.log_evidence - without.log_evidence
         assert one.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), one
-    falls = {(one.part, one.group): one.log_evidence_change for one in evidence}
+    falls = {(group.part, group.group): group.log_evidence_change for group in evidence}
     assert falls['bias', 'board'] > 10.0
     assert falls['bias', 'idle'] < 0.5
 
 
 def test_what_a_group_explains_is_what_it_adds(calm):
-    regression, found, truth = calm
+    regression, chosen, truth = calm
     columns = regression.windows.columns[:, 2:4]
-    evidence = group_evidence(regression, found.posterior)
-    explains = {(one.part, one.group): one.explains_m_s2 for one in evidence}
+    evidence = group_evidence(regression, chosen.posterior)
+    explains = {(group.part, group.group): group.explains_m_s2 for group in evidence}
     expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
     # About 100 ug, with a noise of 2 ug.
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
@@ -279,10 +279,10 @@ def test_of_two_columns_that_are_almost_one_the_better_stays():
     columns = windows.columns.copy()
     noise = np.random.default_rng(7).standard_normal(len(columns))
     columns[:, 4] = columns[:, 2] + 0.02 * columns[:, 2].std() * noise
-    regression, found = selected_of(truth, replace(windows, columns=columns), up)
-    assert found.posterior.prior.column_sd[0, 2] > 0.0
-    assert found.posterior.prior.column_sd[0, 4] == 0.0
-    left = regression.residual(found.posterior.state, found.posterior.layout) / truth.sigma
+    regression, chosen = selected_of(truth, replace(windows, columns=columns), up)
+    assert chosen.posterior.prior.column_sd[0, 2] > 0.0
+    assert chosen.posterior.prior.column_sd[0, 4] == 0.0
+    left = regression.residual(chosen.posterior.state, chosen.posterior.layout) / truth.sigma
     assert np.sqrt(np.mean(left**2)) < 1.05
 
 
@@ -290,9 +290,9 @@ def test_of_two_columns_that_are_almost_one_the_better_stays():
 def test_how_bags_begin_is_learnt(start_sd, lower, upper):
     truth = Truth(start_sd=start_sd)
     windows, up = table_of(truth, 18, np.random.default_rng(9), n_windows=60)
-    _, found = selected_of(truth, windows, up)
-    assert lower <= found.posterior.prior.start_share <= upper
-    assert chosen_groups(found) == {'curve', 'board'}
+    _, chosen = selected_of(truth, windows, up)
+    assert lower <= chosen.posterior.prior.start_share <= upper
+    assert chosen_groups(chosen) == {'curve', 'board'}
 
 
 @pytest.mark.parametrize('away', [0.0, 30.0])
@@ -314,11 +314,11 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
         constants(truth), column_sd=candidates.typical, informative=priors[-1]
     )  # fmt: skip
     fixed = replace(candidates, fixed=np.ones((2, 6), dtype=bool))
-    found = fit_all(regression, state, prior, fixed, priors)
-    assert found.posterior.prior.informative is priors[int(away > 0.0)]
-    curve = unit_of(found.posterior.state, layout)[places]
+    chosen = fit_all(regression, state, prior, fixed, priors)
+    assert chosen.posterior.prior.informative is priors[int(away > 0.0)]
+    curve = unit_of(chosen.posterior.state, layout)[places]
     # The same data: both results differ by less than their uncertainties.
-    assert np.abs(curve - true).max() < 2.0 * np.sqrt(found.posterior.variance[places]).max()
+    assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()
 
 
 def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
@@ -327,13 +327,13 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
     stiff = replace(windows, tilt=windows.tilt[:, :0])
 
     def drift_left(table):
-        regression, found = selected_of(truth, table, up)
-        missed = found.posterior.state.weights[0] / regression.rms - truth.on_bias
-        return found, float(np.sqrt(np.mean((table.columns @ missed.T) ** 2)))
+        regression, chosen = selected_of(truth, table, up)
+        missed = chosen.posterior.state.weights[0] / regression.rms - truth.on_bias
+        return chosen, float(np.sqrt(np.mean((table.columns @ missed.T) ** 2)))
 
-    found, left = drift_left(windows)
+    chosen, left = drift_left(windows)
     # 12 positions x 2 angles x 2 columns: a sd of 10 %.
-    assert 0.7 < found.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
+    assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
     # A tilt of 5 urad changes any axis by 5 ug; the noise of 720 windows is 0.1 ug for each
     # weight.
     assert left < 0.5 * MICRO
@@ -342,23 +342,22 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
 
 def test_a_stiff_support_is_not_seen_tilting(calm):
     # Less than the noise of the windows of a tilt, 2 ug / sqrt(60).
-    _, found, truth = calm
+    _, chosen, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)
-    tilt = GRAVITY * found.posterior.state.tilt
+    tilt = GRAVITY * chosen.posterior.state.tilt
     assert np.abs(tilt).max() < hidden
     assert np.sqrt(np.mean(tilt**2)) < 0.5 * hidden
 
 
 def claimed(n_positions, gravity_sd=0.0):
-    """Return claimed and fitted covariance of a unit whose mounting repeats to 20 ug."""
     truth = Truth(offset_sd=20.0 * MICRO)
     windows, up = table_of(truth, n_positions, np.random.default_rng(1), n_windows=20)
     regression, state = begin(without_starts(windows), up)
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
-    found = select(regression, state, constants(truth), candidates)
-    claim = claim_of(regression, found.posterior, None, gravity_sd)
-    return claim.covariance, found.posterior.covariance
+    selection = select(regression, state, constants(truth), candidates)
+    claim = claim_of(regression, selection.posterior, None, gravity_sd)
+    return claim.covariance, selection.posterior.covariance
 
 
 def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting():
@@ -379,7 +378,7 @@ def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once():
     (without, _), (within, _) = claimed(12), claimed(12, 5e-4)
     added = within - without
     kappa = np.arange(3) * ((len(without) - 3) // 3)
-    # The relative error of K is that of g in each axis; nothing else has an error.
+    # The relative error of K is that of g in each axis; no other parameter has an error.
     both = np.ix_(kappa, kappa)
     np.testing.assert_allclose(added[both], (5e-4 / GRAVITY) ** 2, rtol=2e-3)
     correlation = added[both] / np.sqrt(np.outer(np.diag(added)[kappa], np.diag(added)[kappa]))

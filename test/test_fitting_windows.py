@@ -67,7 +67,7 @@ def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng):
     n, step = 3000, 2
     board = 20.0 + np.cumsum(0.03 * rng.standard_normal(n))
     gradients = [np.cumsum(0.02 * rng.standard_normal(n)), 1.0 + 0.1 * rng.standard_normal(n)]
-    found = memory_on_grid(spec, float(step), board, gradients)
+    on_grid = memory_on_grid(spec, float(step), board, gradients)
     memory = ThermalMemory(spec)
     for k in range(n):
         stamp = k * step * SECOND
@@ -77,7 +77,7 @@ def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng):
         row = memory.at(stamp, float(board[k]), [float(g[k]) for g in gradients])
         if k % 100 == 99:
             # The same recursion in another order of additions.
-            np.testing.assert_allclose(found[k], row, atol=1e-9)
+            np.testing.assert_allclose(on_grid[k], row, atol=1e-9)
 
 
 def test_columns_are_those_of_the_tracker(bags):
@@ -151,8 +151,8 @@ def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
         readings = Readings(readings.stamp_ns, value)
     else:
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
-    told = replace(bag, temperatures={**bag.temperatures, name: readings})
-    windows = windows_of([told])
+    message = replace(bag, temperatures={**bag.temperatures, name: readings})
+    windows = windows_of([message])
     # Silence: the time-out of 60 s, five intervals of 4 s, and a window. A constant reading is
     # detected when the other thermometer changes.
     seen_s = 600.0 if is_stuck else 120.0
@@ -194,21 +194,21 @@ def test_the_lag_of_a_column_moves_it_as_its_slope_says():
     ],
 )
 def test_curves(bags, options, static, dynamic, is_shared):
-    found = sets_of(replace(OPTIONS, **options), bags)
-    assert isinstance(found.static, static)
-    assert found.is_shared == is_shared
-    assert dynamic is None or found.dynamic.n_free == dynamic
+    sets = sets_of(replace(OPTIONS, **options), bags)
+    assert isinstance(sets.static, static)
+    assert sets.is_shared == is_shared
+    assert dynamic is None or sets.dynamic.n_free == dynamic
     t = np.linspace(-5.0, 15.0, 9)
     weight = np.linspace(0.0, 1.0, 9)
-    columns = found.columns(t, weight)
-    assert len(columns) == len(found.groups) == found.static.n_free + 1 + found.dynamic.n_free
+    columns = sets.columns(t, weight)
+    assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
     # No effect at the reference temperature, and no effect of the dynamic set in the static
     # regime.
-    nothing = found.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
+    nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):
-        expected = [0.0, 0.5, 1.0] if k == found.level else 0.0
+        expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0
         np.testing.assert_allclose(column, expected, atol=1e-12)
-    assert all(column[0] == 0.0 for column in columns[found.static.n_free :])
+    assert all(column[0] == 0.0 for column in columns[sets.static.n_free :])
 
 
 @pytest.fixture(scope='module', params=['golovach', 'linear', 'exponential', 'spline'])
@@ -231,7 +231,6 @@ def fitted(request, all_bags):
 
 
 def states_of(windows, calibration):
-    """Return states with the raw columns of the windows in their places."""
     columns = calibration.response
     spec = memory_of(columns)
     layout = Layout(spec)
@@ -281,17 +280,17 @@ def test_covariance_of_the_file_is_that_of_the_claim(fitted):
     state = result.fit.posterior.state
     K = np.array([axis.scale_factor for axis in calibration.axes])
     sd = np.sqrt(np.diag(claim.covariance))
-    found = np.sqrt(np.diag(covariance))
+    by_file = np.sqrt(np.diag(covariance))
     for axis in range(3):
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         expected = sd[claim.layout.bias[axis]] * K[axis] / state.kappa[axis]
-        assert found[bias] == pytest.approx(expected, rel=1e-4)
+        assert by_file[bias] == pytest.approx(expected, rel=1e-4)
         expected = sd[claim.layout.kappa[axis]] / state.kappa[axis]
-        assert found[scale] == pytest.approx(expected, rel=1e-4)
+        assert by_file[scale] == pytest.approx(expected, rel=1e-4)
         # The stated error of gravity is included.
-        assert found[scale] > 1e-4 / STANDARD_GRAVITY
+        assert by_file[scale] > 1e-4 / STANDARD_GRAVITY
     places = claim.layout.misalignment[[0, 2]]
-    np.testing.assert_allclose(found[-3:][[0, 2]], sd[places], rtol=1e-4)
+    np.testing.assert_allclose(by_file[-3:][[0, 2]], sd[places], rtol=1e-4)
 
 
 def test_sections_and_kelvins_by_hand(bags):
@@ -299,12 +298,11 @@ def test_sections_and_kelvins_by_hand(bags):
     data, t = windows.data, windows.temperature - 20.0
     for p in range(data.n_positions):
         # Equal parts of the program, in order.
-        own = data.section[data.position == p]
-        assert (np.diff(own) >= 0).all()
-        assert np.ptp(np.bincount(own, minlength=N_SECTIONS)) <= 2
+        section = data.section[data.position == p]
+        assert (np.diff(section) >= 0).all()
+        assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # A line has an RMS of its own; t^2 is steepest, 2 t, at the largest distance from the
-    # reference.
-    lines = [0, *(k for k, one in enumerate(bank(), start=6) if one.group == 'board')]
+    # A line has its own RMS; t^2 is steepest, 2 t, at the largest distance from the reference.
+    lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

@@ -35,13 +35,11 @@ pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `flee
 
 @pytest.fixture(scope='module')
 def client():
-    """Start two workers once for this file."""
     with connected(None, 2) as client:
         yield client
 
 
 def contents(folder):
-    """Return all files of a folder, with their times of change."""
     return {
         str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
         for path in sorted(folder.rglob('*'))
@@ -61,18 +59,18 @@ def fleet(tmp_path_factory):
 
 def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(client, fleet, tmp_path):
     out = tmp_path / 'out'
-    told = []
+    collected = []
 
     def tell(_n, _total, row):
         if row is None:
             return
         # Both workers are fitting a unit when the first result arrives.
-        if not told:
+        if not collected:
             os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
-        told.append(str(row['name']))
+        collected.append(str(row['name']))
 
     result = fit_fleet(str(fleet), out, OPTIONS, client=client, tell=tell)
-    assert sorted(told) == ['A/good', 'A/torn', 'B/exchanged']
+    assert sorted(collected) == ['A/good', 'A/torn', 'B/exchanged']
     assert result.n_done == 3
     rows = {str(row['name']): row for row in result.rows}
     verdicts = {name: str(row['verdict']).split(',')[0] for name, row in rows.items()}
@@ -105,8 +103,8 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(client, fl
     (out / 'units/B/exchanged').rename(out / 'units/B/other')
     (out / 'units/A/torn/calibration.yaml').write_text('edited')
     results = Results(out)
-    found = {unit.name: results.look_up(unit, OPTIONS) for unit in find_units(Storage(str(fleet)))}
-    assert {name for name, known in found.items() if known} == {'A/good'}
+    seen = {unit.name: results.look_up(unit, OPTIONS) for unit in find_units(Storage(str(fleet)))}
+    assert {name for name, known in seen.items() if known} == {'A/good'}
 
 
 def test_paths_that_climb_are_no_door(client, tmp_path):
@@ -116,7 +114,7 @@ def test_paths_that_climb_are_no_door(client, tmp_path):
     result = fit_fleet(str(fleet / '..' / 'fleet'), tmp_path / 'out', OPTIONS, client=client)
     # A folder whose name begins with a dot is hidden.
     assert [row['name'] for row in result.rows] == ['one', 'three..']
-    made = {one.relative_to(tmp_path).parts[:2] for one in tmp_path.rglob('*.yaml')}
+    made = {path.relative_to(tmp_path).parts[:2] for path in tmp_path.rglob('*.yaml')}
     assert made == {('out', 'units')}
 
 
@@ -126,11 +124,8 @@ def test_bags_that_cannot_be_read_any_more_take_no_result_away(client, tmp_path)
     options = replace(OPTIONS, certificates=True)
     first = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, client=client)
     before = contents(tmp_path / 'out' / 'units')
-    assert {Path(name).name for name in before} == {
-        'calibration.yaml',
-        'certificate.html',
-        'result.json',
-    }
+    expected = {'calibration.yaml', 'certificate.html', 'result.json'}
+    assert {Path(name).name for name in before} == expected
     kept = [(path, path.stat().st_mtime_ns, path.read_bytes()) for path in bags]
     for path in bags:
         path.write_bytes(b'')
@@ -189,14 +184,14 @@ def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
     while not any(map(children_of, children_of(process.pid))):
         assert process.poll() is None
         pause.wait(0.01)
-    # A terminal sends it to all processes of the group.
+    # A terminal sends SIGINT to all processes of the group.
     os.killpg(process.pid, signal.SIGINT)
-    said, _ = process.communicate(timeout=60)
+    printed, _ = process.communicate(timeout=60)
     assert process.returncode == 130
-    said = said.splitlines()
+    printed = printed.splitlines()
     # Whether Dask had started a worker is random.
-    assert said in (
-        [f'thermo_comp: interrupted: {state}, kept in out; the same command does the others']
+    assert printed in (
+        [f'thermo_comp: interrupted: {state}, kept in out; the same command continues']
         for state in ('no test has begun', '0 of 1 test done')
     )
 
@@ -232,8 +227,6 @@ class TestScheduler:
 
 
 class _Future:
-    """A finished task."""
-
     def __init__(self, status, error=None):
         self.status, self._error = status, error
 
@@ -246,7 +239,7 @@ class _Future:
     [
         (
             _Future('error', distributed.KilledWorker('task', None, 3)),
-            'its worker died 4 times: too little memory?',
+            'the worker of its task died 4 times: too little memory?',
         ),
         (_Future('error', MemoryError('no\n room')), 'MemoryError: no room'),
         (_Future('lost'), 'the scheduler was lost'),
@@ -272,7 +265,6 @@ def test_a_fleet_without_dask_says_what_to_install(tmp_path, monkeypatch, capsys
 
 
 def command(folder, out, *options):
-    """Run the command in this process, and return its exit code."""
     return run_command(['fleet', 'fit', str(folder), '-o', str(out), *options])
 
 
@@ -282,9 +274,9 @@ def test_the_command_s_mistakes(tmp_path, capsys):
     assert command(tmp_path, tmp_path / 'out', '--gravity', '-1') == 1
     assert 'local gravity -1 m/s^2 is not found on Earth' in capsys.readouterr().err
     assert command(tmp_path, tmp_path / 'out', '--gravity', '9.81') == 1
-    said = capsys.readouterr().err
-    assert 'no bag in it' in said
-    assert len(said.splitlines()) == 1
+    printed = capsys.readouterr().err
+    assert 'no bag in it' in printed
+    assert len(printed.splitlines()) == 1
 
 
 def test_a_unit_without_a_calibration_leaves_exit_code_1(client, tmp_path, capsys):
@@ -293,13 +285,13 @@ def test_a_unit_without_a_calibration_leaves_exit_code_1(client, tmp_path, capsy
     fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', same, client=client)
     arguments = (tmp_path / 'bags', tmp_path / 'out', '--gravity', '9.81')
     assert command(*arguments) == 1
-    said = capsys.readouterr()
-    assert '- u: the board temperature leads the case' in said.out
-    assert '0 of 1 test calibrated; 0 tests done in this run, 1 in an earlier one' in said.out
-    assert said.err == ''
+    text = capsys.readouterr()
+    assert '- u: the board temperature leads the case' in text.out
+    assert '0 of 1 test calibrated; 0 tests done in this run, 1 in an earlier one' in text.out
+    assert text.err == ''
     assert command(*arguments, '--with-prior') == 1
-    said = '- fitted without a prior: 0 units with complete data, 3 are needed'
-    assert said in capsys.readouterr().out
+    text = '- fitted without a prior: 0 units with complete data, 3 are needed'
+    assert text in capsys.readouterr().out
     assert command(*arguments, '--json') == 1
     data = json.loads(capsys.readouterr().out)
     assert data['prior'] is None
@@ -325,7 +317,7 @@ def test_siblings_help_a_unit_that_lacks_data(client, tmp_path):
     assert [row['is_whole'] for row in alone.rows] == [0, 1, 1, 1]
     assert alone.prior == tmp_path / 'out' / 'prior.yaml'
     of_type = load_calibration(alone.prior).provenance
-    assert [one.name for one in of_type.sources] == ['s1', 's2', 's3']
+    assert [source.name for source in of_type.sources] == ['s1', 's2', 's3']
     before = contents(tmp_path / 'out' / 'units')
 
     helped = fit_fleet(*arguments, client=client, with_prior=True)
@@ -339,7 +331,7 @@ def test_siblings_help_a_unit_that_lacks_data(client, tmp_path):
         [np.array([float(one[name.format(axis)]) for axis in 'xyz']) for one in (row, before_row)]
         for name in ('scale_{}', 'scale_sd_{}_ppm')
     )
-    after, before_it = (float(np.linalg.norm(one / scale - 1.0)) for one in errors)
+    after, before_it = (float(np.linalg.norm(error / scale - 1.0)) for error in errors)
     assert after < before_it
     assert (np.abs(errors[0] / scale - 1.0) < 3e-6 * sds[0]).all()
     assert (sds[0] < 0.5 * sds[1]).all()

@@ -39,15 +39,14 @@ def memory():
 
 
 def to_sqlite(path, target):
-    """Write a bag again in the other storage of rosbag2."""
     with (
         Reader(path) as reader,
         Writer(target, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer,
     ):
         store = get_typestore(Stores.ROS2_JAZZY)
         connections = {
-            one.topic: writer.add_connection(one.topic, one.msgtype, typestore=store)
-            for one in reader.connections
+            link.topic: writer.add_connection(link.topic, link.msgtype, typestore=store)
+            for link in reader.connections
         }
         for connection, stamp_ns, data in reader.messages():
             writer.write(connections[connection.topic], stamp_ns, data)
@@ -80,11 +79,11 @@ class TestElsewhere:
             (tmp_path / 'other' / 'other.db3').rename(path.with_name(name))
             shutil.rmtree(path)
         fs.put(f'{tmp_path}/bags/', f'{url}/', recursive=True)
-        (found,) = find_units(Storage(url))
-        assert list(found.bags) == [f'unit/{name}']
+        (units,) = find_units(Storage(url))
+        assert list(units.bags) == [f'unit/{name}']
         (tmp_path / 'scratch').mkdir()
         monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'scratch'))
-        outcome = process_unit(found, url, OPTIONS)
+        outcome = process_unit(units, url, OPTIONS)
         assert outcome.row['left_out'] == ''
         assert outcome.hashes == {f'unit/{name}': digest(path.with_name(name))}
         assert list((tmp_path / 'scratch').iterdir()) == []
@@ -124,8 +123,8 @@ class TestDiscovery:
             (tmp_path / name).touch()
         (tmp_path / '.hidden').mkdir()
         (tmp_path / '.hidden' / 'x.mcap').touch()
-        found = find_units(Storage(str(tmp_path)))
-        assert [(one.name, one.lot, len(one.bags)) for one in found] == [
+        units = find_units(Storage(str(tmp_path)))
+        assert [(one.name, one.lot, len(one.bags)) for one in units] == [
             ('lot-A/u1', 'lot-A', 2),
             ('lot-B/u2', 'lot-B', 1),
             ('u3', '', 1),
@@ -136,8 +135,8 @@ class TestDiscovery:
             write_unit(tmp_path, seed, 2, names=names)
         write_unit(tmp_path, 3, 1, serial='', names=['e.mcap'])
         (tmp_path / 'f.mcap').write_bytes(b'no bag')
-        found = find_units(Storage(str(tmp_path)))
-        assert {one.name: list(one.bags) for one in found} == {
+        units = find_units(Storage(str(tmp_path)))
+        assert {one.name: list(one.bags) for one in units} == {
             'mems-0001': ['a.mcap', 'd.mcap'],
             'mems-0002': ['b.mcap', 'c.mcap'],
             # The serial follows from the folder only; one bag cannot be opened at all.
@@ -148,9 +147,9 @@ class TestDiscovery:
     def test_names_that_somebody_chose_stand_on_one_line(self, tmp_path):
         write_unit(tmp_path / 'lot\x1b[31m' / 'a\nb', 1, 1)
         write_unit(tmp_path, 1, 1, serial='S1\nCAL_ACC0_ID 7', names=['loose.mcap'])
-        found = find_units(Storage(str(tmp_path)))
-        assert [one.name for one in found] == ['S1\\nCAL_ACC0_ID 7', 'lot\\x1b[31m/a\\nb']
-        rows = [process_unit(one, str(tmp_path), OPTIONS).row for one in found]
+        units = find_units(Storage(str(tmp_path)))
+        assert [one.name for one in units] == ['S1\\nCAL_ACC0_ID 7', 'lot\\x1b[31m/a\\nb']
+        rows = [process_unit(one, str(tmp_path), OPTIONS).row for one in units]
         assert rows[0]['verdict'] == 'refused'
         assert str(rows[0]['problem']).startswith('`serial` must be one printable line')
         for row in rows:
@@ -164,8 +163,8 @@ class TestDiscovery:
         (fleet / 'unit').symlink_to(tmp_path / 'store' / 'u1')
         (fleet / 'again').symlink_to(fleet)
         (fleet / 'nowhere.mcap').symlink_to(tmp_path / 'gone')
-        found = find_units(Storage(str(fleet)))
-        assert [name for one in found for name in one.bags] == ['unit/1.mcap']
+        units = find_units(Storage(str(fleet)))
+        assert [name for one in units for name in one.bags] == ['unit/1.mcap']
 
     def test_a_relative_path_is_the_same_for_every_process(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
@@ -184,8 +183,8 @@ class TestDiscovery:
 def test_damage_is_the_bag_s_not_the_file_system_s(tmp_path):
     (path,) = write_unit(tmp_path / 'u', 1, 1)
     damage(path)
-    (found,) = find_units(Storage(str(tmp_path)))
-    outcome = process_unit(found, str(tmp_path), OPTIONS)
+    (units,) = find_units(Storage(str(tmp_path)))
+    outcome = process_unit(units, str(tmp_path), OPTIONS)
     assert outcome.is_final
     assert str(outcome.row['left_out']).startswith('u/01.mcap: damaged: ')
     assert outcome.hashes == {'u/01.mcap': digest(path)}

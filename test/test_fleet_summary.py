@@ -55,10 +55,10 @@ class TestOutliers:
     def test_one_unit_stands_out_in_one_thing(self, rng):
         rows = fleet_of(100, rng)
         rows[17] = {**rows[17], 'bias_y_ug': 50.0 * 12.0}
-        (found,) = summarise(rows).outliers
-        assert (found.serial, found.label, found.unit) == ('S017', 'bias y', 'µg')
-        assert found.value == 600.0
-        assert found.z == pytest.approx(12.0, rel=0.3)
+        (outliers,) = summarise(rows).outliers
+        assert (outliers.serial, outliers.label, outliers.unit) == ('S017', 'bias y', 'µg')
+        assert outliers.value == 600.0
+        assert outliers.z == pytest.approx(12.0, rel=0.3)
 
     def test_a_twelfth_of_bad_units_does_not_hide_them(self, rng):
         rows = fleet_of(60, rng)
@@ -89,20 +89,20 @@ class TestDrift:
         first = fleet_of(10, rng)
         second = fleet_of(10, rng, day=30.0, like=first)
         second[3] = {**second[3], 'bias_x_ug': float(first[3]['bias_x_ug']) + 40.0}
-        drifts = {one.serial: one for one in summarise([*second, *first]).drifts}
+        drifts = {drift.serial: drift for drift in summarise([*second, *first]).drifts}
         assert len(drifts) == 10
-        assert [serial for serial, one in drifts.items() if one.is_significant] == ['S003']
-        found = drifts['S003']
-        assert (found.worst.constant, found.worst.unit, found.days) == ('bias x', 'µg', 30.0)
-        assert found.worst.change == pytest.approx(40.0)
-        assert found.worst.sd == pytest.approx(2.0 * np.sqrt(2.0))
-        assert (found.earlier, found.later) == ('/u003@0', '/u003@30')
+        assert [serial for serial, drift in drifts.items() if drift.is_significant] == ['S003']
+        worst = drifts['S003']
+        assert (worst.worst.constant, worst.worst.unit, worst.days) == ('bias x', 'µg', 30.0)
+        assert worst.worst.change == pytest.approx(40.0)
+        assert worst.worst.sd == pytest.approx(2.0 * np.sqrt(2.0))
+        assert (worst.earlier, worst.later) == ('/u003@0', '/u003@30')
 
     def test_a_scale_factor_drifts_in_ppm(self, rng):
         first = fleet_of(2, rng)
         second = fleet_of(2, rng, day=7.0, like=first)
         second[0] = {**second[0], 'scale_z': float(first[0]['scale_z']) * (1.0 + 90e-6)}
-        drift = next(one for one in summarise(first + second).drifts if one.serial == 'S000')
+        drift = next(drift for drift in summarise(first + second).drifts if drift.serial == 'S000')
         assert (drift.worst.constant, drift.worst.unit) == ('scale factor z', 'ppm')
         assert drift.worst.change == pytest.approx(90.0)
 
@@ -119,7 +119,6 @@ class TestDrift:
 
 
 def hostile(rng):
-    """Draw a fleet whose texts contain mark-up and escape sequences."""
     evil = '<script>alert(1)</script>"&$x_1$'
     first = fleet_of(12, rng, lots=('A', evil))
     rows = [*first, *fleet_of(12, rng, lots=('A', evil), day=400.0, like=first)]

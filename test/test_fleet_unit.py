@@ -38,7 +38,6 @@ def fleet(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def brief(fleet):
-    """Fit the unit without a certificate, once for this file."""
     return processed(fleet)
 
 
@@ -55,12 +54,12 @@ def test_the_verdict_is_that_of_evaluate(fleet, brief, cli, tmp_path):
     row, bags = brief.row, sorted((fleet / 'lot-A' / 'unit1').iterdir())
     calibration = tmp_path / 'unit.yaml'
     calibration.write_text(brief.calibration)
-    found = json.loads(cli('evaluate', *bags, '-c', calibration, '--json', code=None).stdout)
-    assert row['verdict'] == found['verdict']
-    assert row['reason'] == found['reason']
-    assert row['window_s'] == found['window_s']
+    content = json.loads(cli('evaluate', *bags, '-c', calibration, '--json', code=None).stdout)
+    assert row['verdict'] == content['verdict']
+    assert row['reason'] == content['reason']
+    assert row['window_s'] == content['window_s']
     micro_g = 9.80665e-6
-    sections = found['sections_m_s2']
+    sections = content['sections_m_s2']
     for section in ('static', 'dynamic', 'all'):
         assert row[f'{section}_ug'] == pytest.approx(sections[section]['rms'] / micro_g)
     for cell, name in (('raw_ug', 'raw_rms'), ('peak_ug', 'peak'), ('claimed_ug', 'claimed_rms')):

@@ -127,37 +127,37 @@ def slope_and_lag(variances):
     """
     Make a unit with a slope and a lag of 600 s, and variances of some parameters of its x axis.
     """
-    one = calibration(
+    unit = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
         response=(term('board', (0.3, 0.0, 0.0), tau_s=600.0),),
     )
-    own = np.zeros(parameter_layout(one).n_parameters)
+    rest = np.zeros(parameter_layout(unit).n_parameters)
     for place, variance in variances.items():
-        own[place] = variance
-    return replace(one, posterior=posterior_of(np.diag(own)))
+        rest[place] = variance
+    return replace(unit, posterior=posterior_of(np.diag(rest)))
 
 
 def test_sd_by_hand():
     # x: level and slope of the static bias, level and slope of the dynamic bias, weight of the
     # lag; then static and dynamic level of the scale.
-    one = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
-    states = ramp_states(one, np.array([20.0, 30.0]), 0.0, np.inf)
-    bias, scale = sd_of_states(one, states)
+    unit = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
+    states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
+    bias, scale = sd_of_states(unit, states)
     # sqrt(4e-4 + 100 * 1e-6) counts, 300 of them per m/s^2, and 30 um/s^2 of unexplained residual.
-    own = np.sqrt([4e-4, 5e-4]) / 300.0
-    assert bias[:, 0] == pytest.approx(np.hypot(own, 3e-5), rel=1e-6)
+    expected = np.sqrt([4e-4, 5e-4]) / 300.0
+    assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
     assert scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
     # An endless ramp of 0.6 K/min: 600 s behind are 6 K.
-    bias, scale = sd_of_states(one, ramp_states(one, np.array([25.0]), 0.01, np.inf))
+    bias, scale = sd_of_states(unit, ramp_states(unit, np.array([25.0]), 0.01, np.inf))
     assert bias[0, 0] == pytest.approx(np.sqrt(9e-4 + 36e-6) / 300.0, rel=1e-6)
     assert scale[0, 0] == pytest.approx(2e-6, rel=1e-6)
 
 
 def test_what_is_known_has_no_sd():
-    one = replace(rich_calibration(), posterior=None)
-    bias, scale = sd_of_states(one, ramp_states(one, np.array([20.0]), 0.0, np.inf))
+    unit = replace(rich_calibration(), posterior=None)
+    bias, scale = sd_of_states(unit, ramp_states(unit, np.array([20.0]), 0.0, np.inf))
     assert bias == pytest.approx(np.full((1, 3), 1e-5))
     assert not scale.any()
 
@@ -165,13 +165,13 @@ def test_what_is_known_has_no_sd():
 @pytest.mark.parametrize('rate', [0.01, -0.02])
 def test_ramp_is_what_the_memory_makes_of_one(rate):
     # Second route: the memory of the fit goes through a ramp after a soak, second by second.
-    one = replace(rich_calibration(), board_lag_s=100.0)
-    spec = Correction(one).memory
+    unit = replace(rich_calibration(), board_lag_s=100.0)
+    spec = Correction(unit).memory
     first = Layout(spec).width - 2 * len(spec.lags) - len(spec.plays)
     gradient = np.append(0.0, np.full(900, 100.0 * rate))
     board = 25.0 + rate * np.arange(-900.0, 1.0)
     lived = memory_on_grid(spec, 1.0, board, [gradient] * len(spec.sensors))[-1]
-    (state,) = ramp_states(one, board[-1:], rate, 900.0)
+    (state,) = ramp_states(unit, board[-1:], rate, 900.0)
     layout = Layout(spec)
     assert state[[BOARD, RATE, WEIGHT]].tolist() == [25.0, rate, 1.0]
     for quantity, place in layout.places.items():
@@ -188,9 +188,9 @@ def test_ramp_is_what_the_memory_makes_of_one(rate):
 
 def test_statistics_of_scalars_by_hand():
     # 3 and -4: mean -0.5, mean square 12.5.
-    found = residual_statistics(np.array([3.0, -4.0]))
-    assert (found.n, found.mean, found.peak) == (2, -0.5, 4.0)
-    assert found.rms == pytest.approx(12.5**0.5, rel=1e-15)
+    statistics = residual_statistics(np.array([3.0, -4.0]))
+    assert (statistics.n, statistics.mean, statistics.peak) == (2, -0.5, 4.0)
+    assert statistics.rms == pytest.approx(12.5**0.5, rel=1e-15)
 
 
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
@@ -199,9 +199,9 @@ def test_values_that_are_not_finite_are_left_out(bad):
 
 
 def test_nothing_to_count_gives_nan():
-    found = residual_statistics(np.zeros(0))
-    assert found.n == 0
-    assert np.isnan([found.mean, found.rms, found.peak]).all()
+    statistics = residual_statistics(np.zeros(0))
+    assert statistics.n == 0
+    assert np.isnan([statistics.mean, statistics.rms, statistics.peak]).all()
 
 
 def test_norm_residual_does_not_see_a_rotation(rng):
@@ -215,6 +215,6 @@ def test_norm_residual_does_not_see_a_rotation(rng):
 
 
 def test_regimes_are_told_apart():
-    found = statistics_by_regime(np.array([1.0, 2.0, 5.0]), np.array([False, False, True]))
-    assert (found['static'].n, found['dynamic'].n, found['all'].n) == (2, 1, 3)
-    assert found['dynamic'].peak == 5.0
+    summary = statistics_by_regime(np.array([1.0, 2.0, 5.0]), np.array([False, False, True]))
+    assert (summary['static'].n, summary['dynamic'].n, summary['all'].n) == (2, 1, 3)
+    assert summary['dynamic'].peak == 5.0

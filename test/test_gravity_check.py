@@ -72,10 +72,10 @@ def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
 @pytest.mark.parametrize('rate_hz', [2.5, 5.0, 10.0])
 @pytest.mark.parametrize('offset', [0.3, -3.0, 15.0])
 def test_what_steps_away_at_rest_is_refuted_within_a_second(rng, rate_hz, offset):
-    # WHY: it took five seconds, and the message averaged over the time before the change.
+    # WHY: the refusal took five seconds, and the message averaged over the time before the change.
     after_s, result = steps(rng, offset=offset, rate_hz=rate_hz)
     assert after_s < 1.0
-    # At least two samples.
+    # A refusal needs at least two samples.
     assert result.residual == pytest.approx(offset, abs=5 * NOISE_SD)
 
 
@@ -89,7 +89,7 @@ def test_the_message_gives_the_deviation_now(rng):
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     watch(rng, seconds=40, bias=0.001, monitor=monitor)
     assert not monitor.is_refuted
-    # Another start of time, so that windows are tested and not a step.
+    # Time starts anew, so that windows are tested and not a step.
     result = watch(rng, seconds=8, bias=0.5, monitor=monitor)
     assert monitor.is_refuted
     assert result.residual == pytest.approx(0.5, abs=1e-3)

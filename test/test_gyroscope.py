@@ -37,7 +37,6 @@ FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
 
 
 def block_of(record, K, rate=None):
-    """Make the block of a recording of Imu messages."""
     stamps, board_ns, case_ns = (
         START_NS + stamp_ns
         for stamp_ns in (record.accel_stamp_ns, record.board_stamp_ns, record.case_stamp_ns)
@@ -62,7 +61,7 @@ def rms(values):
 
 @pytest.fixture(scope='module')
 def unit():
-    # Its lags are minutes: a reading every four seconds suffices, with a quarter of the work.
+    # For lags of minutes a reading every four seconds suffices, with a quarter of the work.
     return unit_preset('mems', 2).with_thermometers(rate_hz=0.25)
 
 
@@ -72,7 +71,7 @@ def fitted(unit):
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
     # Heat flows in and between the parts; half of the columns, and half of the work.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
-    return fit([source_of(one, unit.scale_factor) for one in records], options)
+    return fit([source_of(record, unit.scale_factor) for record in records], options)
 
 
 @pytest.fixture(scope='module')
@@ -81,13 +80,13 @@ def held_out(unit):
     # Two ramps up and two down with soaks, without the last way back.
     whole = stations[0].program
     program = replace(whole, time_s=whole.time_s[:10], temperature_c=whole.temperature_c[:10])
-    stations = [replace(one, program=program) for one in stations]
+    stations = [replace(station, program=program) for station in stations]
     return arrays(unit, stations, 99, rate_hz=RATE_HZ)
 
 
 def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
     calibration = fitted.calibration
-    own = calibration.gyroscope
+    gyroscope = calibration.gyroscope
     for record in held_out:
         block = block_of(record, unit.scale_factor)
         out = process_block(Compensator(calibration), block, block.imu.angular_velocity)
@@ -102,12 +101,12 @@ def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
         assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
         # The level contains a turn-on of 2 mdeg/s and the Earth's rate, which cannot be separated,
         # so it must be within the claimed sd of the bias plus the Earth's rate.
-        message = own.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
+        message = gyroscope.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
         claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
         assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
-    np.testing.assert_allclose(own.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
+    np.testing.assert_allclose(gyroscope.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
     # Claimed sd from 9 positions with a turn-on of 2 mdeg/s, and the prior of the Earth's rate.
-    assert np.mean(own.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
+    assert np.mean(gyroscope.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
 
 
 def test_the_fit_tells_what_other_positions_see(fitted):
@@ -119,11 +118,11 @@ def test_the_fit_tells_what_other_positions_see(fitted):
 
 def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
     program = parse_cyclogram('20 10min, 35@1.5 10min, 10@1.5 15min')
-    stations = [replace(one, program=program) for one in plan('chamber-9', 2)[:2]]
+    stations = [replace(station, program=program) for station in plan('chamber-9', 2)[:2]]
     records = arrays(unit, stations, 2, rate_hz=RATE_HZ)
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board'))
-    with_rate = fit([source_of(one, unit.scale_factor) for one in records], options)
-    silent = [np.zeros((len(one.counts), 3)) for one in records]
+    with_rate = fit([source_of(record, unit.scale_factor) for record in records], options)
+    silent = [np.zeros((len(record.counts), 3)) for record in records]
     sources = [
         source_of(o, unit.scale_factor, rate) for o, rate in zip(records, silent, strict=True)
     ]
@@ -135,7 +134,7 @@ def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
     )
     assert same == without.calibration
     # A bag with an invalid rate at rest has no rate.
-    broken = [np.array(one.angular_rate) for one in records]
+    broken = [np.array(record.angular_rate) for record in records]
     broken[0][len(broken[0]) // 2 :] = np.nan
     sources = [
         source_of(o, unit.scale_factor, rate, name)
@@ -143,9 +142,9 @@ def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
     ]
     result = fit(sources, options)
     assert result.calibration.gyroscope is None
-    (said,) = (one.message for one in result.findings if one.name == 'rate')
-    assert said == 'first: not every sample has an angular rate, so no gyroscope was fitted'
-    assert 'rate' not in {one.name for one in (*with_rate.findings, *without.findings)}
+    (messages,) = (finding.message for finding in result.findings if finding.name == 'rate')
+    assert messages == 'first: not every sample has an angular rate, so no gyroscope was fitted'
+    assert 'rate' not in {finding.name for finding in (*with_rate.findings, *without.findings)}
 
 
 @given(st.lists(st.integers(0, 4), min_size=1, max_size=30), st.integers(0, 2**32 - 1))
@@ -168,7 +167,7 @@ def test_file_and_triad_round_trip():
     triad = rate_triad(whole)
     assert gyroscope_of(triad) == whole.gyroscope
     assert triad.gyroscope is None
-    # Its scale is 1, without uncertainty.
+    # The scale of a gyroscope is 1, without uncertainty.
     states = ramp_states(triad, np.array([10.0, 20.0, 30.0]))
     bias, scale = bias_and_scale(triad, states)
     np.testing.assert_array_equal(scale, 1.0)
@@ -197,20 +196,20 @@ def test_a_file_is_refused_by_key():
         assert old in text
         with pytest.raises(CalibrationError, match=said):
             parse_calibration(text.replace(old, new).encode())
-    own = rich_calibration().gyroscope
+    gyro = rich_calibration().gyroscope
     with pytest.raises(ValueError, match=r'`posterior\.rest` must have one number per parameter'):
-        replace(own, response=own.response[1:])
+        replace(gyro, response=gyro.response[1:])
     with pytest.raises(ValueError, match='`bias_function` must be 0 at the reference, got 1'):
         RateCurve(Polynomial((1.0, 2.0)))
-    foreign = replace(own, response=(replace(own.response[0], sensor='magnet'),), posterior=None)
+    foreign = replace(gyro, response=(replace(gyro.response[0], sensor='magnet'),), posterior=None)
     with pytest.raises(ValueError, match=r'`gyroscope.response\[0\].sensor` must be one of'):
         replace(rich_calibration(), gyroscope=foreign)
 
 
 def test_the_rate_is_corrected_by_hand_numbers():
     # At the reference without response only the constant remains; the force is unaffected.
-    own = replace(rich_calibration().gyroscope, response=(), posterior=None)
-    for gyroscope in (own, None):
+    triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
+    for gyroscope in (triad, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))
         for second in range(2000):
             compensator.push('board', second * 10**9, 20.0)
@@ -218,7 +217,7 @@ def test_the_rate_is_corrected_by_hand_numbers():
         row = compensator.process(2000 * 10**9, 300.0, 600.0, 2900.0)
         assert row[:2] == pytest.approx((1.0, 2.0))
         assert compensator.corrects_rate is (gyroscope is not None)
-    compensator = Compensator(replace(calibration(), gyroscope=own))
+    compensator = Compensator(replace(calibration(), gyroscope=triad))
     compensator.push('board', 0, 20.0)
     compensator.push('case', 0, 20.0)
     assert compensator.process(0, 300.0, 600.0, 2900.0) is not None
@@ -242,14 +241,14 @@ def test_with_a_prior_the_gyroscope_is_the_priors(unit, fitted):
 
 
 def reduced(unit, records):
-    sources = [source_of(one, unit.scale_factor) for one in records[:2]]
+    sources = [source_of(record, unit.scale_factor) for record in records[:2]]
     return [reduce_source(source, full_scale=None) for source in sources]
 
 
 def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, held_out)
     # The first third of the bag has enough ramps and soaks to show an error.
-    thirds = [replace(one, n_whole=one.n_whole // 3) for one in bags[0].intervals]
+    thirds = [replace(interval, n_whole=interval.n_whole // 3) for interval in bags[0].intervals]
     short = [replace(bags[0], intervals=tuple(thirds))]
     judged = judge_bags(bags, calibration)
     rate = judged.rate
@@ -264,8 +263,8 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     assert judged.facts()['angular_rate']['reason'] == rate.reason
     assert 'angular rate: valid: 0.' in str(rate)
     # A gyroscope of another unit is detected, also one without covariance.
-    own = calibration.gyroscope
-    other = replace(own, response=(), static=own.dynamic, dynamic=own.dynamic, posterior=None)
+    gyro = calibration.gyroscope
+    other = replace(gyro, response=(), static=gyro.dynamic, dynamic=gyro.dynamic, posterior=None)
     wrong = judge_bags(short, replace(calibration, gyroscope=other))
     assert wrong.is_valid
     assert wrong.rate.kind is Verdict.RECALIBRATE

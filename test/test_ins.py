@@ -38,11 +38,8 @@ def test_levelling_makes_the_force_vertical(rng):
     np.testing.assert_allclose(
         attitude @ attitude.transpose(0, 2, 1), [np.eye(3)] * 20, atol=1e-12
     )
-    np.testing.assert_allclose(
-        (attitude @ force[..., None])[..., 0],
-        np.linalg.norm(force, axis=1)[:, None] * UP,
-        atol=1e-12,
-    )
+    expected = np.linalg.norm(force, axis=1)[:, None] * UP
+    np.testing.assert_allclose((attitude @ force[..., None])[..., 0], expected, atol=1e-12)
 
 
 def test_the_sigma_is_that_of_white_noise(rng):
@@ -55,7 +52,7 @@ def test_the_sigma_is_that_of_white_noise(rng):
     by_integration = density**2 * (T / 2.0 - np.sin(2.0 * omega * T) / (4.0 * omega)) / omega**2
     expected = np.sqrt(2.0 * (by_levelling + by_integration))
     assert free.sigma[-1, 0] == pytest.approx(expected, rel=0.01)
-    # of 298 flights, about eight are independent
+    # about eight of the 298 flights are independent
     assert 0.5 < np.sqrt(np.mean(free.position[-1] ** 2)) / expected < 1.5
 
 
@@ -64,9 +61,9 @@ def test_updates_find_a_bias_that_levelling_has_not_seen():
     dt, n_align = 0.5, 600
     force = np.tile(G * UP, (n_align + 3600 + 1, 1))
     force[n_align:, 0] += 1e-3
-    told = fly(Model(force, 1e-4, 1e-3), dt, UP, G, 1500.0)
+    message = fly(Model(force, 1e-4, 1e-3), dt, UP, G, 1500.0)
     free = fly(Model(force, 1e-4, 1e-3), dt, UP, G, 0.0)
     assert free.position[-1, 0] > 1000.0
-    coasted = told.position[-1, 0] - told.position[2999, 0]
+    coasted = message.position[-1, 0] - message.position[2999, 0]
     # Without ZUPT the same five minutes would give 45 m.
     assert abs(coasted) < 4.5

@@ -100,11 +100,11 @@ class TestWindows:
         # 10 K above the reference the z axis reads 20 counts more: 20 / 300 m/s^2.
         bag = resting(tmp_path / 'bag', 30.0)
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
-        found = evaluate([bag], models).judgements
+        judgements = evaluate([bag], models).judgements
         drift = SLOPE * 10.0 / K
         # The estimate of a steady temperature is exact to 1e-7 K, 1e-9 m/s^2.
         for name, expected in (('right', 0.0), ('half', drift / 2)):
-            windows = found[name].windows
+            windows = judgements[name].windows
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
             np.testing.assert_allclose(windows.residual, expected, atol=1e-9)
             np.testing.assert_allclose(windows.board, 30.0, rtol=0.0, atol=1e-6)
@@ -112,9 +112,9 @@ class TestWindows:
     def test_a_window_is_the_mean_of_what_the_node_publishes(self, tmp_path):
         # A ramp of 1 K/min, in which a wrong time or reading would show.
         bag = resting(tmp_path / 'bag', (15.0, 33.0), minutes=18.0, noise=0.2)
-        one = corrected_by(SLOPE)
-        windows = judged(bag, one).windows
-        compensator = Compensator(one)
+        unit = corrected_by(SLOPE)
+        windows = judged(bag, unit).windows
+        compensator = Compensator(unit)
         with open_recording(bag) as reader:
             blocks = [process_block(compensator, block) for block in reader.blocks()]
         stamps = np.concatenate([block.stamp_ns for block in blocks])
@@ -175,21 +175,21 @@ class TestWindows:
 
     def test_gravity_is_that_of_the_place(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0)
-        found = judged(bag, calibration(), gravity=GRAVITY + 1e-3)
-        np.testing.assert_allclose(found.windows.residual, -1e-3, atol=1e-9)
+        judgement = judged(bag, calibration(), gravity=GRAVITY + 1e-3)
+        np.testing.assert_allclose(judgement.windows.residual, -1e-3, atol=1e-9)
 
     def test_several_recordings_are_judged_as_one(self, tmp_path):
         bags = [
             resting(tmp_path / name, at, error=error)
             for name, at, error in (('one', 19.0, 0.3), ('two', 30.0, -0.3))
         ]
-        found = evaluate(bags, [('it', CLAIMING)])
-        whole = found.judgements['it'].sections['all']
+        evaluation = evaluate(bags, [('it', CLAIMING)])
+        whole = evaluation.judgements['it'].sections['all']
         # +102 ug in one regime, -102 ug in the other: mean 0, RMS 102 ug.
         assert whole.n == sum(judged(bag, CLAIMING).sections['all'].n for bag in bags)
         assert whole.mean / MICRO_G == pytest.approx(0.0, abs=0.5)
         assert whole.rms == pytest.approx(0.3 / K, rel=1e-3)
-        assert found.notes == ()
+        assert evaluation.notes == ()
 
     def test_a_bag_that_never_rests_is_named(self, tmp_path):
         good = resting(tmp_path / 'good', 25.0)
@@ -220,14 +220,14 @@ class TestVerdict:
         ],
     )
     def test_by_its_own_claim(self, residual, raw, claimed, verdict):
-        found = judge(made(residual, raw, claimed), CLAIMING)
-        assert found.verdict == verdict
-        assert found.is_valid == verdict.startswith('valid')
-        assert found.exit_code == (0 if found.is_valid else 1)
-        # Both are compared over the same windows.
-        assert found.sections['all'].ratio == pytest.approx(residual / claimed)
+        judgement = judge(made(residual, raw, claimed), CLAIMING)
+        assert judgement.verdict == verdict
+        assert judgement.is_valid == verdict.startswith('valid')
+        assert judgement.exit_code == (0 if judgement.is_valid else 1)
+        # Residuals and claim are compared over the same windows.
+        assert judgement.sections['all'].ratio == pytest.approx(residual / claimed)
         for value in (residual, raw, claimed):
-            assert spoken(value * MICRO_G) in found.reason
+            assert spoken(value * MICRO_G) in judgement.reason
 
     @pytest.mark.parametrize(
         ('residual', 'raw', 'claimed', 'verdict'),
@@ -239,16 +239,17 @@ class TestVerdict:
         ],
     )
     def test_the_users_limit_decides(self, residual, raw, claimed, verdict):
-        found = judge(made(residual, raw, claimed), CLAIMING, 100.0 * MICRO_G)
-        assert found.verdict == verdict
-        assert '100 ug tolerated' in found.reason
+        judgement = judge(made(residual, raw, claimed), CLAIMING, 100.0 * MICRO_G)
+        assert judgement.verdict == verdict
+        assert '100 ug tolerated' in judgement.reason
 
     def test_headline_of_seen_windows_is_what_was_left_out(self):
-        # WHY: in sample 59 ug, held out in the same positions 61 ug, in a new attitude 1091 ug.
+        # WHY: a fit left 59 ug in sample, 61 ug held out in the same positions, 1091 ug in a new
+        # attitude.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
-        one = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
+        unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
-        unseen, seen = (judge(windows, one, is_seen=is_seen) for is_seen in (False, True))
+        unseen, seen = (judge(windows, unit, is_seen=is_seen) for is_seen in (False, True))
         assert unseen.headline_rms / MICRO_G == pytest.approx(50.0)
         assert unseen.reason.startswith('50 ug RMS of |f| - g, 1 mg raw')
         assert seen.headline_rms / MICRO_G == pytest.approx(300.0)
@@ -257,10 +258,10 @@ class TestVerdict:
         )
         # The claim is compared with the same positions; the limit holds for a new attitude.
         assert seen.verdict == unseen.verdict == 'valid'
-        limited = judge(windows, one, 100.0 * MICRO_G, is_seen=True)
+        limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
         assert '300 ug on positions left out, 100 ug tolerated' in limited.reason
-        assert judge(windows, one, 100.0 * MICRO_G).verdict == 'valid'
+        assert judge(windows, unit, 100.0 * MICRO_G).verdict == 'valid'
 
     def test_a_bag_of_the_fit_is_known_by_its_hash(self, tmp_path):
         bag = resting(tmp_path / 'bag', 25.0)
@@ -268,18 +269,18 @@ class TestVerdict:
         for sha256, expected in ((digest(bag), 3e-4), ('0' * 64, np.nan)):
             sources = (Source('bag', sha256, 6000),)
             provenance = Provenance(sources=sources, residuals=(fitted,))
-            found = judged(bag, dataclasses.replace(CLAIMING, provenance=provenance))
-            assert found.left_out_rms == pytest.approx(expected, nan_ok=True)
+            judgement = judged(bag, dataclasses.replace(CLAIMING, provenance=provenance))
+            assert judgement.left_out_rms == pytest.approx(expected, nan_ok=True)
 
     def test_no_uncertainty_makes_no_claim(self):
         # WHY: an import without covariance was compared with the noise alone and called wrong.
         imported = corrected_by(SLOPE)
         windows = made(50.0, 1000.0, 2.0)
-        found = judge(windows, imported)
-        assert found.verdict == 'no claim'
-        assert not found.is_valid
-        assert 'give a tolerance' in found.reason
-        assert np.isnan(found.sections['all'].claimed_rms)
+        judgement = judge(windows, imported)
+        assert judgement.verdict == 'no claim'
+        assert not judgement.is_valid
+        assert 'give a tolerance' in judgement.reason
+        assert np.isnan(judgement.sections['all'].claimed_rms)
         assert judge(windows, imported, 60.0 * MICRO_G).verdict == 'valid'
         assert judge(windows, imported, 40.0 * MICRO_G).verdict == 'recalibrate'
         assert judge(made(50.0, 40.0, 2.0), imported).verdict == 'no better than raw'
@@ -289,10 +290,10 @@ class TestVerdict:
         worse = windows.force.copy()
         worse[:10, 2] = GRAVITY + 150.0 * MICRO_G
         windows = dataclasses.replace(windows, force=worse)
-        # 84 ug over all of 60 claimed, but 150 in the dynamic regime.
-        found = judge(windows, CLAIMING)
-        assert found.sections['all'].ratio < 2.0
-        assert found.verdict == 'recalibrate'
+        # The RMS is 84 ug over all windows, with 60 ug claimed, but 150 ug in the dynamic regime.
+        judgement = judge(windows, CLAIMING)
+        assert judgement.sections['all'].ratio < 2.0
+        assert judgement.verdict == 'recalibrate'
         assert judge(windows, CLAIMING, 100.0 * MICRO_G).verdict == 'recalibrate'
 
     def test_what_is_outside_the_ranges_decides_nothing(self):
@@ -316,16 +317,15 @@ class TestVerdict:
 
     def test_outside_is_told_from_a_bag(self, tmp_path):
         _, upper = CLAIMING.static.temperature_range_c
-        found = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
-        assert found.kind is Verdict.OUTSIDE
-        assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in found.reason
+        judgement = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
+        assert judgement.kind is Verdict.OUTSIDE
+        assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in judgement.reason
         # Noise of the thermometer does not put a soak at the edge of the range outside of it.
         edge = judged(resting(tmp_path / 'edge', upper + 0.01), CLAIMING)
         assert edge.sections['outside'].n == 0
 
 
 def around(n, bias, scale, noise=0.0):
-    """Make windows of a unit in n positions, with changes of the axes' bias [m/s^2] and scale."""
     rng = np.random.default_rng(5)
     faces = np.vstack((np.eye(3), -np.eye(3)))
     others = rng.standard_normal((max(n - 6, 0), 3))
@@ -343,28 +343,28 @@ class TestShifts:
         moved = around(n, (20.0 * MICRO_G, 0.0, 0.0), (0.0, 30e-6, 0.0), noise=0.5 * MICRO_G)
         # The noise of a window, half a micro-g, gives a claim of 2 ug with 12 windows per
         # position.
-        found = judge(moved, corrected_by(SLOPE, 1e-5), None)
-        assert found.n_positions >= min(n, 12)
-        assert found.shifts[0].bias / MICRO_G == pytest.approx(20.0, abs=1.0)
-        assert found.shifts[1].scale == pytest.approx(30e-6, abs=1.5e-6)
-        assert abs(found.shifts[2].bias) < 3.0 * found.shifts[2].bias_sd
-        assert [said.split(' +')[0] for said in found.moved] == ['x bias', 'y scale']
-        assert found.verdict == 'recalibrate'
-        assert '; moved: x bias +' in found.reason
+        judgement = judge(moved, corrected_by(SLOPE, 1e-5), None)
+        assert judgement.n_positions >= min(n, 12)
+        assert judgement.shifts[0].bias / MICRO_G == pytest.approx(20.0, abs=1.0)
+        assert judgement.shifts[1].scale == pytest.approx(30e-6, abs=1.5e-6)
+        assert abs(judgement.shifts[2].bias) < 3.0 * judgement.shifts[2].bias_sd
+        assert [text.split(' +')[0] for text in judgement.moved] == ['x bias', 'y scale']
+        assert judgement.verdict == 'recalibrate'
+        assert '; moved: x bias +' in judgement.reason
 
     def test_a_unit_as_it_was_has_not_moved(self):
-        found = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)
-        assert (len(found.shifts), found.moved, found.verdict) == (3, (), 'valid')
+        judgement = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)
+        assert (len(judgement.shifts), judgement.moved, judgement.verdict) == (3, (), 'valid')
         # Five positions do not determine the shifts.
-        found = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
-        assert (found.shifts, found.n_positions) == ((), 5)
+        judgement = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
+        assert (judgement.shifts, judgement.n_positions) == ((), 5)
 
     def test_rms_of_an_axis_is_about_the_mean_of_a_position(self):
         windows = made(0.0, 1000.0, 60.0, n=40, dynamic=20)
         force = windows.force.copy()
         force[:20, 0] += 3e-5 * np.where(np.arange(20) % 2, 1.0, -1.0)
-        found = judge(dataclasses.replace(windows, force=force), CLAIMING)
-        np.testing.assert_allclose(found.axis_rms, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
+        judgement = judge(dataclasses.replace(windows, force=force), CLAIMING)
+        np.testing.assert_allclose(judgement.axis_rms, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
 
 
 def test_thermometers_in_doubt_are_told_offline_too(root, tmp_path):
@@ -375,14 +375,14 @@ def test_thermometers_in_doubt_are_told_offline_too(root, tmp_path):
     range.
     """
     exchanged = Topics(board='temperature/case', case='temperature/board')
-    for topics, said in ((Topics(), []), (exchanged, [SWAPPED])):
+    for topics, text in ((Topics(), []), (exchanged, [SWAPPED])):
         bag = root / 'bags' / 'held_out.mcap'
-        one = replay(bag, CLAIMING, tmp_path / f'{len(said)}.mcap', topics=topics, serial='')
-        assert one.notes == said
-        verdict = judged(bag, CLAIMING, topics=topics, serial='', tolerance=1.0 + 9.0 * len(said))
-        assert (verdict.kind is Verdict.SWAPPED) == bool(said)
-        assert not (said and verdict.is_valid)
-        assert verdict.reason.startswith(SWAPPED) == bool(said)
+        result = replay(bag, CLAIMING, tmp_path / f'{len(text)}.mcap', topics=topics, serial='')
+        assert result.notes == text
+        verdict = judged(bag, CLAIMING, topics=topics, serial='', tolerance=1.0 + 9.0 * len(text))
+        assert (verdict.kind is Verdict.SWAPPED) == bool(text)
+        assert not (text and verdict.is_valid)
+        assert verdict.reason.startswith(SWAPPED) == bool(text)
     _, upper = CLAIMING.static.temperature_range_c
     hot = resting(tmp_path / 'hot', upper + 2.0)
     (note,) = replay(hot, CLAIMING, tmp_path / 'hot.mcap').notes

@@ -24,23 +24,22 @@ K = 300.0
 
 
 def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
-    """Change the z axis of a unit, with a claimed sd of its bias."""
     scale = K * (1.0 + 1e-6 * ppm)
     axes = dataclasses.replace(
         calibration().axes, z=AxisReference(scale, bias_ug * MICRO_G * scale)
     )
     part = regime_set(*[axis_set(residual_sd_m_s2=sd_ug * MICRO_G)] * 3)
-    one = calibration(axes=axes, static=part, dynamic=part)
+    unit = calibration(axes=axes, static=part, dynamic=part)
     provenance = dataclasses.replace(
-        one.provenance, created=created, sources=(Source(created, created),)
+        unit.provenance, created=created, sources=(Source(created, created),)
     )
-    return dataclasses.replace(one, provenance=provenance)
+    return dataclasses.replace(unit, provenance=provenance)
 
 
 def test_changes_and_their_sd_by_hand():
     # The later calibration is given first, but dates decide. Sd of 3 and 4 ug make 5.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
-    assert [one.constant for one in drifts] == [
+    assert [drift.constant for drift in drifts] == [
         *('bias x', 'bias y', 'bias z', 'scale x', 'scale y', 'scale z')
     ]
     *still, z = drifts[:3]
@@ -49,27 +48,27 @@ def test_changes_and_their_sd_by_hand():
     assert z.sd == pytest.approx(5.0)
     assert z.is_sure
     assert drifts[5].change == pytest.approx(50.0)
-    for one in still:
-        assert one.change == pytest.approx(0.0, abs=1e-9)
-        assert not one.is_sure
+    for change in still:
+        assert change.change == pytest.approx(0.0, abs=1e-9)
+        assert not change.is_sure
 
 
 def test_what_is_no_history():
-    one = dated('2026-01-01')
-    # Another model of the same bags, another unit, and a single calibration.
-    other = dataclasses.replace(one, unit=dataclasses.replace(one.unit, serial='other'))
-    for calibrations in ([one], [one, one], [one, dataclasses.replace(other)]):
+    unit = dated('2026-01-01')
+    # No history: another model of the same bags, another unit, and a single calibration.
+    other = dataclasses.replace(unit, unit=dataclasses.replace(unit.unit, serial='other'))
+    for calibrations in ([unit], [unit, unit], [unit, dataclasses.replace(other)]):
         assert drifts_of(history_of(calibrations)) == []
     # Without a claimed sd a change is never significant.
     import_ = dataclasses.replace(dated('2026-03-01', 500.0, sd_ug=0.0))
-    silent = drifts_of(history_of([one, import_]))
+    silent = drifts_of(history_of([unit, import_]))
     assert np.isnan([drift.sd for drift in silent]).all()
     assert not any(drift.is_sure for drift in silent)
 
 
 def test_commands_tell_the_history(cli, tmp_path, monkeypatch):
     undrawn = 'thermo_comp.report.page.drawn_figures'
-    monkeypatch.setattr(undrawn, lambda figures: [(one, '') for one in figures])
+    monkeypatch.setattr(undrawn, lambda figures: [(figure, '') for figure in figures])
     now = fitted().calibration
     axes = dataclasses.replace(
         now.axes, x=dataclasses.replace(now.axes.x, bias=now.axes.x.bias + 10.0)
@@ -81,13 +80,13 @@ def test_commands_tell_the_history(cli, tmp_path, monkeypatch):
     save_calibration(now, tmp_path / 'b.yaml')
     bag = write_bag(tmp_path / 'held_out.mcap')
     given = ('-c', tmp_path / 'b.yaml', '-c', tmp_path / 'a.yaml', '--json')
-    told = json.loads(cli('evaluate', bag, *given, code=None).stdout)
-    x = told['history'][0]
+    content = json.loads(cli('evaluate', bag, *given, code=None).stdout)
+    x = content['history'][0]
     assert (x['constant'], x['earlier']) == ('bias x', '2020-01-01T00:00:00Z')
     assert x['change'] == pytest.approx(-10.0 / now.axes.x.scale_factor / MICRO_G, rel=1e-3)
     page = tmp_path / 'page.html'
     drawn = json.loads(cli('report', *given, '-o', page).stdout)
-    assert drawn['history'] == told['history']
+    assert drawn['history'] == content['history']
     assert '2020-01-01' in page.read_text(encoding='utf-8')
     assert '<h2>History</h2>' not in render_report(evidence(), figures=[])
 
@@ -112,12 +111,12 @@ def test_evaluate_and_report_agree(cli, folder, options):
     # WHY: for one bag and calibration one command said "re-calibrate", another "holds".
     page = folder / f'page{len(options)}.html'
     given = (folder / 'held_out.mcap', '-c', folder / 'unit.yaml', *options, '--json')
-    one = cli('evaluate', *given, code=None)
+    printed = cli('evaluate', *given, code=None)
     other = cli('report', *given, '-o', page, code=None)
-    ours, theirs = json.loads(one.stdout), json.loads(other.stdout)
+    ours, theirs = json.loads(printed.stdout), json.loads(other.stdout)
     for name in FACTS:
         assert ours[name] == theirs[name], name
-    assert one.returncode == other.returncode == (0 if ours['is_valid'] else 1)
+    assert printed.returncode == other.returncode == (0 if ours['is_valid'] else 1)
     assert ours['window_s'] == float(options[3] if options else 60)
     # The page shows the same figures, with the same length of windows.
     text = page.read_text(encoding='utf-8')

@@ -28,7 +28,7 @@ def test_jump_along_gravity(rng, with_gyro):
     rest = Rest(rng)
     rest.add((2.0 * MG, 0.0, 20.0 * MG), from_s=301.0)
     (event,) = look(rest, with_gyro=with_gyro)
-    # Located by the single sample between the levels.
+    # The jump is located by the single sample between the levels.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
     # 10 s at 25 Hz on each side with a free drift: sd 2 * 3 mg * sqrt(2 / 250) = 0.5 mg; 4 sd.
@@ -117,7 +117,7 @@ def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
     bag = reduce_source(rest.source(), full_scale=None)
     assert len(bag.intervals) == 1
     assert find_jumps(bag) == ()
-    # Given the scatter of its samples all of it is at rest, except for the ends of the interval.
+    # With the true scatter of the samples the whole interval is at rest, except for its ends.
     assert bag.n_still_cells > 0.98 * bag.n_cells
 
 
@@ -131,7 +131,7 @@ def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
     assert len(bag.intervals) == 2
     (event,) = find_jumps(bag)
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
-    # Compared with the innovation of one sample, which does not depend on earlier ones: 4 sd.
+    # Limit of 4 sd of the innovation of a sample, which does not depend on earlier samples.
     new = sd * np.sqrt(1.0 - np.exp(-2.0 / (rest.rate_hz * tau_s)))
     assert event.along / MG == pytest.approx(20.0, abs=4.0 * new)
 

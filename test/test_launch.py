@@ -16,8 +16,8 @@ FILES = sorted((ROOT / 'launch').glob('*.launch.xml'))
 OURS = ROOT / 'launch' / 'thermo_comp.launch.xml'
 BESIDE = ROOT / 'launch' / 'beside_ins.launch.xml'
 
-# Parameters that the example sets in packages by others, from their sources for Jazzy. A misspelt
-# parameter is silently ignored by their nodes, so the spelling is tested here.
+# Parameters that the example sets in packages by others, from their sources for Jazzy. Nodes of
+# other packages ignore a misspelt parameter silently, so the spelling is tested here.
 OTHERS = {
     ('tf2_ros', 'static_transform_publisher'): set(),
     ('imu_filter_madgwick', 'imu_filter_madgwick_node'): {
@@ -37,7 +37,7 @@ def parse(path):
 
 
 def declared(root):
-    return {one.get('name', '') for one in root.findall('arg')}
+    return {element.get('name', '') for element in root.findall('arg')}
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
@@ -48,9 +48,9 @@ class TestEveryFile:
         assert set(re.findall(r'\$\(var ([\w]+)\)', text)) == declared(root)
 
     def test_files_of_the_package_exist(self, path):
-        found = re.findall(r'\$\(find-pkg-share thermo_comp\)/([^"]+)"', path.read_text())
-        assert found
-        for name in found:
+        elements = re.findall(r'\$\(find-pkg-share thermo_comp\)/([^"]+)"', path.read_text())
+        assert elements
+        for name in elements:
             assert (ROOT / name.replace('$(var driver)', 'xsens')).is_file(), name
 
     def test_the_example_in_its_head_gives_arguments_it_has(self, path):
@@ -63,7 +63,7 @@ class TestEveryFile:
 
 def parameters_set(arguments):
     """Return the parameters that our launch file sets, with substitutions evaluated by launch."""
-    given = {one.get('name', ''): one.get('default', '') for one in parse(OURS).findall('arg')}
+    given = {arg.get('name', ''): arg.get('default', '') for arg in parse(OURS).findall('arg')}
     given |= arguments
 
     def value(text):
@@ -73,13 +73,13 @@ def parameters_set(arguments):
         return text if equal is None else equal[3 if equal[1] == equal[2] else 4]
 
     (node,) = parse(OURS).findall('node')
-    found = [one for one in node.findall('param') if one.get('name')]
-    return {value(one.get('name', '')): value(one.get('value', '')) for one in found}
+    elements = [element for element in node.findall('param') if element.get('name')]
+    return {value(one.get('name', '')): value(one.get('value', '')) for one in elements}
 
 
 def test_a_driver_is_a_file_of_topics():
-    found = parameters_set({'driver': 'xsens'})
-    assert found['topics'] == str(ROOT / 'config/drivers/xsens.yaml')
+    parameters = parameters_set({'driver': 'xsens'})
+    assert parameters['topics'] == str(ROOT / 'config/drivers/xsens.yaml')
     assert 'topics' not in parameters_set({})
 
 
@@ -106,7 +106,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
     some = [{}, {'frame_id': 'body'}, {'serial': '0042', **counts}]
     for arguments in some:
         files = []
-        # In the order of launch: the user's file, then its own values.
+        # In the order of launch: the user's file, then the values of the launch file.
         for name, values in (('mine', mine), ('launch', parameters_set(arguments))):
             path = tmp_path / f'{name}.yaml'
             path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
@@ -114,12 +114,12 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
         context = Context()
         rclpy.init(args=['--ros-args', *files], context=context)
         node = CompensationNode(context)
-        found = {name: node.node.get_parameter(name).value for name in mine}
-        strangers = [one for one in overrides(node.node) if not node.node.has_parameter(one)]
+        used = {name: node.node.get_parameter(name).value for name in mine}
+        strangers = [name for name in overrides(node.node) if not node.node.has_parameter(name)]
         node.close()
         context.try_shutdown()
-        assert found == mine | arguments
-        assert all(one.startswith(NOT_GIVEN) for one in strangers)
+        assert used == mine | arguments
+        assert all(name.startswith(NOT_GIVEN) for name in strangers)
 
 
 def test_our_node_s_executable_parameters_and_topics():
@@ -139,9 +139,9 @@ def test_our_node_s_executable_parameters_and_topics():
     assert named == {'calibration_file', 'serial', 'input', 'topics', 'frame_id'}
     assert named <= {field.name for field in fields(NodeConfig)}
     # A serial such as 0042 would otherwise become a number.
-    assert all(one.get('type') == 'str' for one in node.findall('param') if one.get('name'))
+    assert all(arg.get('type') == 'str' for arg in node.findall('param') if arg.get('name'))
     topics = {topic.name for topic in (*INPUTS.values(), *OUTPUTS)}
-    defaults = {one.get('name'): one.get('default') for one in parse(OURS).findall('arg')}
+    defaults = {arg.get('name'): arg.get('default') for arg in parse(OURS).findall('arg')}
     for remap in node.findall('remap'):
         topic = remap.get('from')
         # Temperature topics are named after the sensors.
@@ -153,23 +153,23 @@ def test_our_node_s_executable_parameters_and_topics():
 def test_the_example_gives_the_included_file_arguments_it_has():
     (include,) = parse(BESIDE).findall('include')
     assert include.get('file', '').endswith(OURS.name)
-    assert {one.get('name') for one in include.findall('arg')} <= declared(parse(OURS))
+    assert {element.get('name') for element in include.findall('arg')} <= declared(parse(OURS))
 
 
 def test_the_example_speaks_to_others_in_their_words():
-    nodes = {(one.get('pkg'), one.get('exec')): one for one in parse(BESIDE).findall('node')}
+    nodes = {(node.get('pkg'), node.get('exec')): node for node in parse(BESIDE).findall('node')}
     assert set(nodes) == set(OTHERS)
     for key, node in nodes.items():
-        assert {one.get('name') for one in node.findall('param')} <= OTHERS[key]
+        assert {element.get('name') for element in node.findall('param')} <= OTHERS[key]
 
 
 def test_the_example_takes_gravity_off_once_and_gives_each_frame_one_parent():
-    nodes = {one.get('exec'): one for one in parse(BESIDE).findall('node')}
-    found = {
-        name: {one.get('name'): one.get('value') for one in nodes[name].findall('param')}
+    nodes = {element.get('exec'): element for element in parse(BESIDE).findall('node')}
+    given = {
+        name: {arg.get('name'): arg.get('value') for arg in nodes[name].findall('param')}
         for name in ('imu_filter_madgwick_node', 'ekf_node')
     }
-    madgwick, ekf = found.values()
+    madgwick, ekf = given.values()
     assert (madgwick['publish_tf'], ekf['publish_tf']) == ('false', 'true')
     assert madgwick['remove_gravity_vector'] == 'false'
     assert ekf['imu0_remove_gravitational_acceleration'] == 'true'

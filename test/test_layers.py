@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Imports go down only, and each heavy library is imported in one room only."""
+"""Rooms import from lower layers only, and each heavy library is imported in one room only."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ LAYERS = {
     '__main__': 6,
 }
 
-# Rooms that may import a library. A library that is missing here is free for all rooms.
+# Rooms that may import a library. Any room may import a library that is missing here.
 ROS = ['rclpy', 'rcl_interfaces', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs']
 HOMES = {
     **{name: {'ros'} for name in ROS}, 'rosgraph_msgs': {'ros'}, 'builtin_interfaces': {'ros'},
@@ -80,22 +80,21 @@ def imports_of(path, with_types=True):
         if isinstance(node, ast.If) and ast.unparse(node.test) == 'TYPE_CHECKING'
         for inner in ast.walk(node)
     }
-    found = []
+    collected = []
     for node in ast.walk(tree):
         if node in typing and not with_types:
             continue
         if isinstance(node, ast.Import):
-            found += [(node.lineno, name.name) for name in node.names]
+            collected += [(node.lineno, name.name) for name in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = [*here[: -node.level]] if node.level else []
             base += (node.module or '').split('.') if node.module else []
-            found += [(node.lineno, '.'.join([*base, name.name])) for name in node.names]
-    return found
+            collected += [(node.lineno, '.'.join([*base, name.name])) for name in node.names]
+    return collected
 
 
 @cache
 def own_unit(name):
-    """Return the room of an absolute name of this package, None for other packages."""
     parts = name.split('.')
     if parts[0] != 'thermo_comp':
         return None
@@ -107,17 +106,17 @@ def own_unit(name):
 
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_go_down_only(path):
-    unit, own = unit_of(path), path.relative_to(PACKAGE).as_posix()
+    unit, file = unit_of(path), path.relative_to(PACKAGE).as_posix()
     assert unit in LAYERS, f'{unit} has no layer: give it one in {Path(__file__).name}'
     wrong = []
-    for line, name in imports_of(path, with_types=own != '__init__.py'):
+    for line, name in imports_of(path, with_types=file != '__init__.py'):
         target = own_unit(name)
         if target is not None and LAYERS[target] > LAYERS[unit]:
             wrong.append(f'{path.name}:{line} imports {name} of layer {LAYERS[target]}')
         library = name.split('.')[0]
         if library in HOMES and unit not in HOMES[library]:
             wrong.append(f'{path.name}:{line} imports {library}, at home in {HOMES[library]}')
-        if library in CLOCKS and unit in PURE and own not in CLOCK_EXCEPTIONS:
+        if library in CLOCKS and unit in PURE and file not in CLOCK_EXCEPTIONS:
             wrong.append(f'{path.name}:{line} imports {library}: the arithmetic has no clock')
     assert not wrong
 
@@ -141,10 +140,10 @@ def circle(uses):
     Remove the leaves of a graph repeatedly; return the rest, which is empty without a circle.
     """
     while True:
-        leaves = {one for one, targets in uses.items() if not targets & uses.keys()}
+        leaves = {file for file, targets in uses.items() if not targets & uses.keys()}
         if not leaves:
-            return {one: targets & uses.keys() for one, targets in uses.items()}
-        uses = {one: targets for one, targets in uses.items() if one not in leaves}
+            return {file: targets & uses.keys() for file, targets in uses.items()}
+        uses = {file: targets for file, targets in uses.items() if file not in leaves}
 
 
 @pytest.mark.parametrize('by', ['room', 'file'])
@@ -153,13 +152,10 @@ def test_no_circle(by):
     # Imports for type annotations do not count.
     uses = {}
     for path in SOURCES:
-        own = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)
-        here = unit_of(path) if by == 'room' else own
-        names = {
-            name
-            for _, name in imports_of(path, with_types=False)
-            if name.split('.')[0] == 'thermo_comp'
-        }
+        text = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)
+        here = unit_of(path) if by == 'room' else text
+        imported = (name for _, name in imports_of(path, with_types=False))
+        names = {name for name in imported if name.split('.')[0] == 'thermo_comp'}
         targets = {own_unit(name) if by == 'room' else own_file(name) for name in names}
         uses.setdefault(here, set()).update(target for target in targets if target != here)
     left = circle(uses)

@@ -27,7 +27,6 @@ LIVE_ONLY = {'/diagnostics'}
 
 
 def replayed(folder, kind):
-    """Replay a minute of a bag with its inputs kept; return the type of each topic."""
     stamps = 10**18 + np.arange(600) * (SECOND_NS // 10)
     slow = 10**18 + np.arange(-1, 60) * SECOND_NS
     source = folder / f'{kind}.mcap'
@@ -41,9 +40,9 @@ def replayed(folder, kind):
             writer.write_imu('imu/uncompensated', stamps, force, np.zeros(9))
     unit = Unit('T-1', 'counts' if kind == 'counts' else 'm/s^2', 32767.0, 0.1)
     scale = 300.0 if kind == 'counts' else 1.0
-    one = calibration(unit=unit, axes=Axes(*[AxisReference(scale, 0.0)] * 3))
+    unit_ = calibration(unit=unit, axes=Axes(*[AxisReference(scale, 0.0)] * 3))
     output = folder / f'{kind}_corrected.mcap'
-    replay(source, one, output, keep_inputs=True)
+    replay(source, unit_, output, keep_inputs=True)
     return {name: topic[0] for name, topic in inspect_recording(output).topics.items()}
 
 
@@ -83,7 +82,7 @@ def script():
 
 
 def test_foxglove_paths_lead_to_numbers(topics):
-    found = set()
+    used = set()
     (output,) = re.findall(r'export const output = "(.*)"', script())
     fields_of_script = re.findall(r'(\w+): number', re.search(r'type Output = .*', script())[0])
     for path in foxglove_paths():
@@ -93,9 +92,9 @@ def test_foxglove_paths_lead_to_numbers(topics):
             assert fields[0] in fields_of_script
         else:
             assert field_kind(topics[topic], fields) in ('float64', 'bool')
-        found.add(topic)
+        used.add(topic)
     # The stamped flag equals the plain flag; a viewer shows either at its time.
-    assert found == {output, *topics} - {'/regime/stamped'}
+    assert used == {output, *topics} - {'/regime/stamped'}
 
 
 def test_foxglove_script_and_diagnostics_name_topics_that_exist(topics):
@@ -132,11 +131,8 @@ def test_plotjuggler_curves_lead_to_numbers(topics):
     root = plotjuggler()
     snippets = {snippet.get('name'): snippet for snippet in root.iter('snippet')}
     curves = {curve.get('name') for curve in root.iter('curve')}
-    sources = {
-        element.text
-        for pattern in ('.//linked_source', './/additional_sources/*')
-        for element in root.findall(pattern)
-    }
+    patterns = ('.//linked_source', './/additional_sources/*')
+    sources = {element.text for pattern in patterns for element in root.findall(pattern)}
     assert set(snippets) <= curves
     for series in (curves - set(snippets)) | sources:
         assert source_kind(topics, series) in ('float64', 'bool')

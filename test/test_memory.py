@@ -33,9 +33,9 @@ def test_a_lag_of_a_ramp(step_s):
     for k in range(n + 1):
         bank.step(round(k * step_s * 1e9), rate * k * step_s)
     end = (n + 0.3) * step_s
-    found, extra = bank.at(round(end * 1e9), rate * end)
+    lag, extra = bank.at(round(end * 1e9), rate * end)
     expected = [rate * tau * -math.expm1(-end / tau) for tau in TAUS]
-    assert found == pytest.approx(expected, rel=1e-9)
+    assert lag == pytest.approx(expected, rel=1e-9)
     assert (max(extra) > 0.0) == (step_s > 6.0)
 
 
@@ -46,8 +46,8 @@ def test_a_lag_of_a_step():
     bank.step(1_000_000, 5.0)
     for second in range(1, 601):
         bank.step(second * SECOND_NS, 5.0)
-    found, extra = bank.at(600 * SECOND_NS, 5.0)
-    assert found == pytest.approx([5.0 * math.exp(-600.0 / tau) for tau in TAUS], rel=2e-5)
+    lag, extra = bank.at(600 * SECOND_NS, 5.0)
+    assert lag == pytest.approx([5.0 * math.exp(-600.0 / tau) for tau in TAUS], rel=2e-5)
     assert extra == [0.0] * len(TAUS)
 
 
@@ -66,8 +66,8 @@ def test_what_is_not_known_of_a_lag():
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
     # The uncertainty decays with the lag.
-    found = bank.at(150 * SECOND_NS, 2.0)[1]
-    assert found == pytest.approx([lost**2 * math.exp(-2.0), 0.0])
+    variance = bank.at(150 * SECOND_NS, 2.0)[1]
+    assert variance == pytest.approx([lost**2 * math.exp(-2.0), 0.0])
     bank.note_jump(3.0)
     assert bank.extra == pytest.approx([lost**2 + 9.0, 9.0])
 
@@ -177,11 +177,11 @@ def test_a_play_on_a_lag_follows_the_lag():
     for second in range(1801):
         memory.board_step(second * SECOND_NS, 20.0 + 0.002 * second)
     lagged = 23.6 - 0.002 * 900.0 * -math.expm1(-2.0)
-    found = memory.at(1800 * SECOND_NS, 23.6, [0.0])
-    assert 23.6 - found[0] == pytest.approx(lagged)
+    state = memory.at(1800 * SECOND_NS, 23.6, [0.0])
+    assert 23.6 - state[0] == pytest.approx(lagged)
     # The play was pushed up from 20, and ends 0.4 K below the lagged temperature.
     assert lagged - 20.0 > 0.4
-    assert found[2] == pytest.approx(-0.4)
+    assert state[2] == pytest.approx(-0.4)
 
 
 def test_start_prior():
@@ -217,5 +217,5 @@ def test_the_start_fades_with_each_time_constant():
     assert memory.start_shares(5) == [1.0, 1.0, 1.0]
     memory.board_step(0, 20.0)
     memory.banks['case'].step(300 * SECOND_NS, 2.0)
-    found = memory.start_shares(600 * SECOND_NS)
-    assert found == pytest.approx([math.exp(-10.0), math.exp(-1.0), math.exp(-0.5)])
+    shares = memory.start_shares(600 * SECOND_NS)
+    assert shares == pytest.approx([math.exp(-10.0), math.exp(-1.0), math.exp(-0.5)])

@@ -27,7 +27,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 
 CYCLE_NS = 10_000_000
 N_SAMPLES = 300
-#: Longest time after which no message arrives any more.
+#: Number of samples sent until the discovery of a peer counts as failed.
 N_TRIED = 5000
 OTHER = """\
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
@@ -35,7 +35,7 @@ OTHER = """\
 </profiles></dds>
 """
 
-#: Receives the output twice; prints when it does, and at the end the stamps received in each way.
+#: A receiver with two subscriptions: prints when both receive, and at the end the stamps of each.
 RECEIVER = """
 import json, select, sys, time
 import rclpy
@@ -74,17 +74,13 @@ print(json.dumps(list(heard.values())), flush=True)
 
 def event_wakes(pid):
     """Count how often the thread of the middleware's timed events has been woken so far."""
-    (thread,) = (
-        task
-        for task in Path(f'/proc/{pid}/task').iterdir()
-        if (task / 'comm').read_text().startswith('dds.ev')
-    )
+    tasks = Path(f'/proc/{pid}/task').iterdir()
+    (thread,) = (task for task in tasks if (task / 'comm').read_text().startswith('dds.ev'))
     lines = (thread / 'status').read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith('voluntary'))
 
 
 def send(driver, first, last, pause_s):
-    """Send samples one by one, with the temperatures at every hundredth."""
     pause = threading.Event()
     for k in range(first, last):
         if k % 100 == 0:

@@ -45,8 +45,6 @@ IMU_UNIT = Unit('T-1', 'm/s^2', 160.0, 0.01)
 
 @pytest.fixture
 def saved(tmp_path):
-    """Write a calibration and return the ROS arguments of a node with it."""
-
     def save(of, *overrides):
         save_calibration(of, tmp_path / 'unit.yaml')
         return node_arguments(tmp_path / 'unit.yaml', *overrides)
@@ -59,19 +57,19 @@ def diagnosis(peer):
     heard = peer.listen(DiagnosticArray, '/diagnostics')
 
     def wait(condition):
-        found = []
+        collected = []
 
         def look():
             for array in heard:
-                values = {one.key: one.value for one in array.status[0].values}
+                values = {value.key: value.value for value in array.status[0].values}
                 if condition(array.status[0], values):
-                    found.append((array, array.status[0], values))
+                    collected.append((array, array.status[0], values))
                     return True
             return False
 
         peer.wait_for(look, f'the diagnosis among {[a.status[0].message for a in heard][-3:]}')
         heard.clear()
-        return found[0]
+        return collected[0]
 
     return wait
 
@@ -135,7 +133,7 @@ def test_flag_is_latched_and_not_there_while_unknown(peer, saved):
         late = peer.listen(Bool, 'regime/dynamic', LATCHED)
         peer.wait_for(lambda: late, 'the latched flag')
         assert not late[0].data
-        # The same with the stamp of the deciding reading, also latched.
+        # The flag with the stamp of the deciding reading is latched, too.
         latched = peer.listen(DiagnosticArray, 'regime/stamped', LATCHED)
         # A late subscriber gets the latched messages, the newest last.
         peer.wait_for(
@@ -181,7 +179,7 @@ def test_diagnostics_name_what_is_wrong(peer, saved):
         assert (values['samples in'], values['samples out']) == ('4', '1')
         assert values['sample stamp [ns]'] == str(stamp_ns)
         assert [m.linear_acceleration.x for m in heard] == [1.0 / 300.0]
-        # The level is ERROR only while it lasts.
+        # The level is ERROR only while the saturation lasts.
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
         driver.counts(stamp_ns + CYCLE_NS, 1.0, 2.0, 3.0)
@@ -238,7 +236,7 @@ def test_a_case_is_missed_only_by_a_calibration_that_knew_one(peer, saved, was_f
 
 def test_diagnostics_of_temperatures(peer, saved):
     wait = diagnosis(peer)
-    # Of a fit that has seen less than 1 g.
+    # The terms are of a fit to forces below 1 g.
     unit = replace(thermal_calibration(), nonlinearity=Nonlinearity((1.0, 5.0), 1e-4))
     with node_in_thread(*saved(unit, 'temperature_timeout:=20', 'case_timeout:=10')) as node:
         driver = drive(peer, node)

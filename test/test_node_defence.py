@@ -267,7 +267,7 @@ def test_while_a_file_hangs_the_node_ends_and_nothing_stays(peer, unit, number):
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
         children = Path(f'/proc/{node.process.pid}/task').glob('*/children')
-        (reader,) = ' '.join(one.read_text() for one in children).split()
+        (reader,) = ' '.join(child.read_text() for child in children).split()
         os.kill(int(reader), signal.SIGSTOP)
         message = Parameter('calibration_file', value=str(unit)).to_parameter_msg()
         client = peer._clients['thermo_comp/set_parameters']
@@ -282,7 +282,6 @@ def test_while_a_file_hangs_the_node_ends_and_nothing_stays(peer, unit, number):
 
 
 def alive(pid):
-    """Return whether a process runs, not counting a zombie."""
     try:
         return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
     except FileNotFoundError:
@@ -298,7 +297,7 @@ raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.
 
 
 def test_a_start_that_hangs_ends_with_one_signal():
-    # WHY: SIGTERM was stored but not handled; a second one was needed.
+    # WHY: SIGTERM was stored but not handled; a second SIGTERM was needed.
     with subprocess.Popen(
         [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True
     ) as process:
@@ -311,11 +310,11 @@ def test_a_start_that_hangs_ends_with_one_signal():
 
 def test_what_param_dump_writes_param_load_sets(peer, unit):
     with node_in_thread(*node_arguments(unit)) as node:
-        names = [one for one in node.node._parameters]  # noqa: C416
+        names = [parameter for parameter in node.node._parameters]  # noqa: C416
         request = GetParameters.Request(names=names)
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert len(values) == len(names) > 20
         dumped = [ParameterMessage(name=n, value=v) for n, v in zip(names, values, strict=True)]
         loaded = SetParameters.Request(parameters=dumped)
         results = peer.call(SetParameters, 'thermo_comp/set_parameters', loaded).results
-        assert [one.reason for one in results if not one.successful] == []
+        assert [result.reason for result in results if not result.successful] == []

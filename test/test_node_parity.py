@@ -79,7 +79,6 @@ def thermal_test(path, imu=False, has_case=True):
 
 
 def output_of(path):
-    """Read a corrected bag with `rosbags`: samples, flags, and stamped flags as bytes."""
     with AnyReader([path]) as reader:
         wanted = [c for c in reader.connections if c.topic.endswith(REGIME.name)]
         flags = [
@@ -93,16 +92,16 @@ def output_of(path):
 
 
 def assert_same(live, offline):
-    found, flags, stamped = output_of(live)
+    out, flags, stamped = output_of(live)
     expected, expected_flags, expected_stamped = output_of(offline)
-    assert found.frame_id == expected.frame_id
-    assert found.accel_stamp_ns.tolist() == expected.accel_stamp_ns.tolist()
-    different = np.flatnonzero((found.accel != expected.accel).any(axis=1))
+    assert out.frame_id == expected.frame_id
+    assert out.accel_stamp_ns.tolist() == expected.accel_stamp_ns.tolist()
+    different = np.flatnonzero((out.accel != expected.accel).any(axis=1))
     assert different.tolist() == []
-    assert found.imu is not None
+    assert out.imu is not None
     assert expected.imu is not None
     for name in ImuColumns._fields:
-        assert getattr(found.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
+        assert getattr(out.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
     # The k-th flag belongs to the k-th case reading: equal flags mean equal switch times.
     assert (len(flags), flags) == (len(expected_flags), expected_flags)
     assert False in flags
@@ -149,13 +148,13 @@ def test_imu_in_another_frame(tmp_path):
     args = ['-p', 'input:=imu', '-p', 'frame_id:=tilted']
     assert run(unit, tmp_path / 'bag.mcap', tmp_path, *args, frame_id='tilted') > 0
     given = read_recording(tmp_path / 'bag.mcap', Topics(input='imu'), require=('accel',)).columns
-    found, _, _ = output_of(tmp_path / 'live.mcap')
-    given = given.imu.take(np.flatnonzero(np.isin(given.accel_stamp_ns, found.accel_stamp_ns)))
+    published, _, _ = output_of(tmp_path / 'live.mcap')
+    given = given.imu.take(np.flatnonzero(np.isin(given.accel_stamp_ns, published.accel_stamp_ns)))
     is_rate = given.angular_velocity_covariance[:, 0] != -1.0
     # An existing rate is corrected, a missing one passes unchanged.
-    moved = np.abs(found.imu.angular_velocity - given.angular_velocity)
+    moved = np.abs(published.imu.angular_velocity - given.angular_velocity)
     assert moved[~is_rate].max() == 0.0
     # The biases of `rich_gyroscope` at the reference temperature are 10 mrad/s and more.
     assert moved[is_rate].min() > 1e-3
-    claimed = found.imu.angular_velocity_covariance[is_rate].reshape(-1, 3, 3)
+    claimed = published.imu.angular_velocity_covariance[is_rate].reshape(-1, 3, 3)
     assert (np.linalg.eigvalsh(claimed) > 0.0).all()

@@ -40,8 +40,6 @@ def of_bias(counts, **keys):
 
 
 class Flow:
-    """Publishes the counts of a unit at rest, and collects the output."""
-
     def __init__(self, peer):
         self._peer = peer
         self.heard = peer.listen(Imu, 'imu/data_raw')
@@ -60,7 +58,6 @@ class Flow:
             self.n_sent += 1
 
     def more(self, n=100):
-        """Wait for further samples; return their number."""
         wanted = len(self.heard) + n
         self._peer.wait_for(lambda: len(self.heard) >= wanted, f'{n} more samples')
         return len(self.heard)
@@ -89,24 +86,22 @@ def test_reload_while_samples_flow(peer, tmp_path):
         before = flow.more()
         assert flow.bias(before - 1) == 1.0
 
-        # Another file: applied when the answer comes, between two samples.
+        # Another file is applied when the answer comes, between two samples.
         assert [r.successful for r in peer.set_parameters(calibration_file=str(second))] == [True]
         flow.more()
 
-        # Broken file: refused with path, key and reason; the calibration in use stays.
+        # A broken file is refused with path, key and reason; the calibration in use stays.
         (result,) = peer.set_parameters(calibration_file=str(broken))
         assert not result.successful
         assert str(broken) in result.reason
         assert 'axes.x.bias' in result.reason
         assert 'nan' in result.reason.lower()
         flow.more()
-        assert peer.call(
-            GetParameters,
-            'thermo_comp/get_parameters',
-            GetParameters.Request(names=['calibration_file']),
-        ).values[0].string_value == str(second)
+        request = GetParameters.Request(names=['calibration_file'])
+        (value,) = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
+        assert value.string_value == str(second)
 
-        # With other parameters: all are set, or none.
+        # A file with other parameters: all are set, or none.
         result = peer.set_atomically(transition_time=5, calibration_file=str(broken))
         assert not result.successful
         result = peer.set_atomically(transition_time=5, calibration_file=str(tmp_path / 'none'))
@@ -205,7 +200,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
     ]
     try:
         new = node._prepare(changes)
-        values = {one.name: node.node.get_parameter(one.name).value for one in changes}
+        values = {change.name: node.node.get_parameter(change.name).value for change in changes}
         running = node._relay.running
         number, k = 0, 0
         while True:
@@ -217,17 +212,17 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
             assert {name: node.node.get_parameter(name).value for name in values} == values
             assert node._loop._period_ns == SECOND_NS
             for _ in range(3):
-                for one in (undisturbed, running.compensator):
+                for compensator in (undisturbed, running.compensator):
                     if k % 10 == 0:
-                        one.push('board', START_NS + k * CYCLE_NS, 20.0 + 1e-3 * k)
-                        one.push('case', START_NS + k * CYCLE_NS, 20.0 + 2e-3 * k)
+                        compensator.push('board', START_NS + k * CYCLE_NS, 20.0 + 1e-3 * k)
+                        compensator.push('case', START_NS + k * CYCLE_NS, 20.0 + 2e-3 * k)
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
         # Each executed line of the building, the exchange and the setting.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
-            one.name: one.value for one in changes
+            change.name: change.value for change in changes
         }
         sample = START_NS + k * CYCLE_NS, *standing(k)
         force = node._compensator.process(*sample)
@@ -252,11 +247,8 @@ def test_a_calibration_that_cannot_be_applied_changes_nothing(peer, tmp_path):
         assert not result.successful
         assert result.reason.startswith(f'{second}: ')
         flow.more(50)
-        (parameter,) = peer.call(
-            GetParameters,
-            'thermo_comp/get_parameters',
-            GetParameters.Request(names=['calibration_file']),
-        ).values
+        request = GetParameters.Request(names=['calibration_file'])
+        (parameter,) = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert parameter.string_value == str(first)
         flow.stop()
     assert {flow.bias(index) for index in range(len(flow.heard))} == {1.0}

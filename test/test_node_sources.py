@@ -38,16 +38,16 @@ from thermo_comp.unit.calibration_file import save_calibration
 def contested(peer, heard, topic, send):
     """Let both publishers send until the node reports two, however slowly."""
     text = f'2 publishers on {topic}, the topic is not used until only one of them sends'
-    found = []
+    collected = []
 
     def look():
         send()
-        found.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
-        return bool(found)
+        collected.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
+        return bool(collected)
 
     peer.poll(look, text)
-    assert found[0].level == DiagnosticStatus.ERROR
-    return found[0]
+    assert collected[0].level == DiagnosticStatus.ERROR
+    return collected[0]
 
 
 def test_samples_of_a_second_publisher_never_go_out(peer, unit):
@@ -66,11 +66,11 @@ def test_samples_of_a_second_publisher_never_go_out(peer, unit):
             other.publish(strange)
 
         status = contested(peer, diagnostics, '/accel/counts', both)
-        values = {one.key: one.value for one in status.values}
+        values = {value.key: value.value for value in status.values}
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
         peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
-        # The first samples afterwards may still be of the other driver.
+        # After the other driver has left, the first samples may still be from it.
         samples.send(20)
         before = len(samples.heard)
         peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
@@ -112,7 +112,7 @@ rclpy.spin(node)
 
 @contextlib.contextmanager
 def driver_process(name):
-    """Run a driver; return the time of its first sample [ns]. It is killed at the end."""
+    """Run a driver; return the time of its first sample [ns]. The driver is killed at the end."""
     command = [sys.executable, '-c', DRIVER, name]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -135,27 +135,25 @@ def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer, unit):
         with driver_process('first'):
             peer.wait_for(lambda: len(of('first')) > 100, 'samples of the first driver')
         killed = time.monotonic()
-        # Waits for the clock, as the driver is restarted a second later.
+        # The test waits for the clock, as the driver is restarted a second later.
         peer.poll(lambda: time.monotonic() - killed > 1.0, 'a second')
         with driver_process('second') as (_, began_ns):
             peer.wait_for(lambda: of('second'), 'samples of the second driver')
             assert node._relay.samples.count_publishers() == 2
             assert (stamp_of(of('second')[0]) - began_ns) * 1e-9 < 2.0
             text = '2 publishers on /accel/counts, of which one sends'
+            warned = DiagnosticStatus.WARN
             peer.wait_for(
-                lambda: any(
-                    text in one.status[0].message and one.status[0].level == DiagnosticStatus.WARN
-                    for one in diagnostics[-5:]
-                ),
+                lambda: any(text in status.message and status.level == warned
+                            for array in diagnostics[-5:] for status in array.status[:1]),
                 'the warning alone',
-            )
+            )  # fmt: skip
             peer.wait_for(lambda: len(of('second')) > 100, 'more of the second driver')
         names = [imu.header.frame_id for imu in heard]
         assert names == sorted(names)
 
 
 def numbered(begin, period_s, until_s, start_s=0.0):
-    """List the messages of a publisher: time and number."""
     n = int((until_s - start_s) / period_s)
     return [(start_s + k * period_s, begin + k) for k in range(n)]
 
@@ -163,16 +161,16 @@ def numbered(begin, period_s, until_s, start_s=0.0):
 @pytest.mark.parametrize('offset', [-7, -1, 0, 1, 2, 1000])
 @pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
 def test_two_that_send_are_never_mixed(offset, period_s):
-    own = [(*one, 'own') for one in numbered(500, 0.01, 12.0)]
-    begins = 500 + 200 + offset  # about as many as the other driver has sent by then
-    other = [(*one, 'other') for one in numbered(begins, period_s, 8.0, start_s=2.003)]
+    first = [(*message, 'own') for message in numbered(500, 0.01, 12.0)]
+    begins = 500 + 200 + offset  # about as many as the first driver has sent by then
+    other = [(*message, 'other') for message in numbered(begins, period_s, 8.0, start_s=2.003)]
     sources, used = Sources(), []
-    for at_s, number, name in sorted(own + other):
+    for at_s, number, name in sorted(first + other):
         n_known = 2 if at_s > 2.0 else 1
         if not sources.of_one(n_known, [number], [round(at_s * 1e9)]):
             used.append((at_s, name))
     assert {name for _, name in used} == {'own'}
-    # The other driver is known but silent: this one's samples count from a second of silence on.
+    # The other driver is listed but silent: samples of the first count after a second of silence.
     assert sum(at_s < 2.0 for at_s, _ in used) >= 199
     assert sum(at_s > 10.0 for at_s, _ in used) >= 199
 
@@ -239,8 +237,8 @@ def test_reports_more_often_than_samples_are_no_silence(peer, tmp_path):
             peer.wait_for(lambda n=n: len(imu) > n, 'the sample')
             del heard[:]
             peer.wait_for(lambda: len(heard) > 10, 'reports')
-            said = [array.status[0].message for array in heard[1:10]]
-            assert not any('no samples' in text for text in said), said
+            messages = [array.status[0].message for array in heard[1:10]]
+            assert not any('no samples' in text for text in messages), messages
         status_with(peer, heard, 'no samples are coming in')
 
 

@@ -57,18 +57,18 @@ def test_bad_start(overrides, text, unit, tmp_path, capfd):
     nan = dump_calibration(calibration()).replace('bias: 0.0', 'bias: .nan', 1)
     (tmp_path / 'nan.yaml').write_text(nan)
     save_calibration(calibration(unit=Unit('T-1', 'm/s^2', 160.0, 0.01)), tmp_path / 'imu.yaml')
-    code = main(arguments(*(one.format(tmp=tmp_path, unit=unit) for one in overrides)))
-    said = capfd.readouterr()
+    code = main(arguments(*(override.format(tmp=tmp_path, unit=unit) for override in overrides)))
+    printed = capfd.readouterr()
     assert code == 1
-    assert said.out == ''
-    (line,) = said.err.splitlines()
+    assert printed.out == ''
+    (line,) = printed.err.splitlines()
     assert line.startswith('thermo_comp_node: ')
     assert text in line
 
 
 def test_one_topic_for_two_thermometers(unit, capfd):
     remaps = [f'temperature/{name}:=/imu/temperature' for name in ('board', 'case')]
-    words = [word for one in remaps for word in ('-r', one)]
+    words = [word for remap in remaps for word in ('-r', remap)]
     assert main([*arguments(f'calibration_file:={unit}'), *words]) == 1
     assert capfd.readouterr().err == (
         'thermo_comp_node: /imu/temperature: one topic for both board and case: a single '
@@ -86,9 +86,9 @@ def test_one_topic_for_two_thermometers(unit, capfd):
 def test_an_environment_that_ros_cannot_use(name, value, text, unit, monkeypatch, capfd):
     monkeypatch.setenv(name, value)
     assert main(arguments(f'calibration_file:={unit}')) == 1
-    said = capfd.readouterr().err.splitlines()[-1]
-    assert said.startswith('thermo_comp_node: failed to initialize')
-    assert text in said
+    printed = capfd.readouterr().err.splitlines()[-1]
+    assert printed.startswith('thermo_comp_node: failed to initialize')
+    assert text in printed
 
 
 def test_closed_streams_are_no_signal(unit):
@@ -154,8 +154,8 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path,
     peer.close()
     finished = ran(sys.executable, '-m', 'thermo_comp', 'info', unit)
     assert finished.returncode == 1
-    said = 'thermo_comp: error: the commands need typer: pip install thermo_comp\n'
-    assert (finished.stdout, finished.stderr) == ('', said)
+    text = 'thermo_comp: error: the commands need typer: pip install thermo_comp\n'
+    assert (finished.stdout, finished.stderr) == ('', text)
 
 
 def test_usage(capfd):
@@ -167,18 +167,18 @@ def test_usage(capfd):
 
 def test_unreadable_ros_arguments(capfd):
     assert main(['thermo_comp_node', '--ros-args', '--params-file', '/none.yaml']) == 2
-    said = capfd.readouterr().err
-    assert 'thermo_comp_node: ' in said
-    assert 'Traceback' not in said
+    printed = capfd.readouterr().err
+    assert 'thermo_comp_node: ' in printed
+    assert 'Traceback' not in printed
 
 
 def test_misspelt_parameters_are_said(unit, capfd):
     overrides = ['-p', f'calibration_file:={unit}', '-p', 'transition_tme:=3.0']
     overrides += ['-p', 'qos_overrides./imu/uncompensated.subscription.depth:=3']
     with node_in_thread(*overrides):
-        said = capfd.readouterr().err
-        assert 'there is no parameter `transition_tme`, it has no effect' in said
-        assert said.count('there is no parameter') == 1
+        printed = capfd.readouterr().err
+        assert 'there is no parameter `transition_tme`, it has no effect' in printed
+        assert printed.count('there is no parameter') == 1
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

@@ -50,11 +50,11 @@ def test_the_inverse_of_a_square_is_the_root_of_a_quadratic(k2, tolerance):
     x = np.linspace(-10.0, 10.0, 41)
     root = 2.0 * x / (1.0 + np.sqrt(1.0 + 4.0 * k2 * x))
     np.testing.assert_allclose(linearised(x, k2, 0.0, 0.0), root, rtol=0.0, atol=tolerance)
-    for one, expected in zip(x.tolist(), root.tolist(), strict=True):
-        signed = np.copysign(k2, k2 * one)
-        odd = 2.0 * one / (1.0 + np.sqrt(1.0 + 4.0 * signed * one))
-        found = linearised(one, 0.0, k2, 0.0), linearised(one, k2, 0.0, 0.0)
-        assert found == pytest.approx((odd, expected), abs=tolerance)
+    for reading, expected in zip(x.tolist(), root.tolist(), strict=True):
+        signed = np.copysign(k2, k2 * reading)
+        odd = 2.0 * reading / (1.0 + np.sqrt(1.0 + 4.0 * signed * reading))
+        forces = linearised(reading, 0.0, k2, 0.0), linearised(reading, k2, 0.0, 0.0)
+        assert forces == pytest.approx((odd, expected), abs=tolerance)
 
 
 def test_the_inverse_of_a_cube_is_the_real_root():
@@ -74,8 +74,8 @@ def test_a_correction_undoes_the_terms_at_their_temperature():
     for k in range(120):
         compensator.push('board', k * 10**9, 20.0 + t)
         compensator.push('case', k * 10**9, 20.0 + t)
-        found = compensator.process(k * 10**9, *(300.0 * G * x).tolist())
-    assert np.array(found[:3]) / G == pytest.approx(f, abs=1e-11)
+        corrected = compensator.process(k * 10**9, *(300.0 * G * x).tolist())
+    assert np.array(corrected[:3]) / G == pytest.approx(f, abs=1e-11)
 
 
 def test_stream_and_batch_have_the_same_bits(rng):
@@ -83,7 +83,7 @@ def test_stream_and_batch_have_the_same_bits(rng):
     unit = with_covariance(bent, rng)
     # Up to 10 g on an axis, beyond the 6 g of the fit.
     events = [
-        (kind, stamp, tuple(9.0 * one for one in value) if kind == 'accel' else value)
+        (kind, stamp, tuple(9.0 * count for count in value) if kind == 'accel' else value)
         for kind, stamp, value in run_of(rng, seconds=60)
     ]
     rows, _ = stream(Compensator(unit, UNCHECKED), events)
@@ -103,7 +103,7 @@ def test_without_terms_every_bit_is_that_of_a_file_without_a_nonlinearity(rng):
 
 
 def test_the_variance_is_that_of_all_parameters_together(rng):
-    # No |f| f: what it has in common with others is left out, on the safe side.
+    # No |f| f: its correlation with other terms is left out, on the safe side.
     unit = calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE)))
     unit = with_covariance(unit, rng)
     layout, correction = parameter_layout(unit), Correction(unit)
@@ -120,8 +120,8 @@ def test_the_variance_is_that_of_all_parameters_together(rng):
             powers = np.array([f**2 / G, f**3 / G**2])
             first = layout.nonlinear + 4 * axis
             along[first : first + 4] = [*powers, *(t * powers)]
-            found = np.polyval(linear[axis, ::-1], f) + f**2 * np.polyval(beyond[axis, ::-1], f)
-            assert found == pytest.approx(along @ whole @ along, rel=1e-5)
+            extended = np.polyval(linear[axis, ::-1], f) + f**2 * np.polyval(beyond[axis, ::-1], f)
+            assert extended == pytest.approx(along @ whole @ along, rel=1e-5)
 
 
 def test_beyond_the_largest_force_an_unknown_square_begins():
@@ -158,8 +158,8 @@ def test_a_file_keeps_the_terms_and_refuses_those_that_no_axis_has():
 def test_rests_in_the_field_feel_every_coefficient():
     # The second route is a difference of two evaluations.
     unit = with_covariance(calibration(nonlinearity=BENT), np.random.default_rng(1))
-    found = rests(unit, any_way, lambda _days: np.zeros(3), days=1, rate=0.5 / 60.0)
-    series = series_of(found, unit)
+    logged = rests(unit, any_way, lambda _days: np.zeros(3), days=1, rate=0.5 / 60.0)
+    series = series_of(logged, unit)
     values, scale, step = parameters_of(unit), np.full(3, 300.0), 1e-7
     layout, covariance = parameter_layout(unit), unit.posterior.covariance()
     assert (series.claim > 0.0).all()
@@ -167,6 +167,6 @@ def test_rests_in_the_field_feel_every_coefficient():
         moved = with_parameters(
             unit, scale, values + step * (np.arange(len(values)) == k), covariance
         )
-        slope = (series.miss - series_of(found, moved).miss) / step
+        slope = (series.miss - series_of(logged, moved).miss) / step
         # The derivative of the correction itself, 2 K2 of 1 g, is left out.
         assert np.allclose(slope, series.by_parameter[:, k], atol=1e-3 * abs(slope).max() + 1e-7)

@@ -39,7 +39,7 @@ def words_of(ups, rng, seconds=20.0):
 
 def constants(result):
     triad = result.calibration.axes
-    return np.array([one.bias for one in triad]), np.array([one.scale_factor for one in triad])
+    return np.array([axis.bias for axis in triad]), np.array([one.scale_factor for one in triad])
 
 
 @pytest.fixture(scope='module')
@@ -56,17 +56,17 @@ def plain(words):
     ('offset', 'declared'), [(32768.0, False), (32768.0, True), (8192.0, False), (20000.0, False)]
 )
 def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declared):
-    found = fit([source(words + offset)], replace(OPTIONS, offset=offset if declared else None))
-    bias, scale = constants(found)
+    result = fit([source(words + offset)], replace(OPTIONS, offset=offset if declared else None))
+    bias, scale = constants(result)
     np.testing.assert_allclose(bias - offset, constants(plain)[0], atol=0.02)
     np.testing.assert_allclose(scale, constants(plain)[1], rtol=1e-6)
-    # Compared with the truth: means of 2000 samples of 12 counts, 14 of them.
+    # Tolerance: noise of 14 means of 2000 samples of 12 counts.
     np.testing.assert_allclose(bias - offset, BIAS, atol=1.0)
     np.testing.assert_allclose(scale, K, rtol=3e-4)
-    np.testing.assert_allclose(found.calibration.misalignment, M, atol=3e-4)
-    assert any(one.name == 'offset' for one in found.findings)
-    assert 'zero force reads' in found.calibration.provenance.notes[-1]
-    assert not any(one.name == 'offset' for one in plain.findings)
+    np.testing.assert_allclose(result.calibration.misalignment, M, atol=3e-4)
+    assert any(finding.name == 'offset' for finding in result.findings)
+    assert 'zero force reads' in result.calibration.provenance.notes[-1]
+    assert not any(finding.name == 'offset' for finding in plain.findings)
 
 
 def test_a_bag_for_each_position_needs_none_of_the_others(rng):
@@ -74,20 +74,20 @@ def test_a_bag_for_each_position_needs_none_of_the_others(rng):
     ups = positions(10, 3)
     ups[0] = -np.full(3, 3.0**-0.5)
     bags = [source(words_of([up], rng) + 32768.0, f'bag{k}') for k, up in enumerate(ups)]
-    found = fit(bags, OPTIONS)
-    bias, scale = constants(found)
+    result = fit(bags, OPTIONS)
+    bias, scale = constants(result)
     np.testing.assert_allclose(bias - 32768.0, BIAS, atol=2.0)
     np.testing.assert_allclose(scale, K, rtol=6e-4)
-    assert found.bags[0].n_saturated == found.bags[1].n_saturated == 0
+    assert result.bags[0].n_saturated == result.bags[1].n_saturated == 0
 
 
 def test_one_attitude_of_16_bits_has_the_right_scale(rng):
-    found = fit([source(words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0)], OPTIONS)
-    bias, scale = constants(found)
+    result = fit([source(words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0)], OPTIONS)
+    bias, scale = constants(result)
     # Norm of one reading with the bias at its prior: 1 m/s^2, about 400 counts.
     np.testing.assert_allclose(scale, 4200.0 / GRAVITY, rtol=0.05)
     np.testing.assert_allclose(bias, 32768.0, atol=400.0)
-    assert found.calibration.unit.full_scale == 65535.0
+    assert result.calibration.unit.full_scale == 65535.0
 
 
 def test_rails_of_words_without_a_sign_are_saturated(rng):
@@ -100,8 +100,8 @@ def test_rails_of_words_without_a_sign_are_saturated(rng):
 def test_a_prior_knows_the_offset(rng, plain):
     known = about(plain.calibration, np.full(3, 32768.0))
     up = np.array((0.6, 0.0, 0.8))
-    found = fit([source(words_of([up], rng) + 32768.0)], replace(OPTIONS, prior=known))
-    np.testing.assert_allclose(constants(found)[0], 32768.0 + BIAS, atol=2.0)
+    result = fit([source(words_of([up], rng) + 32768.0)], replace(OPTIONS, prior=known))
+    np.testing.assert_allclose(constants(result)[0], 32768.0 + BIAS, atol=2.0)
 
 
 def test_a_centre_is_found_only_where_there_is_one(rng):

@@ -28,7 +28,6 @@ KNOWN_KEYS = {
 
 
 def setup_literals():
-    """Return the module-level literals of setup.py without running it."""
     literals = {}
     for node in ast.parse((ROOT / 'setup.py').read_text()).body:
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
@@ -50,11 +49,8 @@ def test_manifest_is_format_3_with_keys_that_exist():
     assert MANIFEST.get('format') == '3'
     assert MANIFEST.findtext('name') == 'thermo_comp'
     assert MANIFEST.findtext('export/build_type') == 'ament_python'
-    keys = {
-        node.text
-        for tag in ('depend', 'exec_depend', 'build_depend', 'test_depend')
-        for node in MANIFEST.iter(tag)
-    }
+    tags = ('depend', 'exec_depend', 'build_depend', 'test_depend')
+    keys = {node.text for tag in tags for node in MANIFEST.iter(tag)}
     assert keys == KNOWN_KEYS
 
 

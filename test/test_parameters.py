@@ -43,14 +43,14 @@ def test_every_parameter_is_described():
     with bare_node() as node:
         parameters.declare(node)
         for entry in fields(NodeConfig):
-            found = node.describe_parameter(entry.name)
-            assert found.description == entry.metadata['description']
-            assert found.read_only == (
+            shown = node.describe_parameter(entry.name)
+            assert shown.description == entry.metadata['description']
+            assert shown.read_only == (
                 entry.name in {'calibration_directory', 'topics', 'rest_log'}
             )
-            assert found.type == Parameter.Type.from_parameter_value(entry.default).value
-            assert bool(found.floating_point_range) == isinstance(entry.default, float)
-            assert bool(found.integer_range) == isinstance(entry.default, int)
+            assert shown.type == Parameter.Type.from_parameter_value(entry.default).value
+            assert bool(shown.floating_point_range) == isinstance(entry.default, float)
+            assert bool(shown.integer_range) == isinstance(entry.default, int)
     assert parameters.descriptor('input').additional_constraints == 'one of: counts, imu'
 
 
@@ -113,9 +113,9 @@ def test_only_whole_numbers_for_float_parameters_are_turned_into_floats():
         Parameter('use_sim_time', value=True),
         Parameter('unknown', value=5),
     ]
-    found = [parameters.read_parameter(one.to_parameter_msg()) for one in changes]
-    assert [one.value for one in found] == [5.0, 5, True, 5]
-    assert [one.type_ for one in found] == [
+    given = [parameters.read_parameter(change.to_parameter_msg()) for change in changes]
+    assert [change.value for change in given] == [5.0, 5, True, 5]
+    assert [change.type_ for change in given] == [
         Parameter.Type.DOUBLE, Parameter.Type.INTEGER, Parameter.Type.BOOL, Parameter.Type.INTEGER,
     ]  # fmt: skip
 

@@ -20,7 +20,6 @@ OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 
 
 def bag_of(path, rest):
-    """Write a rest at 25 Hz with a board thermometer at 2 Hz that begins 3 s earlier."""
     stamp_ns = START_NS + np.rint(rest.time * 1e9).astype(np.int64)
     board_ns = START_NS + np.rint((rest.board_time - 3.0) * 1e9).astype(np.int64)
     with BagWriter(path) as writer:
@@ -58,8 +57,8 @@ def test_what_is_inside_is_there_and_nothing_else(bag, begin, end, n_messages, m
     # A reading applies from the same sample on as in the whole bag.
     after = [np.sum(inside[:n]) for n in board.after[own]]
     begins = np.cumsum([0, *map(len, blocks)])
-    found = [b.temperatures['board'].after + n for b, n in zip(blocks, begins, strict=False)]
-    np.testing.assert_array_equal(np.concatenate(found), after)
+    places = [b.temperatures['board'].after + n for b, n in zip(blocks, begins, strict=False)]
+    np.testing.assert_array_equal(np.concatenate(places), after)
     for block in blocks:
         assert sum(map(len, block.raw.values())) == block.n_messages
         assert all(len(raw.data) == raw.size.sum() for raw in block.raw.values())
@@ -72,8 +71,8 @@ def test_stamps_say_the_same_as_seconds(bag):
         part_of(bag, 20, 50),
     )
     assert since == pytest.approx(20.0)
-    for one, other in zip(by_stamp, by_time, strict=True):
-        np.testing.assert_array_equal(one.accel, other.accel)
+    for stamped, other in zip(by_stamp, by_time, strict=True):
+        np.testing.assert_array_equal(stamped.accel, other.accel)
 
 
 def test_nothing_inside_is_said(bag):

@@ -40,7 +40,6 @@ def study_of(name, n=9, corners=HALF, **given):
 
 
 def taus_of(calibration):
-    """Return the time constants of the lags, those of an axis without weight apart."""
     return [
         sorted({one.tau_s for one in calibration.response if one.kind == 'board' and one.bias[k]})
         for k in range(3)
@@ -57,7 +56,7 @@ def test_the_lags_are_those_of_the_parts_each_for_its_axis():
     unit, study = study_of('parts', part_s=PARTS_S)
     calibration = strangers.fitted(study)
     # A lag of 10 K that is wrong by 1 % moves a bias of 10 ug/K by 1 ug, twice its noise of a
-    # minute; some hundred minutes of ramps determine it better than that.
+    # minute; some hundred minutes of ramps determine a lag better than 1 %.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # 0.65 ug is the noise of a mean of a minute.
     assert judged(calibration, study).norm < 2.0
@@ -81,10 +80,10 @@ def test_a_bump_is_no_disturbance_and_no_motion():
     # At 0.5 Hz a cell of 30 samples is a minute, and the bump passes within two of them.
     bump = np.array([450.0, -400.0, 500.0])
     _, study = study_of('bump', n=12, bump=bump, bump_c=17.0)
-    found = judged(strangers.fitted(study), study)
+    judgement = judged(strangers.fitted(study), study)
     # The bends are a polygon with corners every 0.5 K in a bell of 0.85 K sd.
-    assert found.norm < 60.0
-    assert found.norm_ratio < 1.5
+    assert judgement.norm < 60.0
+    assert judgement.norm_ratio < 1.5
 
 
 def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
@@ -95,10 +94,10 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     records = second_simulator.runs_of(unit, program, second_simulator.directions(9, 5), 5)
     tests = second_simulator.runs_of(unit, held[0], second_simulator.directions(2, 7), 7,
                                      soaked_s=21600.0, soaked_c=20.0)  # fmt: skip
-    found = fit_and_correct(records, tests, full_scale=second_simulator.FULL_SCALE)
+    result = fit_and_correct(records, tests, full_scale=second_simulator.FULL_SCALE)
     least, _ = second_simulator.floor_of(tests)
-    assert errors(found.specific_force, found.sd, tests).norm < 2.0 * least
-    stages = {(one.tau_s, one.second_tau_s) for one in found.calibration.response if one.tau_s}
+    assert errors(result.specific_force, result.sd, tests).norm < 2.0 * least
+    stages = {(one.tau_s, one.second_tau_s) for one in result.calibration.response if one.tau_s}
     for head, pendulum in zip(unit.head_s, unit.pendulum_s, strict=True):
         # The network is integrated in steps of 2 s, which adds a second to a time constant.
         near = [
@@ -114,7 +113,7 @@ def test_without_parts_or_ramps_the_fit_has_a_bank_of_lags(case):
     # Soaks do not determine a time constant; with a third node no axis is a curve of one part.
     study = next(case(0))
     calibration = strangers.fitted(study)
-    assert {one.tau_s for one in calibration.response if one.kind == 'board'} <= {*FINE_TAUS}
+    assert {term.tau_s for term in calibration.response if term.kind == 'board'} <= {*FINE_TAUS}
 
 
 def test_units_of_a_type_share_the_lags_of_the_bank():
@@ -122,7 +121,7 @@ def test_units_of_a_type_share_the_lags_of_the_bank():
     calibration = strangers.fitted(study)
 
     def sibling(k, ratio):
-        terms = tuple(replace(one, tau_s=ratio * one.tau_s) for one in calibration.response)
+        terms = tuple(replace(term, tau_s=ratio * term.tau_s) for term in calibration.response)
         unit = replace(calibration.unit, serial=f'u{k}')
         return replace(calibration, unit=unit, response=terms)
 
@@ -147,8 +146,8 @@ def test_fit_says_how_far_the_parts_lag(tmp_path, cli):
             header=HEADER, comments='',
         )  # fmt: skip
     asked = ('fit', *tables, '--gravity', GRAVITY, '-o', tmp_path / 'unit.yaml', '--force')
-    (line,) = (one for one in cli(*asked).stdout.splitlines() if 'its part' in one)
+    (line,) = (text for text in cli(*asked).stdout.splitlines() if 'its part' in text)
     spoken = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
-    told = json.loads(cli(*asked, '--json').stdout)['part_lags_s']
-    assert told == pytest.approx(unit.part_s, rel=0.01)
-    assert spoken == pytest.approx(told, abs=0.5)
+    content = json.loads(cli(*asked, '--json').stdout)['part_lags_s']
+    assert content == pytest.approx(unit.part_s, rel=0.01)
+    assert spoken == pytest.approx(content, abs=0.5)

@@ -37,7 +37,6 @@ NAMES = ('accel/counts', 'temperature/board', 'temperature/case')
 
 
 def bag_of(path, n, rng):
-    """Write n samples, and a temperature of each sensor at every tenth."""
     stamps = START_NS + np.arange(n) * CYCLE_NS
     with BagWriter(path) as writer:
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (n, 3)), 'imu_link')
@@ -54,8 +53,6 @@ def messages_of(path):
 
 
 class Listener:
-    """Receives all topics of the player, in order of arrival."""
-
     def __init__(self, peer, prefix='', qos=UNLIMITED):
         self.peer = peer
         self.topics = {
@@ -69,11 +66,11 @@ class Listener:
 
 
 def by_topic(path):
-    found = {name: [] for name in NAMES}
+    heard = {name: [] for name in NAMES}
     with AnyReader([path]) as reader:
         for connection, _, data in reader.messages():
-            found[connection.topic.lstrip('/')].append(bytes(data))
-    return found
+            heard[connection.topic.lstrip('/')].append(bytes(data))
+    return heard
 
 
 @pytest.mark.parametrize('rate', [0.0, 20.0], ids=['as fast as taken', 'paced'])
@@ -85,11 +82,8 @@ def test_every_message_arrives_byte_for_byte(peer, tmp_path, rng, rate):
     # The player has ended, so every reliable subscriber has received everything.
     listener.wait_for(4800)
     assert listener.topics == by_topic(bag)
-    assert report.n_messages == {
-        '/accel/counts': 4000,
-        '/temperature/board': 400,
-        '/temperature/case': 400,
-    }
+    temperatures = {'/temperature/board': 400, '/temperature/case': 400}
+    assert report.n_messages == {'/accel/counts': 4000, **temperatures}
     assert (report.unheard, report.lossy) == ([], [])
     assert progress[-1] == 1.0
     times = [message.clock.sec * 10**9 + message.clock.nanosec for message in listener.clock]
@@ -127,10 +121,10 @@ def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng
         [sys.executable, '-c', SLOW_LISTENER], stdout=subprocess.PIPE, text=True
     ) as listener:
         report = play(tmp_path / 'bag.mcap', rate=0.0)
-        said, _ = listener.communicate(timeout=2 * TIMEOUT)
+        printed, _ = listener.communicate(timeout=2 * TIMEOUT)
     assert report.n_messages == {'/accel/counts': 7000}
     expected = hashlib.sha256(b''.join(messages_of(tmp_path / 'bag.mcap'))).hexdigest()
-    assert said.strip() == expected
+    assert printed.strip() == expected
 
 
 def test_says_who_does_not_listen_and_who_may_lose(peer, tmp_path, rng):

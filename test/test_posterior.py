@@ -23,7 +23,6 @@ from thermo_comp.unit.posterior import Block, Posterior, posterior_of
 
 
 def random_covariance(seed, n, spread=1.0):
-    """Make random correlations between parameters whose units differ by decades."""
     rng = np.random.default_rng(seed)
     factor = rng.normal(size=(n, n)) * np.geomspace(1.0, 1e-4, n) ** spread
     covariance = factor @ factor.T
@@ -35,19 +34,19 @@ def random_covariance(seed, n, spread=1.0):
 @settings(max_examples=60, deadline=None)
 def test_variances_stay_and_correlations_miss_by_the_tolerance(seed, n, tolerance):
     covariance = random_covariance(seed, n)
-    found = posterior_of(covariance, tolerance)
+    posterior = posterior_of(covariance, tolerance)
     sd = np.sqrt(np.diag(covariance))
-    error = (found.covariance() - covariance) / sd / sd[:, np.newaxis]
+    error = (posterior.covariance() - covariance) / sd / sd[:, np.newaxis]
     # The factor has single precision.
     np.testing.assert_allclose(np.diag(error), 0.0, atol=1e-6)
     np.testing.assert_allclose(error, 0.0, atol=tolerance + 2e-6)
-    assert (found.variances <= (tolerance + 1e-6) * sd**2).all()
-    assert found.matrix.shape == (n, found.rank)
+    assert (posterior.variances <= (tolerance + 1e-6) * sd**2).all()
+    assert posterior.matrix.shape == (n, posterior.rank)
 
 
 def test_a_tolerance_makes_it_smaller():
     covariance = random_covariance(1, 30)
-    ranks = [posterior_of(covariance, one).rank for one in (0.1, 1e-3, 1e-5)]
+    ranks = [posterior_of(covariance, share).rank for share in (0.1, 1e-3, 1e-5)]
     assert ranks == sorted(ranks)
     assert ranks[0] < ranks[-1] <= 30
 
@@ -56,9 +55,9 @@ def test_what_is_exactly_known_has_no_variance():
     covariance = np.zeros((4, 4))
     assert posterior_of(covariance) == Posterior.of(np.empty((4, 0)), np.zeros(4))
     covariance[2, 2] = 9.0
-    found = posterior_of(covariance)
-    assert found.rank == 1
-    np.testing.assert_array_equal(found.covariance(), covariance)
+    posterior = posterior_of(covariance)
+    assert posterior.rank == 1
+    np.testing.assert_array_equal(posterior.covariance(), covariance)
 
 
 @pytest.mark.parametrize(
@@ -88,9 +87,9 @@ def test_negative_rest_is_refused():
 
 
 def test_views_are_read_only():
-    found = posterior_of(np.eye(2))
+    posterior = posterior_of(np.eye(2))
     with pytest.raises(ValueError, match='read-only'):
-        found.matrix[0, 0] = 1.0
+        posterior.matrix[0, 0] = 1.0
 
 
 def test_layout_by_hand():
@@ -113,12 +112,12 @@ def test_layout_by_hand():
 
 def whole_bank(sensors):
     curve = axis_set((0.0, 0.1, 0.01, 1e-3), (1.0, 1e-5, 1e-6, 1e-7))
-    one = regime_set(curve, curve, curve)
+    axes = regime_set(curve, curve, curve)
     terms = tuple(
         term(**{**vars(column), 'range': (-9.0, 9.0)}, bias=(1 / 3,) * 3, scale=(1e-7 / 3,) * 3)
         for column in bank(sensors)
     )
-    value = calibration(static=one, dynamic=one, sensors=sensors, response=terms)
+    value = calibration(static=axes, dynamic=axes, sensors=sensors, response=terms)
     n = parameter_layout(value).n_parameters
     factor = np.random.default_rng(5).normal(size=(n, n)) / 3.0
     return replace(value, posterior=Posterior.of(factor, np.full(n, 1 / 3)))
@@ -147,7 +146,7 @@ def fitted(rng, ups):
 
 
 def said(result):
-    return next((one.message for one in result.findings if one.name == 'unseen'), '')
+    return next((finding.message for finding in result.findings if finding.name == 'unseen'), '')
 
 
 def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):

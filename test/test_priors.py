@@ -33,7 +33,7 @@ OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 def source(record):
     # A reading every eight seconds: a ramp of 1 K/min is still detected, eight times faster.
     arrays = arrays_of(record, 8)
-    later = [one + 10**18 if one.dtype == np.int64 else one for one in arrays]
+    later = [array + 10**18 if array.dtype == np.int64 else array for array in arrays]
     return source_of(*later)
 
 
@@ -67,32 +67,32 @@ def sd_of_levels(calibration):
 
 
 def test_population_is_the_mean_unit_and_its_scatter():
-    found = population(siblings())
-    K = np.array([[one.axes.x.scale_factor, one.axes.z.scale_factor] for one in siblings()])
-    assert found.axes.x.scale_factor == pytest.approx(np.exp(np.log(K[:, 0]).mean()))
+    prior = population(siblings())
+    K = np.array([[unit.axes.x.scale_factor, unit.axes.z.scale_factor] for unit in siblings()])
+    assert prior.axes.x.scale_factor == pytest.approx(np.exp(np.log(K[:, 0]).mean()))
     slopes = [
-        one.static.x.bias_function.free_coefficients[0] / one.axes.x.scale_factor
-        for one in siblings()
+        unit.static.x.bias_function.free_coefficients[0] / unit.axes.x.scale_factor
+        for unit in siblings()
     ]
-    mean = found.static.x.bias_function.free_coefficients[0] / found.axes.x.scale_factor
+    mean = prior.static.x.bias_function.free_coefficients[0] / prior.axes.x.scale_factor
     assert mean == pytest.approx(np.mean(slopes))
-    variance = np.diag(found.posterior.covariance())
-    at = parameter_layout(found).bias[0].static + 1
-    sd = np.sqrt(variance[at]) / found.axes.x.scale_factor
+    variance = np.diag(prior.posterior.covariance())
+    at = parameter_layout(prior).bias[0].static + 1
+    sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
     # Scatter of three units and of their mean, and parameters that are not determined in any.
-    own = []
-    for one in siblings():
-        variance = np.diag(one.posterior.covariance())
-        own.append(variance[parameter_layout(one).bias[0].static + 1])
-    own = np.array(own) / K[:, 0] ** 2
-    expected = np.sqrt(np.var(slopes, ddof=1) * 4.0 / 3.0 + own.mean())
+    scatter = []
+    for unit in siblings():
+        variance = np.diag(unit.posterior.covariance())
+        scatter.append(variance[parameter_layout(unit).bias[0].static + 1])
+    scatter = np.array(scatter) / K[:, 0] ** 2
+    expected = np.sqrt(np.var(slopes, ddof=1) * 4.0 / 3.0 + scatter.mean())
     assert sd == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch):
     # WHY: a fit started with the narrow prior of three units attributed 190 ug of their
     # differences to the mounting offset and stayed there: 271 ug held out instead of 0.9. WHAT: no
-    # prior is wider anywhere than the one of the start.
+    # prior is wider anywhere than the prior of the start.
     seen = []
 
     def fitted_with(*given):
@@ -108,8 +108,8 @@ def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch):
     assert len(tried) > 2
     widest = begun.precision
     root = np.sqrt(np.diag(widest))
-    for one in tried:
-        narrower = (one.precision - widest) / np.outer(root, root)
+    for trial in tried:
+        narrower = (trial.precision - widest) / np.outer(root, root)
         assert np.linalg.eigvalsh(narrower).min() > -1e-6
 
 
@@ -122,10 +122,10 @@ def test_siblings_make_one_position_worth_more():
     helped = fit(few, replace(options, prior=population(siblings()))).calibration
     truth = sibling(KIND, 9, 0.15)
     errors = []
-    for one in (alone, helped):
-        relative = [axis.scale_factor for axis in one.axes]
+    for result in (alone, helped):
+        relative = [axis.scale_factor for axis in result.axes]
         errors.append(np.abs(np.array(relative) / truth.scale_factor - 1.0).max())
-        curve = one.static.z.scale_function
+        curve = result.static.z.scale_function
         errors[-1] += abs(curve.value(10.0) - fitted_curve(9).value(10.0))
     assert errors[1] < errors[0]
 
@@ -181,7 +181,6 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
 
 
 def left_by(calibration, record):
-    """Return RMS of |f| - g in means of a minute."""
     origin = record.accel_stamp_ns[0]
     board, case = (
         ((stamp[::8] - origin) * 1e-9, value[::8])
@@ -218,10 +217,10 @@ def test_the_command_names_the_nonlinear_terms_that_a_prior_leaves_out(cli, tmp_
     )
     first = replace(first, nonlinearity=Nonlinearity((9.8, 50.0), 1e-4, (cube,)), posterior=bent)
     paths = [tmp_path / f'{k}.yaml' for k in range(3)]
-    for one, path in zip((first, *others), paths, strict=True):
-        save_calibration(one, path)
-    said = cli('prior', *paths, '-o', tmp_path / 'type.yaml').stdout
-    assert f'leaves out the nonlinear terms (K2, K3) of {first.unit.serial}\n' in said
+    for unit, path in zip((first, *others), paths, strict=True):
+        save_calibration(unit, path)
+    printed = cli('prior', *paths, '-o', tmp_path / 'type.yaml').stdout
+    assert f'leaves out the nonlinear terms (K2, K3) of {first.unit.serial}\n' in printed
     assert load_calibration(tmp_path / 'type.yaml').nonlinearity is None
 
 
@@ -239,27 +238,27 @@ def test_another_units_calibration_is_no_prior():
     with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit-9'):
         fit(all_twelve, options)
     allowed = fit(all_twelve, replace(options, allow=('prior',)))
-    said = [one.message for one in allowed.findings if one.name == 'prior']
-    assert any('allowed: ' in one for one in said)
-    assert any('bags contradict the prior' in one for one in said)
+    messages = [finding.message for finding in allowed.findings if finding.name == 'prior']
+    assert any('allowed: ' in text for text in messages)
+    assert any('bags contradict the prior' in text for text in messages)
     # A model without regimes does not determine the two curves of a prior.
     assert not allowed.residuals[-1].one_set.n
 
 
 def test_prior_of_the_other_input_is_refused():
-    # WHY: its scale factors in counts were once taken for those in m/s^2.
+    # WHY: scale factors of a prior in counts were once taken for those in m/s^2.
     with pytest.raises(ValueError, match=r'`prior` is in counts, the samples are in m/s\^2'):
         replace(OPTIONS, prior=fitted(1).calibration, input='m/s^2')
 
 
 def test_commands_make_a_prior_and_name_what_is_missing(tmp_path, capsys):
     files = []
-    for one in siblings():
-        files.append(tmp_path / f'{one.unit.serial}.yaml')
-        save_calibration(one, files[-1])
+    for unit in siblings():
+        files.append(tmp_path / f'{unit.unit.serial}.yaml')
+        save_calibration(unit, files[-1])
     target = tmp_path / 'type.yaml'
     assert run(['prior', *map(str, files), '-o', str(target)]) == 0
-    assert 'what 3 units have in common' in capsys.readouterr().out
+    assert 'prior from 3 units, 13 columns' in capsys.readouterr().out
     assert load_calibration(target) == population(siblings())
     assert run(['prior', *map(str, files[:2]), '-o', str(target), '--force']) == 1
     assert 'need 3 for a population' in capsys.readouterr().err

@@ -60,11 +60,11 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place, value):
     content = yaml.dump(tree, Dumper=yaml.CSafeDumper, allow_unicode=True).encode()
     refusal = None
     try:
-        found = parse_calibration(content, 'unit.yaml')
+        parsed = parse_calibration(content, 'unit.yaml')
     except CalibrationError as error:
         refusal = error
     else:
-        assert parse_calibration(dump_calibration(found).encode()) == found
+        assert parse_calibration(dump_calibration(parsed).encode()) == parsed
     if refusal is not None:
         text = str(refusal)
         assert '\n' not in text
@@ -88,8 +88,8 @@ magnitudes = st.builds(
 edges = st.sampled_from(
     [
         near
-        for one in QUANTITIES.values()
-        for bound in (one.above, one.at_least, one.nil_or, one.below, one.at_most)
+        for bounds in QUANTITIES.values()
+        for bound in (bounds.above, bounds.at_least, bounds.nil_or, bounds.below, bounds.at_most)
         if bound is not None
         for near in (bound, -bound, bound * (1 - 1e-12), bound * (1 + 1e-12))
     ]
@@ -98,7 +98,7 @@ factors = st.integers(-60, 60).map(lambda power: 2.0**power)
 
 
 class Edited(dict[str, Any]):
-    """A calibration file with some changed values; only these are shown."""
+    """A calibration file with some changed values; a failing example shows only these values."""
 
     edits: tuple[Any, ...] = ()
 
@@ -133,7 +133,7 @@ def edited(draw):
             branch[last] = draw(
                 st.permutations(value)
                 | st.lists(magnitudes | edges, max_size=20)
-                | factors.map(lambda f, v=value: [f * one for one in v])
+                | factors.map(lambda f, v=value: [f * x for x in v])
             )
         else:
             branch[last] = draw(anything | edges)
@@ -143,7 +143,7 @@ def edited(draw):
 
 def whole_range(of):
     """List messages that pass through and beyond all temperatures of a calibration."""
-    edges_c = [edge for one in of.regime_sets() for edge in one.temperature_range_c]
+    edges_c = [edge for regime_set in of.regime_sets() for edge in regime_set.temperature_range_c]
     middle = of.reference_temperature_c
     temperatures = [middle, middle + 0.5, *edges_c, middle, -273.0, 999.0, middle, middle]
     steps_s = [1.0, 5.0, 20.0, 60.0, 1.0, 400.0, 60.0, 5.0, 90_000.0, 2.0, 0.5]
@@ -193,7 +193,7 @@ def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tre
             assert min(rate[3:]) > 0.0
     counters = compensator.counters
     assert counters.n_unsound == 0
-    # The only remaining reasons: samples faster than the converter, and stale temperatures.
+    # Samples are dropped only if faster than the converter, or with stale temperatures.
     assert n_sound or counters.n_too_fast or counters.n_stale or counters.n_no_temperature
     status = compensator.status()
     assert all(map(math.isfinite, status.state))

@@ -33,7 +33,6 @@ def work(tmp_path_factory):
 
 @pytest.fixture(scope='module', params=[0, 1, 2])
 def unit(request, real_data, work):
-    """Fit a unit that was turned by hand, without a thermometer."""
     sources, _ = fit_sources([handheld_bag(real_data, work, request.param)])
     return fit(sources, OPTIONS)
 
@@ -88,7 +87,7 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
 
 
 def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
-    # Read from a plot of |a|: +20 mg at 366 s and +17 mg at 468 s; a third one across gravity.
+    # Jumps in a plot of |a|: +20 mg at 366 s and +17 mg at 468 s; a third jump across gravity.
     sources, _ = fit_sources([freezer_bag(real_data, work)])
     with pytest.raises(FitError, match='not a function of temperature') as refused:
         fit(sources, OPTIONS)

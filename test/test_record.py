@@ -62,25 +62,23 @@ def session(tmp_path_factory):
 
 
 def contents(paths):
-    """Return the serialized messages of bags by topic, one bag after the other."""
-    found = {}
+    collected = {}
     for path in paths:
         with open_recording(path, require=()) as reader:
             for topic, messages in reader.raw(reader.info.topics):
-                found.setdefault(topic.name, []).extend(messages)
-    return found
+                collected.setdefault(topic.name, []).extend(messages)
+    return collected
 
 
 def check_positions(result):
-    """Compare the result with the truth."""
     assert result['is_complete']
-    for found, up in zip(result['positions'], UPS, strict=True):
+    for position, up in zip(result['positions'], UPS, strict=True):
         # The unit's bias changes the measured direction by less than a degree.
-        assert np.array(found['up']) @ up > np.cos(np.radians(1.0))
-        assert found['reason'] == ''
-        assert set(found['thermometers']) == {'board', 'case', 'lid'}
+        assert np.array(position['up']) @ up > np.cos(np.radians(1.0))
+        assert position['reason'] == ''
+        assert set(position['thermometers']) == {'board', 'case', 'lid'}
         # Cells next to a motion, of three seconds at this sample rate, do not count as still.
-        assert found['still_s'] == pytest.approx(SOAK_S, abs=20.0)
+        assert position['still_s'] == pytest.approx(SOAK_S, abs=20.0)
 
 
 def check_fit(result, cli, folder):
@@ -89,14 +87,14 @@ def check_fit(result, cli, folder):
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))
     assert words.pop(0) == 'thermo_comp'
-    bags = [str(one) for one in sorted(folder.glob('*.mcap'))]
+    bags = [str(path) for path in sorted(folder.glob('*.mcap'))]
     cli(*(part for word in words for part in (bags if '*' in word else [word])), cwd=folder)
     calibration = load_calibration(folder / 'unit.yaml')
     assert calibration.unit.serial == 'lab-7'
     axes = calibration.axes
-    scale = np.array([one.scale_factor for one in axes])
-    bias = np.array([one.bias for one in axes]) / scale
-    sd = np.array([one['sd_g'] for one in result['positions']]).max() * 9.80665
+    scale = np.array([axis.scale_factor for axis in axes])
+    bias = np.array([axis.bias for axis in axes]) / scale
+    sd = np.array([place['sd_g'] for place in result['positions']]).max() * 9.80665
     # The claim before the fit includes the noise of the positions only; constants are at 20 degC.
     assert scale / UNIT.scale_factor == pytest.approx(1.0, abs=5.0 * max(result['scale_sd']))
     true_bias = np.array(UNIT.bias_at_reference) / UNIT.scale_factor
@@ -131,7 +129,7 @@ class TestGrowing:
             growing.write_bytes(whole[: next(sizes)])
             return False
 
-        found = {}
+        collected = {}
         n_looks = 0
         for news in growing_blocks(growing, Topics(), wait):
             n_looks += news is None
@@ -139,11 +137,11 @@ class TestGrowing:
                 block, info = news
                 assert info.metadata['serial'] == 'lab-7'
                 for role, messages in block.raw.items():
-                    found.setdefault(role, []).extend(messages)
+                    collected.setdefault(role, []).extend(messages)
         assert n_looks == 10
         sent = contents([session])
-        assert found.pop('accel') == sent.pop('/accel/counts')
-        assert {f'/temperature/{name}': own for name, own in found.items()} == sent
+        assert collected.pop('accel') == sent.pop('/accel/counts')
+        assert {f'/temperature/{name}': own for name, own in collected.items()} == sent
 
     def test_what_is_no_bag_is_said(self, tmp_path):
         with pytest.raises(RecordingError, match='no such file'):
@@ -158,8 +156,8 @@ class TestGrowing:
         result = json.loads(finished.stdout)
         check_positions(result)
         bags = numbered_bags(tmp_path / 'bags')
-        assert [str(one) for one in bags] == result['bags']
-        assert [one.name for one in bags] == [f'{k:02d}.mcap' for k in range(1, N_POSITIONS + 1)]
+        assert [str(bag) for bag in bags] == result['bags']
+        assert [bag.name for bag in bags] == [f'{k:02d}.mcap' for k in range(1, N_POSITIONS + 1)]
         # No message is lost, repeated or moved.
         assert contents(bags) == contents([session])
         assert f'position {N_POSITIONS}: good' in finished.stderr
@@ -181,8 +179,8 @@ class TestGrowing:
 
     def test_usage(self, session, cli, tmp_path):
         out = ('-o', tmp_path / 'bags')
-        said = cli('record', session, '--soak', '45', *out, code=2).stderr
-        assert "--soak: expected a duration like 45min, 1.5h or 30s, got '45'" in said
+        printed = cli('record', session, '--soak', '45', *out, code=2).stderr
+        assert "--soak: expected a duration like 45min, 1.5h or 30s, got '45'" in printed
         (tmp_path / 'file').write_text('')
         assert (
             'cannot be written' in cli('record', session, '-o', tmp_path / 'file', code=1).stderr
@@ -190,7 +188,7 @@ class TestGrowing:
 
 
 def test_what_a_crash_has_left_is_told_and_finished(session, cli, tmp_path):
-    # WHY: the hours of a killed run were in a hidden file that nobody knew of.
+    # WHY: the hours of a killed run were in a hidden file without any message.
     bags = tmp_path / 'bags'
     killed = subprocess.run(
         [sys.executable, '-c', CRASH, session, bags, str(START_NS + 200 * 10**9)], check=False
@@ -199,11 +197,11 @@ def test_what_a_crash_has_left_is_told_and_finished(session, cli, tmp_path):
     (left,) = leftovers(bags)
     assert leftovers(bags) == {left: 1}
     arguments = ('record', session, '--positions', '1', '--soak', '80s', '-o', bags)
-    told = cli(*arguments, code=None).stderr
-    assert f'{left} is bag 1 of a run that crashed; --finish' in told
+    errors = cli(*arguments, code=None).stderr
+    assert f'{left} is bag 1 of a run that crashed; --finish' in errors
     assert left.exists()
-    for one in numbered_bags(bags):
-        one.unlink()
+    for bag in numbered_bags(bags):
+        bag.unlink()
     before = contents([left])
     cli(*arguments, '--finish', code=None)
     assert leftovers(bags) == {}
@@ -215,14 +213,12 @@ def test_what_a_crash_has_left_is_told_and_finished(session, cli, tmp_path):
     # An unreadable file stays in place.
     broken = bags / '.07.999999999-abcdef.partial.mcap'
     broken.write_bytes(b'no bag')
-    said = cli(*arguments, '--finish', code=None).stderr
-    assert 'it cannot be completed' in said
+    printed = cli(*arguments, '--finish', code=None).stderr
+    assert 'the bag cannot be completed' in printed
     assert broken.exists()
 
 
 class Recording:
-    """The command in a separate process."""
-
     def __init__(self, *arguments):
         self.process = subprocess.Popen(
             [sys.executable, '-m', 'thermo_comp', 'record', *map(str, arguments)], cwd=ROOT,
@@ -230,19 +226,17 @@ class Recording:
         )  # fmt: skip
 
     def wait_for(self, words):
-        """Read its output up to this text."""
         for line in self.process.stderr:
             if words in line:
                 return
         raise AssertionError(f'it ended without: {words}')
 
     def end(self, number=None):
-        """Wait for its end, after a signal; return its exit code, result and last output."""
         if number is not None:
             self.process.send_signal(number)
-        out, said = self.process.communicate(timeout=120)
-        assert 'Traceback' not in said
-        return self.process.returncode, json.loads(out), said
+        out, errors = self.process.communicate(timeout=120)
+        assert 'Traceback' not in errors
+        return self.process.returncode, json.loads(out), errors
 
 
 @pytest.fixture
@@ -264,8 +258,7 @@ class TestLive:
         assert code == 0
         check_positions(result)
         assert len(numbered_bags(bags)) == N_POSITIONS
-        # It ends when the last position is good: all messages until then are recorded, byte for
-        # byte.
+        # The recording ends when the last position is good, with all messages up to then.
         sent, got = contents([session]), contents(numbered_bags(bags))
         assert got.keys() == sent.keys()
         for topic, messages in got.items():
@@ -287,8 +280,8 @@ class TestLive:
         recording.wait_for('no publisher on /left/imu/driver')
         play(bag, rate=0.0, wait_s=30.0, ros_args=remap)
         recording.wait_for('position 1: good')
-        code, result, said = recording.end(signal.SIGTERM)
-        assert (code, result['n_good'], result['is_complete']) == (0, 1, False), said
+        code, result, printed = recording.end(signal.SIGTERM)
+        assert (code, result['n_good'], result['is_complete']) == (0, 1, False), printed
         assert result['findings'][0] == '17 of 18 positions are missing'
         assert contents(numbered_bags(bags)) == contents([bag])
         assert sorted(bags.iterdir()) == numbered_bags(bags)

@@ -33,12 +33,9 @@ def blocks_of(path, stamp_ns, reading_ns):
 
 
 def joined(blocks, name):
-    return np.concatenate(
-        [
-            block.accel_stamp_ns if name == 'accel' else block.temperatures[name].stamp_ns
-            for block in blocks
-        ]
-    )
+    if name == 'accel':
+        return np.concatenate([block.accel_stamp_ns for block in blocks])
+    return np.concatenate([block.temperatures[name].stamp_ns for block in blocks])
 
 
 @pytest.mark.parametrize('jump_ns', [YEAR_NS, -YEAR_NS, -START_NS + 5, 2 * LONGEST_PAUSE_NS])
@@ -50,8 +47,8 @@ def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path, jump_ns):
     )
     # A reading is before the sample of its log time: the jump is before reading 5.
     hour = LONGEST_PAUSE_NS * after
-    found = joined(blocks, 'accel') - true_ns
-    assert found[:500].tolist() == [0] * 500
+    offsets = joined(blocks, 'accel') - true_ns
+    assert offsets[:500].tolist() == [0] * 500
     steps = np.diff(joined(blocks, 'accel'))
     assert np.delete(steps, 499).tolist() == [STEP_NS] * 998
     assert abs(int(steps[499]) - LONGEST_PAUSE_NS) <= STEP_NS
@@ -84,9 +81,9 @@ def test_thermometers_of_another_time_zone_are_named(tmp_path, zone_s, n):
     # WHY: the only message was the number of days, or none, and `replay` wrote samples corrected
     # with the temperatures of another hour.
     true_ns = START_NS + STEP_NS * np.arange(n)
-    said = f'board is stamped {zone_s:+} s from the samples around it: two clocks?'
+    text = f'board is stamped {zone_s:+} s from the samples around it: two clocks?'
     with suppress(RecordingError):
         blocks_of(tmp_path / 'bag.mcap', true_ns, true_ns[:: n // 100] + zone_s * 10**9)
-    found = survey_recording(tmp_path / 'bag.mcap')
-    assert said in (found.info.chosen or '')
-    assert 'a fit needs one clock for all' in found.findings
+    survey = survey_recording(tmp_path / 'bag.mcap')
+    assert text in (survey.info.chosen or '')
+    assert 'a fit needs one clock for all' in survey.findings

@@ -122,12 +122,12 @@ def test_cut_anywhere(data, compression):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         path.write_bytes(content[:cut])
-        found = outcome(path)
-        if isinstance(found, RecordingError):
-            assert cut < 60, found  # only a file without a complete header contains nothing
+        result = outcome(path)
+        if isinstance(result, RecordingError):
+            assert cut < 60, result  # only a file without a complete header contains nothing
         else:
-            assert found.info.truncated is not None
-            assert_columns(found.columns, regular_messages(24)[: found.info.n_messages])
+            assert result.info.truncated is not None
+            assert_columns(result.columns, regular_messages(24)[: result.info.n_messages])
 
 
 def test_zeros_at_the_end_are_no_messages(tmp_path):
@@ -142,11 +142,11 @@ def test_zeros_at_the_end_are_no_messages(tmp_path):
         content, position, _ = small_bag('none', is_chunked)
         for at in range(position + 60 if is_chunked else 700, len(content), 37):
             path.write_bytes(content[:at] + bytes(4096))
-            found = outcome(path)
-            if isinstance(found, Recording):
-                assert found.info.truncated is not None
-                n = found.columns.n_messages
-                assert_columns(found.columns, messages[:n])
+            result = outcome(path)
+            if isinstance(result, Recording):
+                assert result.info.truncated is not None
+                n = result.columns.n_messages
+                assert_columns(result.columns, messages[:n])
 
 
 def test_a_torn_directory_says_which_file(tmp_path):
@@ -179,12 +179,12 @@ def test_changed_bytes_are_an_error_or_harmless(data, compression, n_changes):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         path.write_bytes(content)
-        found = outcome(path)
-        if isinstance(found, RecordingError):
-            assert '\n' not in str(found)
-            assert 'bag.mcap' in str(found)
+        result = outcome(path)
+        if isinstance(result, RecordingError):
+            assert '\n' not in str(result)
+            assert 'bag.mcap' in str(result)
         else:
-            assert len(found.columns) <= 24
+            assert len(result.columns) <= 24
 
 
 @settings(max_examples=100, deadline=None)
@@ -195,11 +195,11 @@ def test_any_bytes_are_an_error_or_an_empty_bag(content, has_magic):
         for name in ('bag.mcap', 'bag.db3', 'bag.bag'):
             path = Path(folder, name)
             path.write_bytes(magic + content if has_magic else content)
-            found = outcome(path)
-            if isinstance(found, RecordingError):
-                assert '\n' not in str(found)
+            result = outcome(path)
+            if isinstance(result, RecordingError):
+                assert '\n' not in str(result)
             else:
-                assert len(found.columns) == 0
+                assert len(result.columns) == 0
 
 
 def chunk_record(content, compression, size, checksum=0):

@@ -37,20 +37,20 @@ def test_rows_deleted_from_a_database_are_missed(tmp_path, cli):
         (topic,) = database.execute('select id from topics where name = ?', (ACCEL,)).fetchone()
         query = 'delete from messages where id > 100 and topic_id = ?'
         n_left = 400 - database.execute(query, (topic,)).rowcount
-    told = f'{ACCEL}: {n_left} of the 400 messages listed are there'
-    assert inspect_recording(bag).truncated == told
-    assert told in cli('info', bag, code=1).stdout
+    text = f'{ACCEL}: {n_left} of the 400 messages listed are there'
+    assert inspect_recording(bag).truncated == text
+    assert text in cli('info', bag, code=1).stdout
     calibration = Path(__file__).parent.parent / 'config' / 'calibration.example.yaml'
     done = cli('replay', bag, '-c', calibration, '-o', tmp_path / 'o.mcap', '--serial', '', code=1)
-    assert told in done.stderr
+    assert text in done.stderr
     assert (tmp_path / 'o.mcap').is_file()
 
 
 def test_a_conversion_tells_what_the_bag_lacks(tmp_path, cli):
     messages = regular_messages(400, accel=IMU_IN)
-    for one in messages:
-        if one.topic == IMU_IN:  # as gravity, since another magnitude at rest is refused
-            one.numbers = (*one.numbers[:25], 0.0, 0.0, 9.81, *one.numbers[28:])
+    for message in messages:
+        if message.topic == IMU_IN:  # as gravity, since another magnitude at rest is refused
+            message.numbers = (*message.numbers[:25], 0.0, 0.0, 9.81, *message.numbers[28:])
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     with sqlite3.connect(tmp_path / 'bag' / 'bag.db3') as database:
         database.execute('delete from messages where id > 400')
@@ -65,10 +65,10 @@ def test_a_topic_that_metadata_promise_and_nobody_has(tmp_path, storage):
     path = bag / 'metadata.yaml'
     content = yaml.safe_load(path.read_text())
     topics = content['rosbag2_bagfile_information']['topics_with_message_count']
-    one = yaml.safe_load(yaml.safe_dump(topics[0]))
-    one['topic_metadata']['name'] = '/gone'
-    one['message_count'] = 7
-    topics.append(one)
+    topic = yaml.safe_load(yaml.safe_dump(topics[0]))
+    topic['topic_metadata']['name'] = '/gone'
+    topic['message_count'] = 7
+    topics.append(topic)
     path.write_text(yaml.safe_dump(content))
     assert inspect_recording(bag).truncated == '/gone: 0 of the 7 messages listed are there'
 
@@ -78,7 +78,7 @@ def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path):
     with open_recording(tmp_path / 'bag.mcap') as reader:
         kind = reader.info.topics[ACCEL][0]
         reader.info = replace(reader.info, topics={**reader.info.topics, ACCEL: (kind, 64)})
-        for _ in range(2):  # reported once, however often it is read
+        for _ in range(2):  # the loss is reported once, however often the bag is read
             assert sum(map(len, reader.blocks())) == 40
         assert reader.info.truncated == f'{ACCEL}: 40 of the 64 messages listed are there'
 
@@ -92,12 +92,12 @@ def test_a_compressed_file_is_read_up_to_its_damage(tmp_path):
     for damaged in (data[:half], data[:half] + bytes(4096) + data[half + 4096 :]):
         packed.write_bytes(damaged)
         recording = read_recording(bag)
-        told = recording.info.truncated or ''
+        message = recording.info.truncated or ''
         assert 0 < len(recording.columns) < 8000
         for topic, n_all in ((ACCEL, 8000), (BOARD, 1000), (CASE, 1000)):
             n_read = recording.info.topics[topic][1]
-            assert f'{topic}: {n_read} of the {n_all} messages' in told
-    assert f'{packed.name} is unreadable after' in told
+            assert f'{topic}: {n_read} of the {n_all} messages' in message
+    assert f'{packed.name} is unreadable after' in message
     packed.write_bytes(data[:8])
     with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: it has no content'):
         read_recording(bag)

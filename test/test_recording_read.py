@@ -96,8 +96,8 @@ def test_any_file_gives_its_messages_in_order_of_log_time(messages, **options):
             and options['index_types'] == IndexType.ALL
             and options['repeat']
         ):
-            # Second route to the order: that of rosbags for the same file. Its versions differ for
-            # equal log times in different chunks, so that these may be in either order.
+            # Second route to the order: that of rosbags for the same file. The versions of rosbags
+            # differ for equal log times in different chunks, so that these may be in either order.
             order = [(log_ns, topic) for topic, log_ns, _ in read_with_rosbags(path)]
             wanted = [(m.log_ns, m.topic) for m in in_reading_order(messages)]
             assert [log_ns for log_ns, _ in order] == [log_ns for log_ns, _ in wanted]
@@ -165,11 +165,11 @@ def test_raw_messages_are_the_very_bytes(tmp_path, accel):
     write_rosbag1(tmp_path / 'bag.bag', messages)
     for name in ('bag.mcap', 'bag', 'bag.bag'):
         with open_recording(tmp_path / name) as reader:
-            found = {
+            content = {
                 reader.topics[k]: raw for b in reader.blocks(raw=True) for k, raw in b.raw.items()
             }
-        assert set(found) == {accel, BOARD, CASE}
-        for topic, raw in found.items():
+        assert set(content) == {accel, BOARD, CASE}
+        for topic, raw in content.items():
             wanted = [m for m in messages if m.topic == topic]
             assert list(raw) == [serialize(m) for m in wanted]
             assert raw.log_ns.tolist() == [m.log_ns for m in wanted]
@@ -229,9 +229,9 @@ def test_raw_messages_of_overlapping_chunks_are_in_order_too(tmp_path):
     write_mcap(tmp_path / 'bag.mcap', shuffled, chunk_size=250)
     with open_recording(tmp_path / 'bag.mcap') as reader:
         blocks = list(reader.blocks(raw=True))
-    found = [one for block in blocks for one in block.raw.get('accel', ())]
+    serialized = [content for block in blocks for content in block.raw.get('accel', ())]
     wanted = [m for m in sorted(shuffled, key=lambda m: m.log_ns) if m.topic == ACCEL]
-    assert found == [serialize(m) for m in wanted]
+    assert serialized == [serialize(m) for m in wanted]
     frames = [block.frame_id for block in blocks for _ in range(len(block))]
     assert frames == [m.frame_id for m in wanted]
 
@@ -295,7 +295,6 @@ def test_a_topic_is_found_under_its_namespace(tmp_path):
 
 
 def written(path, *topics, counts='accel/counts'):
-    """Write three samples, and a reading of 20, 21, ... degC on each topic."""
     with BagWriter(path) as bag:
         bag.write_counts(counts, START_NS + np.arange(3), np.zeros((3, 3)))
         for row, topic in enumerate(topics):
@@ -307,13 +306,13 @@ def test_further_thermometers_are_found_beside_the_board(tmp_path):
     names = ('board', 'case', 'lid', 'Tip', 'accel', 'a/b')
     topics = [f'imu0/temperature/{name}' for name in names]
     path = written(tmp_path / 'bag', *topics, 'temperature/lid', counts='imu0/accel/counts')
-    found = read_recording(path).columns.temperatures
-    assert {name: one.celsius.tolist() for name, one in found.items()} == {
+    temperatures = read_recording(path).columns.temperatures
+    assert {name: part.celsius.tolist() for name, part in temperatures.items()} == {
         'board': [20.0],
         'case': [21.0],
         'lid': [22.0],
     }
-    assert found['lid'].after.tolist() == [2]
+    assert temperatures['lid'].after.tolist() == [2]
 
 
 def test_topics_by_the_names_of_their_inputs(tmp_path):
@@ -345,7 +344,7 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
             '/imu/ticks, its only Vector3Stamped, is taken for counts; '
             '/imu/die, its only Temperature, is taken for board'
         )
-    # Not if the user named another topic, nor if there are two, nor a case as the board.
+    # No topic is chosen if the user named another, if there are two, or for a case as the board.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):
@@ -359,7 +358,7 @@ def test_reading_twice_gives_the_same(tmp_path, monkeypatch):
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:
-        first = next(iter(reader.blocks()))  # abandoned before its end
+        first = next(iter(reader.blocks()))  # the reading is abandoned before its end
         again = next(iter(reader.blocks()))
     assert first.accel.tobytes() == again.accel.tobytes()
 

@@ -55,7 +55,6 @@ DECEITFUL = [
 
 @st.composite
 def records(draw):
-    """Long regular parts with irregular ones between."""
     pieces = []
     for _ in range(draw(st.integers(1, 6))):
         content = draw(st.sampled_from(DECEITFUL) | st.binary(max_size=60))

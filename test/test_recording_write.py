@@ -61,11 +61,7 @@ def test_rosbags_and_mcap_read_back_what_was_written(
                 bag.flush()
                 for name in 'ctibr':  # in the order of the calls
                     written += [(group, time, name) for time in log_ns.tolist()]
-                expected = {
-                    'c': (stamp_ns, linear),
-                    't': (stamp_ns, linear),
-                    'i': (stamp_ns, linear),
-                }
+                expected = dict.fromkeys('cti', (stamp_ns, linear))
         file = path if is_file else path / 'bag_0.mcap'
         names = {
             '/accel/counts': 'c', '/temperature/board': 't', '/imu/data_raw': 'i',
@@ -93,10 +89,10 @@ def test_rosbags_and_mcap_read_back_what_was_written(
         with Reader2(path) as rosbag:
             assert rosbag.message_count == len(wanted)
             assert {c.topic for c in rosbag.connections} == set(names)
-            found = [(log_ns, names[c.topic]) for c, log_ns, _ in rosbag.messages()]
+            listed = [(log_ns, names[c.topic]) for c, log_ns, _ in rosbag.messages()]
         # For equal log times across chunks the order depends on the version of rosbags.
-        assert [log_ns for log_ns, _ in found] == sorted(log_ns for log_ns, _ in wanted)
-        assert sorted(found) == sorted(wanted)
+        assert [log_ns for log_ns, _ in listed] == sorted(log_ns for log_ns, _ in wanted)
+        assert sorted(listed) == sorted(wanted)
         if counts[-1] and len(counts) == 1:
             messages = {'c': [], 't': [], 'i': []}
             with AnyReader([path]) as rosbag_any:
@@ -138,7 +134,7 @@ def test_metadata_comes_back(tmp_path, name):
     pairs = {'serial': 'Ünit 7', 'git': 'a: b\n- c'}
     small(tmp_path / name, metadata=pairs)
     assert read_recording(tmp_path / name, require=()).info.metadata == pairs
-    if name == 'bag.mcap':  # also of a truncated file
+    if name == 'bag.mcap':  # a truncated file keeps its metadata, too
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content[: len(content) // 2])
         assert read_recording(tmp_path / name, require=()).info.metadata == pairs
@@ -227,17 +223,15 @@ def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path, name):
 def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path):
     (tmp_path / 'home').mkdir()
     (tmp_path / 'home' / 'thesis.tex').write_text('ten years of work')
-    with pytest.raises(OutputError, match=r'is not replaced: it holds thesis\.tex'):
-        BagWriter(tmp_path / 'home', overwrite=True)
     (tmp_path / 'file').write_text('')
-    with pytest.raises(OutputError, match='is not replaced: it is a file'):
-        BagWriter(tmp_path / 'file', overwrite=True)
     small(tmp_path / 'fit' / '01.mcap', 1.0)
-    with pytest.raises(OutputError, match=r'is not replaced: it has no metadata\.yaml'):
-        BagWriter(tmp_path / 'fit', overwrite=True)
     (tmp_path / 'folder.mcap').mkdir()
-    with pytest.raises(OutputError, match='is not replaced: it is a folder'):
-        BagWriter(tmp_path / 'folder.mcap', overwrite=True)
+    for name, reason in (
+        *(('home', r'it holds thesis\.tex'), ('file', 'it is a file')),
+        *(('fit', r'it has no metadata\.yaml'), ('folder.mcap', 'it is a folder')),
+    ):
+        with pytest.raises(OutputError, match=f'is not replaced: {reason}'):
+            BagWriter(tmp_path / name, overwrite=True)
 
 
 def test_an_output_may_be_a_link(tmp_path):
@@ -264,29 +258,22 @@ def test_a_target_that_cannot_be_made(tmp_path):
 
 
 def test_arguments_that_do_not_fit(tmp_path):
+    xyz = [[1, 2, 3]]
     with BagWriter(tmp_path / 'bag') as bag:
-        with pytest.raises(ValueError, match=r'`xyz` must have shape \(2, 3\), got \(2, 2\)'):
-            bag.write_counts('a', [1, 2], [[1, 2], [3, 4]])
-        with pytest.raises(ValueError, match='`stamp_ns` must be one row of integers, got float'):
-            bag.write_counts('a', [1.5], [[1, 2, 3]])
-        with pytest.raises(ValueError, match='`stamp_ns` must not be negative, got -1'):
-            bag.write_counts('a', [-1], [[1, 2, 3]])
-        with pytest.raises(
-            ValueError, match=r'`stamp_ns` must be below 2\*\*31 s, got 2147483648'
+        for write, given, reason in (
+            (bag.write_counts, ([1, 2], [[1, 2], [3, 4]]), r'`xyz` .* \(2, 3\), got \(2, 2\)'),
+            (bag.write_counts, ([1.5], xyz), '`stamp_ns` must be one row of integers, got float'),
+            (bag.write_counts, ([-1], xyz), '`stamp_ns` must not be negative, got -1'),
+            (bag.write_counts, ([2**31 * 10**9], xyz), r'`stamp_ns` .* 2\*\*31 s, got 2147483648'),
+            (bag.write_counts, ([1], xyz, '', [1, 2]), '`log_ns` must have 1 values, got 2'),
+            (bag.write_temperature, ([1], [1.0, 2.0]), r'`celsius` .* \(1, 1\), got \(2, 1\)'),
+            (bag.write_imu, ([1], [[1.0, 2.0]], np.zeros(9)), '`linear_acceleration` must have'),
+            (bag.write_imu, ([1], xyz, np.zeros((1, 3))), 'acceleration_covariance` must have'),
+            (bag.write_bool, ([1], [True, False]), '`log_ns` must have 2 values, got 1'),
+            (bag.write_raw, ('std_msgs/msg/Bool', [1, 2], [b'']), '`log_ns` .* 1 values, got 2'),
         ):
-            bag.write_counts('a', [2**31 * 10**9], [[1, 2, 3]])
-        with pytest.raises(ValueError, match='`log_ns` must have 1 values, got 2'):
-            bag.write_counts('a', [1], [[1, 2, 3]], log_ns=[1, 2])
-        with pytest.raises(ValueError, match=r'`celsius` must have shape \(1, 1\), got \(2, 1\)'):
-            bag.write_temperature('a', [1], [1.0, 2.0])
-        with pytest.raises(ValueError, match='`linear_acceleration` must have shape'):
-            bag.write_imu('a', [1], [[1.0, 2.0]], np.zeros(9))
-        with pytest.raises(ValueError, match='`linear_acceleration_covariance` must have shape'):
-            bag.write_imu('a', [1], [[1.0, 2.0, 3.0]], np.zeros((1, 3)))
-        with pytest.raises(ValueError, match='`log_ns` must have 2 values, got 1'):
-            bag.write_bool('a', [1], [True, False])
-        with pytest.raises(ValueError, match='`log_ns` must have 1 values, got 2'):
-            bag.write_raw('a', 'std_msgs/msg/Bool', [1, 2], [b''])
+            with pytest.raises(ValueError, match=reason):
+                write('a', *given)
     with pytest.raises(RecordingError, match='the bag is closed'):
         bag.write_bool('a', [1], [True])
 

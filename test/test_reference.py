@@ -38,14 +38,10 @@ def test_json_schema_says_the_same():
     }
     assert schema['properties']['frame']['default'] == {'kind': 'circle', 'radius': 1.0}
     assert schema['$defs']['Circle']['properties'] == {
-        'radius': {
-            'type': 'number',
-            'exclusiveMinimum': 0.0,
-            'exclusiveMaximum': 10.0,
-            'description': 'In metres.',
-        },
+        'radius': {'type': 'number', 'exclusiveMinimum': 0.0, 'exclusiveMaximum': 10.0,
+                   'description': 'In metres.'},
         'kind': {'const': 'circle', 'default': 'circle'},
-    }
+    }  # fmt: skip
     assert schema['$defs']['Circle']['required'] == ['radius']
 
 

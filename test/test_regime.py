@@ -5,7 +5,8 @@ The detector on short runs: early, few false alarms, no missed ramps; long runs 
 benchmarks/regime.py.
 
 All runs are seeded. A limit on a median of n delays holds with the benchmark's spread: the median
-of 24 scatters by about 0.3 of the delays' sd, 1 s at 1 mK; of 12 with coarse steps by 4 s.
+of 24 delays scatters by about 0.3 of their sd, 1 s at 1 mK; the median of 12 delays with coarse
+steps by 4 s.
 """
 
 import math
@@ -52,7 +53,7 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
     Run n ramps; return the switches after the start of each, and the number of static starts.
     """
     settings = detector_settings(noise, quantum, lag)
-    found, n_static = [], 0
+    collected, n_static = [], 0
     for seed in range(n):
         rng = np.random.default_rng([seed, 2])
         t = np.arange(-soak_s, end_s, dt)
@@ -63,9 +64,9 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
         )
         before = [each for each in changes if each[0] < 0.0]
         n_static += bool(before) and before[-1][1] == STATIC
-        found.append([each for each in changes if each[0] >= 0.0])
-        assert found[-1][-1][2] == sign
-    return found, n_static
+        collected.append([each for each in changes if each[0] >= 0.0])
+        assert collected[-1][-1][2] == sign
+    return collected, n_static
 
 
 @pytest.fixture(scope='module')
@@ -90,10 +91,10 @@ def headline():
     ],
 )
 def test_onset_is_early(headline, sensor, median_s, late_s):
-    found, n_static = headline[sensor]
-    assert n_static == len(found)
-    assert all(len(each) == 1 and each[0][1] == DYNAMIC for each in found)
-    delays = [each[0][0] for each in found]
+    switched, n_static = headline[sensor]
+    assert n_static == len(switched)
+    assert all(len(each) == 1 and each[0][1] == DYNAMIC for each in switched)
+    delays = [each[0][0] for each in switched]
     assert np.median(delays) <= median_s
     assert np.percentile(delays, 95) <= late_s
 
@@ -132,8 +133,8 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
     ],
 )
 def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt, end_s):
-    found, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
-    for each in found:
+    delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
+    for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
         # The slowest detection is that of a ramp of 0.2 K/min by a thermometer with steps of 1 K
         # behind a lag of 15 min: it needs two changes of the reading, 5 min apart.
@@ -314,20 +315,25 @@ def test_a_reversal_is_no_rest(lost, quantum):
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
 
 
-def test_direction_follows_a_reversal():
-    settings = detector_settings(0.001)
+def regimes_and_directions(settings, case_readings, board_readings):
+    """Return regime and direction after each pair of readings, of which one comes per second."""
     case, board = Thermometer(settings.case), Thermometer(settings.board)
     detector = RegimeDetector(settings)
+    states = []
+    for k, (c, b) in enumerate(zip(case_readings, board_readings, strict=True)):
+        board.update(k * SECOND_NS, float(b))
+        case.update(k * SECOND_NS, float(c))
+        detector.update(k * SECOND_NS, case, board)
+        states.append((detector.regime, detector.direction))
+    return states
+
+
+def test_direction_follows_a_reversal():
     rng = np.random.default_rng(8)
     t = np.arange(-1800.0, 7200.0)
-    directions = {}
-    truths = case_and_board(t, TRIANGLE)
-    for k, (c, b) in enumerate(zip(*(read(x, 0.001, 0.0, rng) for x in truths), strict=True)):
-        stamp_ns = k * SECOND_NS
-        board.update(stamp_ns, float(b))
-        case.update(stamp_ns, float(c))
-        detector.update(stamp_ns, case, board)
-        directions[t[k]] = detector.direction
+    readings = [read(x, 0.001, 0.0, rng) for x in case_and_board(t, TRIANGLE)]
+    states = regimes_and_directions(detector_settings(0.001), *readings)
+    directions = {at: direction for at, (_, direction) in zip(t, states, strict=True)}
     assert directions[-100.0] == 0
     assert directions[600.0] == directions[3600.0] == 1
     # The case turns lag * ln(2 - exp(-ramp / lag)) after the chamber: 616 s.
@@ -339,19 +345,11 @@ def test_direction_follows_a_reversal():
 def test_a_held_reading_does_not_turn_the_direction():
     # WHY: a sensor that measures every 30 s and is published every second gives a staircase, whose
     # constant parts and steps look like reversals.
-    settings = detector_settings(0.001, 0.0625, 300.0)
-    case, board = Thermometer(settings.case), Thermometer(settings.board)
-    detector = RegimeDetector(settings)
     rng = np.random.default_rng(1)
     t = np.arange(-2400.0, 6000.0)
     truths = case_and_board(t, [(0.0, 2.0), (3000.0, 0.0)], 300.0)
-    held = [np.repeat(read(x, 0.001, 0.0625, rng)[::30], 30).tolist() for x in truths]
-    seen = set()
-    for k, (c, b) in enumerate(zip(*held, strict=True)):
-        board.update(k * SECOND_NS, b)
-        case.update(k * SECOND_NS, c)
-        detector.update(k * SECOND_NS, case, board)
-        seen.add((detector.regime, detector.direction))
+    held = [np.repeat(read(x, 0.001, 0.0625, rng)[::30], 30) for x in truths]
+    seen = set(regimes_and_directions(detector_settings(0.001, 0.0625, 300.0), *held))
     assert seen == {(UNKNOWN, 0), (STATIC, 0), (DYNAMIC, 1)}
 
 

@@ -73,7 +73,6 @@ def calibrated(**changes):
 
 
 def one_by_one(block, calibration):
-    """Run a recording through the compensator message by message."""
     compensator = Compensator(calibration)
     readings = [
         (int(after), name, int(stamp), float(value))
@@ -96,7 +95,6 @@ def one_by_one(block, calibration):
 
 
 def output_of(path):
-    """Read a corrected bag with `rosbags`."""
     flags, stamped = [], []
     with AnyReader([path]) as reader:
         wanted = [c for c in reader.connections if c.topic == '/' + REGIME.name]
@@ -229,27 +227,25 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)
     calibration = dataclasses.replace(calibration, unit=unit)
-    peaks, held, parts = [], [], []
+    peaks, held = [], []
     for name, minutes in (('short', 2.0), ('long', 6.0)):
         bag = thermal_test(tmp_path / name, minutes=minutes, rate_hz=500.0)
         held.clear()
         tracemalloc.start()
         result = replay(
             *(bag, calibration, tmp_path / f'{name}.mcap'),
-            progress=lambda part: (
-                parts.append(part),
-                held.append(tracemalloc.get_traced_memory()[0]),
-            ),
+            progress=lambda part: held.append((part, tracemalloc.get_traced_memory()[0])),
         )
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         assert result.counters.n_out == minutes * 60.0 * 500.0
-    assert parts[len(parts) - len(held) :] == sorted(parts[len(parts) - len(held) :])
-    assert parts[-1] == 1.0
+        parts, held_bytes = zip(*held, strict=True)
+        assert list(parts) == sorted(parts)
+        assert parts[-1] == 1.0
     # Three times the messages: memory only grows by the flags of the bag, one per case reading.
     assert peaks[1] < 1.1 * peaks[0]
-    third = len(held) // 3
-    assert max(held[-third:]) < 1.15 * max(held[:third])
+    third = len(parts) // 3
+    assert max(held_bytes[-third:]) < 1.15 * max(held_bytes[:third])
 
 
 @pytest.mark.parametrize('imu', [False, True])
@@ -271,12 +267,9 @@ def test_a_table_holds_what_the_bag_holds(tmp_path, imu):
     expected = {
         'stamp_ns': block.accel_stamp_ns,
         **{f'specific_force_{a}_m_s2': block.accel[:, i] for i, a in enumerate('xyz')},
-        **{
-            f'covariance_{"xyz"[i]}{"xyz"[j]}_m2_s4': covariance[:, 3 * i + j]
-            for i in range(3)
-            for j in range(i, 3)
-        },
     }
+    for i, j in zip(*np.triu_indices(3), strict=True):
+        expected[f'covariance_{"xyz"[i]}{"xyz"[j]}_m2_s4'] = covariance[:, 3 * i + j]
     if imu:
         for i, a in enumerate('xyz'):
             expected[f'angular_velocity_{a}_rad_s'] = block.imu.angular_velocity[:, i]
@@ -340,20 +333,16 @@ def test_every_topic_is_copied(tmp_path, storage):
                     sqlite.write(connection, stamp, data)
     replay(bag, rich_calibration(), tmp_path / 'out', all_topics=True)
     replay(bag, rich_calibration(), tmp_path / 'plain')
-    with AnyReader([tmp_path / 'out']) as found, AnyReader([mcap]) as given:
+    with AnyReader([tmp_path / 'out']) as copy, AnyReader([mcap]) as given:
         for topic in ('/odd', '/gps/ok', '/accel/counts', '/temperature/board'):
-            each = [
-                [
-                    (stamp, bytes(data))
-                    for connection, stamp, data in one.messages()
-                    if connection.topic == topic
-                ]
-                for one in (found, given)
-            ]
-            assert each[0] == each[1], topic
-        (output,) = (one for one in found.connections if one.topic == f'/{IMU_OUT.name}')
+            copied, original = (
+                [(stamp, bytes(data)) for to, stamp, data in bag.messages() if to.topic == topic]
+                for bag in (copy, given)
+            )
+            assert copied == original, topic
+        (output,) = (one for one in copy.connections if one.topic == f'/{IMU_OUT.name}')
         assert output.msgtype == 'sensor_msgs/msg/Imu'
-        times = [stamp for _, stamp, _ in found.messages()]
+        times = [stamp for _, stamp, _ in copy.messages()]
         assert times == sorted(times)
     first, second = (output_of(tmp_path / name)[0] for name in ('out', 'plain'))
     assert np.array_equal(first.accel, second.accel)

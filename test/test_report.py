@@ -65,7 +65,6 @@ def page_of(evidence, folder, **keys):
 
 
 def words_of(evidence):
-    """Return the page without its figures, whose drawing takes seconds."""
     return Page(render_report(evidence, figures=[]))
 
 
@@ -105,14 +104,14 @@ def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
         '12.7 m per µg',
     ):
         assert fact in page.text
-    for one in figures_of(evidence()):
-        assert one.question in page.text
+    for figure in figures_of(evidence()):
+        assert figure.question in page.text
     assert not re.search(r'\bnan\b', page.text)
 
 
 def test_certificate_has_the_residual_of_each_position_left_out(page):
     # The last position cannot be left out.
-    shown = [one.residual_rms.get(LEFT_OUT) for one in evidence().positions]
+    shown = [position.residual_rms.get(LEFT_OUT) for position in evidence().positions]
     assert shown == [*LEFT_OUT_RMS, None]
     assert 'left out, µg RMS' in page.text
     assert 'Left out: with a fit to the other positions' in page.text
@@ -148,8 +147,8 @@ def test_bag_says_whether_its_fit_has_seen_it(opened):
 
 
 def test_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):
-    found = evidence_of_bags(opened)
-    shown = found.shown
+    seen = evidence_of_bags(opened)
+    shown = seen.shown
     truth = run(0).truth
     # In the middle of the first ramp the case heats at about the chamber's 1.5 K/min.
     ramp = (shown.time > 17 * 60) & (shown.time < 21 * 60)
@@ -164,10 +163,10 @@ def test_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):
     directions = [s.direction for s in shown.stretches if s.direction]
     assert directions[0] == 1
     assert directions[-1] == -1
-    page = page_of(found, tmp_path)
+    page = page_of(seen, tmp_path)
     assert 'no calibration was judged' in page.text
-    assert [one.name for one in figures_of(found)] == ['temperatures', 'dynamics']
-    assert all(one.question in page.text for one in figures_of(found))
+    assert [figure.name for figure in figures_of(seen)] == ['temperatures', 'dynamics']
+    assert all(figure.question in page.text for figure in figures_of(seen))
 
 
 def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
@@ -185,8 +184,8 @@ def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
     calibration = replace(
         calibration, unit=replace(calibration.unit, serial=evil), provenance=provenance
     )
-    found = evidence_of_bags(open_bags([bag]), calibration)
-    page = Page(render_report(found, figures=[(one, '') for one in figures_of(found)]))
+    judged = evidence_of_bags(open_bags([bag]), calibration)
+    page = Page(render_report(judged, figures=[(figure, '') for figure in figures_of(judged)]))
     assert page.text.count(evil) >= 6
     assert '$\\frac{.mcap' in page.text
     assert not page.names() & {'script', 'img'}
@@ -200,18 +199,12 @@ def test_hours_of_bag_stay_a_small_page():
     value = 20.0 + 15.0 * np.sin(time / 9000.0) + np.random.default_rng(1).normal(size=len(time))
     readings = Readings(shown.start_ns + (time * 1e9).astype(np.int64), value)
     rows = np.resize(np.arange(len(windows)), 8640)
-    long = replace(
-        evidence(),
-        windows=replace(
-            windows.select(rows),
-            bag=np.zeros(8640, np.int64),
-            position=np.zeros(8640, np.int64),
-            time=np.arange(8640) * 10.0,
-        ),
-    )
+    zeros = np.zeros(8640, np.int64)
+    windows = replace(windows.select(rows), bag=zeros, position=zeros, time=np.arange(8640) * 10.0)
+    long = replace(evidence(), windows=windows)
     bag = replace(shown.bag, temperatures={'board': readings, 'case': readings})
     vars(long)['shown'] = replace(shown, bag=bag, duration_s=86400.0)
-    figures = [one for one in figures_of(long) if one.name not in ('functions', 'step')]
+    figures = [figure for figure in figures_of(long) if figure.name not in ('functions', 'step')]
     assert len(render_report(long, figures=drawn_figures(figures)).encode()) < 1_900_000
 
 
@@ -230,7 +223,7 @@ def test_bag_is_read_in_bounded_memory(tmp_path):
     finally:
         tracemalloc.stop()
     assert opened.n_samples == n_times * len(one.counts)
-    # All columns of this bag would take 32 bytes a sample and more; blocks are a part of that.
+    # All columns of this bag would take 32 bytes a sample and more; a block takes a part of it.
     assert peak < 64 * opened.n_samples
 
 
@@ -241,7 +234,7 @@ def test_calibration_alone_makes_a_page_and_its_figures_as_png(tmp_path):
     assert '01.mcap' in page.text
     assert f'{1:064x}' in page.text
     # Figures that need no bags; all others are drawn for the page.
-    names = [one.name for one in figures_of(evidence())]
+    names = [figure.name for figure in figures_of(evidence())]
     without_bags = [name for name in names if name in ('functions', 'step', 'hysteresis')]
     files = sorted(folder.iterdir())
     assert [path.name for path in files] == [
@@ -269,9 +262,9 @@ def test_verdict_and_its_colour(opened):
         name: replace(getattr(calibration, name), temperature_range_c=(19.0, 22.0))
         for name in ('static', 'dynamic')
     }
-    found = evidence_of_bags(opened, replace(calibration, **narrow))
-    assert found.judgement.sections['outside'].n > 0
-    assert 'outside the calibrated ranges not judged' in found.headline
+    judged = evidence_of_bags(opened, replace(calibration, **narrow))
+    assert judged.judgement.sections['outside'].n > 0
+    assert 'outside the calibrated ranges not judged' in judged.headline
     strict = evidence_of_bags(opened, calibration, tolerance=1e-9)
     assert (strict.level, strict.judgement.verdict) == ('poor', 'recalibrate')
     page = words_of(strict)

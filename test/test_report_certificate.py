@@ -49,20 +49,16 @@ def lab(folder, text=LAB):
 
 
 @pytest.mark.parametrize(
-    ('value', 'expanded', 'said'),
+    ('value', 'expanded', 'text'),
     [
-        (302.95873, 0.01319, ('302.959', '0.013')),
-        (1954.9, 21.7, ('1955', '22')),
-        (-356.26, 199.6, ('−360', '200')),
-        (0.0123, 0.0996, ('0.01', '0.10')),
-        (-0.3, 15.0, ('0', '15')),
-        (12345.6, 9960.0, ('12000', '10000')),
-        (1.23456789, math.nan, ('1.23457', '–')),
-        (1.5, 0.0, ('1.50000', '–')),
+        (302.95873, 0.01319, ('302.959', '0.013')), (1954.9, 21.7, ('1955', '22')),
+        (-356.26, 199.6, ('−360', '200')), (0.0123, 0.0996, ('0.01', '0.10')),
+        (-0.3, 15.0, ('0', '15')), (12345.6, 9960.0, ('12000', '10000')),
+        (1.23456789, math.nan, ('1.23457', '–')), (1.5, 0.0, ('1.50000', '–')),
     ],
-)
-def test_uncertainties_have_two_digits_and_values_their_place(value, expanded, said):
-    assert rounded(value, expanded) == said
+)  # fmt: skip
+def test_uncertainties_have_two_digits_and_values_their_place(value, expanded, text):
+    assert rounded(value, expanded) == text
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e5))
@@ -137,7 +133,7 @@ def test_the_example_is_accepted_and_is_what_the_page_shows():
     info = load_certificate_info(example)
     # All fields except the serial, which the calibration contains, and the remarks.
     assert info.gravity.source == 'national gravity network'
-    assert [one.name for one in info.instruments] == ['chamber', 'thermometers']
+    assert [instrument.name for instrument in info.instruments] == ['chamber', 'thermometers']
     page = (ROOT / 'docs' / 'recording.md').read_text(encoding='utf-8')
     assert example.read_text(encoding='utf-8') in page
 
@@ -153,19 +149,19 @@ def test_statements_that_are_no_text_file_are_refused(tmp_path):
 
 
 def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
-    found = {one.name: one.standard for one in budget(evidence(), CertificateInfo())}
-    assert found['gravity'] is None
-    assert found['thermometers'] is None
+    standards = {one.name: one.standard for one in budget(evidence(), CertificateInfo())}
+    assert standards['gravity'] is None
+    assert standards['thermometers'] is None
     # Noise, attitude and model together are the claimed sd; the residual is within it.
     windows = evidence().judgement.windows
     claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
-    parts = [found[name] for name in ('noise', 'attitude', 'model')]
+    parts = [standards[name] for name in ('noise', 'attitude', 'model')]
     assert float(np.linalg.norm(parts)) == pytest.approx(claim)
-    assert found['repeatability'] == 0.0
+    assert standards['repeatability'] == 0.0
     # Gravity uncertain by 1 ug, and the thermometers by the effect of a kelvin.
     info = load_certificate_info(lab(tmp_path))
     stated = budget(evidence(), info)
-    by_name = {one.name: one.standard for one in stated}
+    by_name = {contribution.name: contribution.standard for contribution in stated}
     assert by_name['gravity'] == 2e-5
     expected = math.hypot(claim, 2e-5, by_name['thermometers'])
     assert combined(stated) == pytest.approx(expected)
@@ -174,15 +170,15 @@ def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
 def test_residual_beyond_the_claim_is_repeatability():
     judgement = evidence().judgement
     doubtful = replace(evidence(), judgement=replace(judgement, left_out_rms=1e-3))
-    found = {one.name: one.standard for one in budget(doubtful, CertificateInfo())}
+    standards = {one.name: one.standard for one in budget(doubtful, CertificateInfo())}
     whole = combined(budget(doubtful, CertificateInfo()))
-    assert 0.9e-3 < found['repeatability'] < 1e-3
+    assert 0.9e-3 < standards['repeatability'] < 1e-3
     assert whole == pytest.approx(1e-3)
 
 
 def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
     # WHY: 0.00037 was printed for a scale factor although gravity's uncertainty was not stated.
-    rows = {one.quantity: one for one in results(evidence(), CertificateInfo(), ())}
+    rows = {result.quantity: result for result in results(evidence(), CertificateInfo(), ())}
     assert rows['scale factor x'].expanded == '–'
     assert rows['bias x'].expanded != '–'
     page = render_report(evidence(), figures=[])
@@ -191,15 +187,15 @@ def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
     info = load_certificate_info(lab(tmp_path))
     assert 'withheld' not in render_report(evidence(), figures=[], info=info)
     # The gravity uncertainty given to the fit is in the covariance, and is not counted twice.
-    told = replace(evidence(), gravity_sd=2e-5)
-    assert 'withheld' not in render_report(told, figures=[])
-    assert {one.name: one.standard for one in budget(told, info)}['gravity'] == 0.0
+    stated = replace(evidence(), gravity_sd=2e-5)
+    assert 'withheld' not in render_report(stated, figures=[])
+    assert {one.name: one.standard for one in budget(stated, info)}['gravity'] == 0.0
 
 
 def test_table_over_temperature(tmp_path):
     info = load_certificate_info(lab(tmp_path))
     tables = over_temperature(evidence(), info)
-    assert [one.axis for one in tables] == ['x', 'y', 'z']
+    assert [table.axis for table in tables] == ['x', 'y', 'z']
     calibration = fitted().calibration
     for k, table in enumerate(tables):
         assert len({row.program for row in table.rows}) == 3
@@ -208,36 +204,36 @@ def test_table_over_temperature(tmp_path):
                 continue
             at = float(row.temperature.replace('−', '-'))
             bias, sd, scale, scale_sd = in_a_soak(calibration, at)
-            said = [float(cell.replace('−', '-')) for cell in row[2:]]
+            numbers = [float(cell.replace('−', '-')) for cell in row[2:]]
             # Half a digit each of two values, and half a tenth of a kelvin at the ends of the
             # range.
-            slack = 0.06 * abs(table.bias_slope) + 0.06 * said[1]
-            assert said[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)
-            assert said[1] == pytest.approx(2.0 * sd[k] / MICRO_G, rel=0.06)
+            slack = 0.06 * abs(table.bias_slope) + 0.06 * numbers[1]
+            assert numbers[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)
+            assert numbers[1] == pytest.approx(2.0 * sd[k] / MICRO_G, rel=0.06)
             *_, scale_0, _ = in_a_soak(calibration)
-            slack = 0.06 * abs(table.scale_slope) + 0.06 * said[4]
-            assert said[3] == pytest.approx(1e6 * (scale[k] / scale_0[k] - 1.0), abs=slack)
+            slack = 0.06 * abs(table.scale_slope) + 0.06 * numbers[4]
+            assert numbers[3] == pytest.approx(1e6 * (scale[k] / scale_0[k] - 1.0), abs=slack)
             gravity = 2e-5 / calibration.gravity_m_s2
-            assert said[4] == pytest.approx(2e6 * math.hypot(scale_sd[k], gravity), rel=0.06)
+            assert numbers[4] == pytest.approx(2e6 * math.hypot(scale_sd[k], gravity), rel=0.06)
 
 
 @pytest.mark.parametrize(
-    ('ends', 'found'),
+    ('ends', 'expected'),
     [
         ((-20.2, 61.3), [-20.2, 0.0, 20.0, 40.0, 61.3]),
         ((14.9, 30.1), [14.9, 20.0, 25.0, 30.1]),
         ((20.0, 20.5), [20.0, 20.5]),
     ],
 )
-def test_temperatures_of_the_table_are_round(ends, found):
-    assert table_temperatures(*ends).tolist() == found
+def test_temperatures_of_the_table_are_round(ends, expected):
+    assert table_temperatures(*ends).tolist() == expected
 
 
 def test_gravity_in_doubt_is_the_scale_factors_doubt(tmp_path):
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
-    rows = {one.quantity: one for one in results(evidence(), info, ())}
+    rows = {result.quantity: result for result in results(evidence(), info, ())}
     scale = fitted().calibration.axes.x.scale_factor
-    # A thousandth of gravity, twice: much more than the uncertainty of the fit.
+    # Gravity uncertain by a thousandth, with k = 2: much more than the uncertainty of the fit.
     assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
     assert (
         rows['bias x']
@@ -247,14 +243,14 @@ def test_gravity_in_doubt_is_the_scale_factors_doubt(tmp_path):
 
 def test_conformity_is_stated_to_a_limit_alone():
     judgement = replace(evidence().judgement, tolerance=100.0 * MICRO_G)
-    said, rule = conformity(replace(evidence(), judgement=judgement))
-    assert said == 'The unit conforms to the limit of 100 µg.'
+    statement, rule = conformity(replace(evidence(), judgement=judgement))
+    assert statement == 'The unit conforms to the limit of 100 µg.'
     assert 'guard band 0' in rule
     beyond = replace(judgement, kind=Verdict.RECALIBRATE)
     assert 'does not conform' in conformity(replace(evidence(), judgement=beyond))[0]
     for judged in (replace(judgement, kind=Verdict.OUTSIDE), evidence().judgement, None):
-        said, rule = conformity(replace(evidence(), judgement=judged))
-        assert said == ''
+        statement, rule = conformity(replace(evidence(), judgement=judged))
+        assert statement == ''
         assert 'o statement of conformity is made' in rule
 
 

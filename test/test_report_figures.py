@@ -56,7 +56,7 @@ def test_bias_and_scale_curves_by_hand():
 def test_a_soak_measures_what_the_calibration_lacks():
     # A scale that is wrong by 30 ppm in all soaks, in any direction of gravity.
     windows = evidence().windows
-    up = np.array([one.up for one in evidence().positions])[windows.position]
+    up = np.array([position.up for position in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
     wrong = replace(evidence(), windows=replace(windows, force=up * length[:, None]))
     temperature, errors = of_unit.soak_measurements(wrong)
@@ -114,15 +114,11 @@ def look(line):
 @pytest.mark.parametrize(
     'draw',
     [
-        of_bags.draw_temperatures,
-        of_bags.draw_dynamics,
-        of_bags.draw_residuals,
-        of_bags.draw_gravity,
-        of_unit.draw_functions,
-        of_bags.draw_positions,
+        of_bags.draw_temperatures, of_bags.draw_dynamics, of_bags.draw_residuals,
+        of_bags.draw_gravity, of_unit.draw_functions, of_bags.draw_positions,
         of_bags.draw_every_position,
     ],
-)
+)  # fmt: skip
 def test_figures_are_legible_in_black_and_white(draw):
     with drawing():
         figure = draw(evidence())
@@ -159,8 +155,8 @@ def test_rates_are_those_of_the_gyroscope():
     unit = rich_calibration()
     with drawing():
         figure = of_unit.draw_rates(replace(evidence(), calibration=unit))
-    own = unit.gyroscope
-    for axes, curve in zip(figure.axes, own.static.axes(), strict=True):
+    gyroscope = unit.gyroscope
+    for axes, curve in zip(figure.axes, gyroscope.static.axes(), strict=True):
         soak = axes.get_lines()[0]
         celsius, drawn = np.array(soak.get_data(), dtype=float)
         bias = np.degrees(curve.bias_function.value(celsius - 20.0)) * 1e3
@@ -168,9 +164,9 @@ def test_rates_are_those_of_the_gyroscope():
         # Equal to rounding; no value in micro-g.
         np.testing.assert_allclose(drawn, bias - slope * (celsius - 20.0), atol=1e-9)
         assert f'{slope:+.3g}'.replace('-', '\u2212') in axes.get_title(loc='left')
-    names = [one.name for one in figures_of(replace(evidence(), calibration=unit))]
+    names = [figure.name for figure in figures_of(replace(evidence(), calibration=unit))]
     assert 'rates' in names
-    assert 'rates' not in [one.name for one in figures_of(evidence())]
+    assert 'rates' not in [figure.name for figure in figures_of(evidence())]
 
 
 TIMEOUT_S = 60.0
@@ -181,10 +177,10 @@ HEADLESS = (
 
 
 def browser():
-    found = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
-    if found is None:
+    path = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
+    if path is None:
         pytest.skip('no Chromium here (Debian: apt install chromium)')
-    return found
+    return path
 
 
 def test_browser_draws_the_page_for_a_phone_whole_and_without_a_complaint(tmp_path):
@@ -206,8 +202,8 @@ def test_browser_draws_the_page_for_a_phone_whole_and_without_a_complaint(tmp_pa
         ],
         capture_output=True, text=True, timeout=TIMEOUT_S, check=True,
     )  # fmt: skip
-    (said,) = [line for line in finished.stderr.splitlines() if 'CONSOLE' in line]
-    cut, n_tables = re.search(r'(\d+) of (\d+) tables are cut', said).groups()
+    (text,) = [line for line in finished.stderr.splitlines() if 'CONSOLE' in line]
+    cut, n_tables = re.search(r'(\d+) of (\d+) tables are cut', text).groups()
     assert int(n_tables) >= 5
     assert cut == '0'
     assert (tmp_path / 'phone.png').stat().st_size > 10_000
@@ -226,7 +222,7 @@ def test_no_printed_page_is_empty(tmp_path):
     printed = (tmp_path / 'page.pdf').read_bytes()
     pages = re.findall(rb'/Type /Page\n.*?/Contents (\d+) 0 R', printed, re.DOTALL)
     assert 5 <= len(pages) <= 12
-    for one in pages:
-        drawn = re.search(rb'\n%s 0 obj.*?stream\r?\n' % one, printed, re.DOTALL)
+    for page in pages:
+        drawn = re.search(rb'\n%s 0 obj.*?stream\r?\n' % page, printed, re.DOTALL)
         # The margin takes some lines.
         assert zlib.decompressobj().decompress(printed[drawn.end() :]).count(b'\n') > 200

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rest log: what the node gathers on real DDS, and its files when killed or on a full disk."""
+"""The rest log: rests gathered on real DDS, and the files of a killed node or on a full disk."""
 
 import json
 import signal
@@ -29,7 +29,7 @@ from thermo_comp.thermal.memory import MemorySpec
 from thermo_comp.unit.calibration_file import save_calibration
 
 RATE_HZ, CYCLE_NS = 50, 20_000_000
-NOISE = 0.01  # of a sample [m/s^2]: 3 counts of the unit of 300 per m/s^2
+NOISE = 0.01  # noise of a sample [m/s^2]: 3 counts of the unit of 300 per m/s^2
 START = Start(START_NS, 'T-1', 'counts', 9.80665, 'abc', MemorySpec(('case',), (('board', 60.0),)))
 
 
@@ -55,7 +55,6 @@ def unit(tmp_path):
 
 
 def standing(n, seed=1):
-    """Make the counts of a unit that stands."""
     rng = np.random.default_rng(seed)
     return np.round((30.0, -20.0, 2941.0) + 300.0 * NOISE * rng.standard_normal((n, 3)))
 
@@ -88,12 +87,12 @@ def test_windows_are_means_of_ten_seconds_at_rest():
     for one, part in zip(whole, parts, strict=True):
         assert np.allclose(one.mean, part.mean(axis=0), atol=1e-9)
         assert np.allclose(one.sd, part.std(axis=0), rtol=0.05)
-    # However the samples arrive.
-    pieces, found = finder(), []
+    # The result does not depend on the blocks in which the samples arrive.
+    pieces, rests = finder(), []
     for cut in np.split(np.arange(len(samples)), [7, 333, 334, 1201]):
-        found += pieces.add(stamps[cut], samples[cut])
-    assert [one.stamp_ns for one in found] == [one.stamp_ns for one in whole]
-    assert np.allclose([one.mean for one in found], [one.mean for one in whole], atol=1e-9)
+        rests += pieces.add(stamps[cut], samples[cut])
+    assert [one.stamp_ns for one in rests] == [one.stamp_ns for one in whole]
+    assert np.allclose([one.mean for one in rests], [one.mean for one in whole], atol=1e-9)
 
 
 @pytest.mark.parametrize('fault', ['moves', 'shakes', 'stuck', 'tilts', 'saturated', 'gap'])
@@ -116,13 +115,13 @@ def test_what_is_no_rest_is_not_kept(fault):
 
 
 def test_a_rest_that_lasts_a_day_is_kept_ever_more_rarely():
-    # Ten minutes all 60 windows, then one a minute to the hour, then one in five minutes.
-    found, one = 0, finder()
+    # All 60 windows of ten minutes, then a window a minute to the hour, then one in five minutes.
+    kept, one = 0, finder()
     samples = standing(6 * 60)
     for minute in range(71):
         stamps = START_NS + (np.arange(len(samples)) + minute * len(samples)) * SECOND_NS // 6
-        found += len(one.add(stamps, samples))
-    assert found == 60 + 50 + 3
+        kept += len(one.add(stamps, samples))
+    assert kept == 60 + 50 + 3
 
 
 @given(st.integers(0, 2000), st.integers(0, 255))
@@ -137,7 +136,7 @@ def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
     changed = bytearray(content)
     changed[place % len(content)] = value
     left = [one for _, one in decode(bytes(changed))[0]]
-    # Without its start no rest counts; of others at most two lines are joined by a lost newline.
+    # A rest without its start does not count; a lost newline joins at most two lines.
     assert all(one in [rest(k) for k in range(9)] for one in left)
     assert len(left) >= 7 or place % len(content) < len(encode(START))
 
@@ -154,19 +153,19 @@ def test_a_line_with_a_checksum_may_hold_anything(value, place):
     good = json.loads(encode(rest(0))[9:])
     for data in (value, [*good[:place], value, *good[place + 1 :]]):
         text = json.dumps(data).encode()
-        found, n_damaged = decode(encode(START) + b'%08x %s\n' % (zlib.crc32(text), text))
-        assert len(found) + n_damaged == 1
-        for _, one in found:
+        rests, n_damaged = decode(encode(START) + b'%08x %s\n' % (zlib.crc32(text), text))
+        assert len(rests) + n_damaged == 1
+        for _, one in rests:
             assert np.isfinite([*one.mean, *one.sd, *one.state, *one.shares]).all()
             assert (len(one.mean), len(one.sd), len(one.state)) == (3, 3, 9)
 
 
 def test_thinning_halves_the_rests_and_keeps_each_start():
     starts = [replace(START, start_ns=START_NS + k) for k in range(3)]
-    lines = [encode(one) + b''.join(map(encode, map(rest, range(5)))) for one in starts]
+    lines = [encode(start) + b''.join(map(encode, map(rest, range(5)))) for start in starts]
     content = thinned(b''.join(lines))
-    found = decode(content)[0]
-    assert [one.stamp_ns for _, one in found] == 3 * [rest(k).stamp_ns for k in (0, 2, 4)]
+    rests = decode(content)[0]
+    assert [one.stamp_ns for _, one in rests] == 3 * [rest(k).stamp_ns for k in (0, 2, 4)]
     while len(content) > len(thinned(content)):
         content = thinned(content)
     assert [start for start, _ in decode(content)[0]] == starts
@@ -186,7 +185,7 @@ def test_a_log_is_bounded_by_day_and_in_all(tmp_path, monkeypatch):
     assert len(sizes) == 6
     assert max(sizes) <= 2000
     assert sum(sizes) <= 5000 + 2000
-    # The oldest days are the thinnest, and none is gone.
+    # The oldest days are the thinnest, and no day is gone.
     assert sizes[0] < sizes[-1] / 2
     assert log.n_rests == len(logged(tmp_path))
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')
@@ -236,20 +235,20 @@ def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(tmp_path, unit, pee
         peer.join(node)
         until(lambda: len(logged(folder)) > len(before), 'a rest of the second start')
 
-        def told():
-            values = {one.key: one.value for a in heard[-1:] for one in a.status[0].values}
+        def message():
+            values = {value.key: value.value for a in heard[-1:] for value in a.status[0].values}
             return values.get('rests gathered') == str(len(logged(folder)))
 
-        peer.wait_for(told, 'the number of rests in the diagnostics')
-    found = logged(folder)
+        peer.wait_for(message, 'the number of rests in the diagnostics')
+    rests = logged(folder)
     assert decode(file.read_bytes())[1] == 1
-    last = found[len(before)][1]
+    last = rests[len(before)][1]
     begin = round((last.stamp_ns - START_NS) / SECOND_NS - 5.0) * RATE_HZ
     assert np.allclose(last.mean, samples[begin : begin + 10 * RATE_HZ].mean(axis=0), atol=1e-5)
     assert last.n == 10 * RATE_HZ
     assert last.state[0] == pytest.approx(21.0, abs=1e-6)
-    assert len({start.start_ns for start, _ in found}) == 2
-    assert {start.serial for start, _ in found} == {'T-1'}
+    assert len({start.start_ns for start, _ in rests}) == 2
+    assert {start.serial for start, _ in rests} == {'T-1'}
 
 
 def test_the_diagnostics_warn_of_a_full_disk(small_disk, unit, peer):

@@ -36,7 +36,6 @@ def readings(second):
 
 
 def run(compensator, events):
-    """Feed events; return (published stamps, rows)."""
     stamps, rows = [], []
     for kind, stamp_ns, value in events:
         if kind == 'accel':
@@ -90,15 +89,15 @@ def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_v
         else:
             one.run, one.n_same = (*sample, stamp_ns), 0
             expected.append(False)
-    found = []
+    collected = []
     begin = 0
     for cut in [*cuts, len(values)]:
         end = min(begin + cut, len(values))
         if end > begin:
             mask = many.find(stamps[begin:end], samples[begin:end])
-            found += [False] * (end - begin) if mask is None else mask.tolist()
+            collected += [False] * (end - begin) if mask is None else mask.tolist()
         begin = end
-    assert found == expected
+    assert collected == expected
     assert many.n_same == one.n_same
     np.testing.assert_array_equal(many.run, one.run)  # NaN before the first sample
 
@@ -132,7 +131,7 @@ def test_an_acceleration_at_another_rate_has_another_noise(rng):
         recording(8000, 400.0, lambda _: tuple(GRAVITY * u + rng.normal(0.0, 1e-3) for u in UP)),
     )
     assert len(rows) == 8000
-    # Four times as fast: each sample averages over a quarter of the time and has four times the
+    # Samples four times as fast: each averages over a quarter of the time and has four times the
     # variance.
     assert rows[-1][3] / rows[0][3] == pytest.approx(4.0, rel=1e-6)
 

@@ -18,17 +18,16 @@ NODE = 'thermo_comp'
 
 
 def allowed():
-    """Read the full names in the policy, by permission."""
     root = ET.parse(ROOT / 'config' / 'policy.xml').getroot()  # noqa: S314 - our own file
     (profile,) = root.iter('profile')
     assert (profile.get('ns'), profile.get('node')) == ('/', NODE)
-    found = {}
+    collected = {}
     for group in profile:
         ((what, verdict),) = group.attrib.items()
         assert verdict == 'ALLOW'
         names = [(one.text or '').replace('~', f'/{NODE}') for one in group]
-        found[what] = {name if name.startswith('/') else f'/{name}' for name in names}
-    return found
+        collected[what] = {name if name.startswith('/') else f'/{name}' for name in names}
+    return collected
 
 
 def test_the_policy_allows_what_the_node_opens_and_no_more(tmp_path):

@@ -48,16 +48,16 @@ def test_a_perfect_model_leaves_the_noise(kind):
     unit = triad(kind, 2)
     errors, norms = [], []
     for record in arrays(unit, plan('held-out', 2), 7):
-        found = corrected_by_truth(record) / MICRO_G
-        errors.append(np.sum((found - record.truth.specific_force / MICRO_G) ** 2, axis=1))
-        norms.append(np.linalg.norm(found, axis=1) - STANDARD_GRAVITY / MICRO_G)
+        force = corrected_by_truth(record) / MICRO_G
+        errors.append(np.sum((force - record.truth.specific_force / MICRO_G) ** 2, axis=1))
+        norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
         # The mean square of the walk over 7.3 h is 9 * 7.3 / 2 per axis; three runs scatter
         # widely.
         assert 4.0 < vector < 20.0
     else:
-        # 1311 means scatter by 2 % and 1.2 %; five of each.
+        # 1311 means scatter by 2 % and 1.2 %; the limits are five times as large.
         assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
         assert vector == pytest.approx(1.12, abs=0.07)
 
@@ -85,14 +85,14 @@ def test_plans_are_what_their_names_say():
 
 
 def test_a_joint_that_slips_goes_round_a_loop():
-    """Independent of the rate: the way back differs from the way there, and time has no effect."""
+    """Hysteresis is independent of the rate: the way back differs from the way there."""
     there_and_back = np.concatenate([np.linspace(0, 5, 200), np.linspace(5, 0, 200)])
     for is_gradual in (False, True):
         effect = SlipEffect('a', 1.0, is_gradual, bias=(2.0, 0.0, 0.0))
         quick, _ = effect.change(_history(there_and_back))
         slow, _ = effect.change(_history(np.repeat(there_and_back, 7), 60.0))
         np.testing.assert_array_equal(slow[::7], quick)
-        # It slips at its width in each direction.
+        # The play slips at its width in each direction.
         assert quick[199, 0] == pytest.approx(2.0, rel=0.01)
         assert quick[-1, 0] == pytest.approx(-2.0, rel=0.02)
         # A second cycle closes the loop.
@@ -167,7 +167,6 @@ NAMES = (*UNIT_NAMES, *TRIAD_NAMES)
 
 
 def _static(unit, board):
-    """Return bias [ug] and relative scale after endless soaks at board temperatures."""
     still = []
     for temperature in board:
         parts = unit.network.equilibrium(unit.network.air_for('board', float(temperature)))
@@ -230,7 +229,7 @@ def test_sum_of_counts_is_the_integral_within_one_count(rng):
     charge = rng.uniform(-3000.0, 3000.0, (200_000, 3))
     start = first_charge(7)
     counts, _ = balanced(charge, start)
-    # At every cycle, not only at the end; 1e-6 is the rounding of the float sum here.
+    # The sums agree at every cycle, not only at the end; 1e-6 is the rounding of the float sum.
     short = np.cumsum(charge, axis=0) + start / 2.0**40 - np.cumsum(counts, axis=0)
     assert short.min() > -1e-6
     assert short.max() < 1.0 + 1e-6

@@ -120,7 +120,7 @@ def test_white_noise_has_its_density(unit):
         power[band].mean(axis=0), 2.0 * np.array(unit.noise_density) ** 2, rtol=0.05
     )
     means = accel.reshape(-1, 3000, 3).mean(axis=1)
-    # The standard deviation of 240 means scatters by 4.6 %; three of these.
+    # The standard deviation of 240 means scatters by 4.6 %; the limit is three times this.
     np.testing.assert_allclose(
         means.std(axis=0), np.array(unit.noise_density) / np.sqrt(60.0), rtol=0.15
     )
@@ -145,8 +145,8 @@ def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
         (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, of_part(run.truth, 'case')
     )
     error = run.case - true
-    # At least 540 readings of 5 mK: the mean is good to 0.2 mK, the deviation to 3 %; five of
-    # each.
+    # At least 540 readings of 5 mK: the mean is good to 0.2 mK, the deviation to 3 %; the limits
+    # are five times as large.
     assert error.mean() == pytest.approx(0.0, abs=1.1e-3)
     assert error.std() == pytest.approx(0.005, rel=0.16)
 
@@ -180,7 +180,7 @@ def test_run_refuses_what_cannot_be(unit):
         simulate(unit, SHORT, UP, gravity=float('nan'))
 
 
-# Both are closed forms, so only rounding differs; temperatures are tens of degrees.
+# The two solutions are closed forms, so only rounding differs; temperatures are tens of degrees.
 ROUNDING = 1e-9
 
 
@@ -253,11 +253,8 @@ def test_still_state_obeys_the_heat_balance():
     case = warm[unit.network.nodes.index('case')]
     assert to_air.conductance * (case - 12.0) == pytest.approx(sum(unit.network.power.values()))
     response = response_of(unit.network, [0.0, 3600.0], [12.0, 12.0])
-    np.testing.assert_allclose(
-        response.temperatures(np.array([0.0, 1800.0, 3600.0])),
-        np.tile(warm, (3, 1)),
-        atol=ROUNDING,
-    )
+    temperatures = response.temperatures(np.array([0.0, 1800.0, 3600.0]))
+    np.testing.assert_allclose(temperatures, np.tile(warm, (3, 1)), atol=ROUNDING)
     board = unit.network.nodes.index('board')
     assert unit.network.equilibrium(unit.network.air_for('board', 20.0))[board] == pytest.approx(
         20.0

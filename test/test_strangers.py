@@ -156,14 +156,14 @@ def test_held_out_bags_take_no_part_in_the_fit(case, recorded):
 
 
 def test_turn_on_draws_its_positions_and_its_shifts(recorded):
-    found = {}
+    collected = {}
     for number in range(1, 9):
         for study in cases.turn_on(number):
             shifts = [recorded(bag)[3]['shift'] for bag in (*study.bags, *study.tests[''])]
-            found.setdefault((len(study.bags), study.label), []).append(shifts)
+            collected.setdefault((len(study.bags), study.label), []).append(shifts)
     expected = {(n, f'{n} at {sd} ug') for n in (9, 10, 12, 18) for sd in (0, 30, 300)}
-    assert set(found) == expected
-    for (_, label), shifts in found.items():
+    assert set(collected) == expected
+    for (_, label), shifts in collected.items():
         sd, n = float(label.split()[2]), np.size(shifts)
         # The sd of an sd over n draws is 1 / sqrt(2 n).
         assert np.std(shifts) == pytest.approx(sd, rel=5.0 / np.sqrt(2 * n), abs=1e-12)
@@ -215,7 +215,7 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
         strangers.error_of([by_norm([fit], order=order)(held)], [held], is_drift=False)
         for order in (3, 0)
     )
-    # Remaining error: products of two small terms that the cubic does not contain.
+    # The remaining errors are products of two small terms that the cubic does not contain.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
 
@@ -238,10 +238,10 @@ def test_a_bias_at_the_reference_is_held_against_its_bound():
     # An sd of 2e-3 m/s^2 that the calibration claims in addition to its white noise.
     claimed = axis_set(residual_sd_m_s2=2e-3)
     known = regime_set(x=claimed, y=claimed, z=claimed)
-    found = strangers.bias_score(calibration(axes=axes, static=known, dynamic=known), study)
-    assert found.ratio == pytest.approx(1 / 0.6 / np.sqrt(3.0))
-    assert found.vector == pytest.approx(1 / 300.0 / UG)
-    assert found.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
+    score = strangers.bias_score(calibration(axes=axes, static=known, dynamic=known), study)
+    assert score.ratio == pytest.approx(1 / 0.6 / np.sqrt(3.0))
+    assert score.vector == pytest.approx(1 / 300.0 / UG)
+    assert score.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
 
 
 def test_a_cubic_by_hand_finds_a_pose_s_drift():
@@ -275,10 +275,10 @@ def test_a_ratio_is_1_where_errors_are_as_claimed():
     error = rng.standard_normal((n, 3)) @ root.T
     claim = np.broadcast_to(root @ root.T, (n, 3, 3))
     out = strangers.Corrected(truth + error, claim, np.zeros(3))
-    found = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
+    scores = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
     # 20000 windows determine an RMS to half a percent.
-    assert (found.ratio, found.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
-    assert found.claim == pytest.approx(found.vector, rel=0.02)
+    assert (scores.ratio, scores.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
+    assert scores.claim == pytest.approx(scores.vector, rel=0.02)
 
 
 def test_a_claim_of_a_minute_is_the_noise_of_its_mean():
@@ -300,8 +300,8 @@ def test_minutes_that_are_not_published_may_be_few():
     for n_missing, expected in ((1, 1.0), (3, np.inf)):
         force[:n_missing] = np.nan
         out = strangers.Corrected(force, claim, np.zeros(3))
-        found = strangers.score([out], [Minutes(truth, np.zeros(100), truth)], is_drift=False)
-        assert found.ratio == pytest.approx(expected)
+        scores = strangers.score([out], [Minutes(truth, np.zeros(100), truth)], is_drift=False)
+        assert scores.ratio == pytest.approx(expected)
 
 
 def test_a_row_says_what_it_misses_and_nothing_else():
@@ -320,14 +320,9 @@ def test_a_row_says_what_it_misses_and_nothing_else():
 
 
 def test_more_data_is_held_against_the_row_without_it():
-    rows = rows_of(
-        [
-            Result(
-                'third-node alone: its attitude', 1, {'fit': Score(20.0, 40.0, 1.0, 1.0, 40.0)}
-            ),
-            Result('third-node joint: its attitude', 1, {'fit': Score(9.0, 30.0, 1.0, 1.0, 40.0)}),
-        ]
-    )
+    alone, joint = Score(20.0, 40.0, 1.0, 1.0, 40.0), Score(9.0, 30.0, 1.0, 1.0, 40.0)
+    rows = rows_of([Result('third-node alone: its attitude', 1, {'fit': alone}),
+                    Result('third-node joint: its attitude', 1, {'fit': joint})])  # fmt: skip
     assert misses(rows[0], rows) == []
     assert misses(rows[1], rows) == ['vector / alone: its attitude 0.75 > 0.5']
 
@@ -357,7 +352,7 @@ def carried_bag():
 
 def test_rests_of_a_recording_are_its_long_stays():
     rows = rests_of(carried_bag())
-    # Without a minute at each end.
+    # The blocks exclude a minute at each end.
     expected = [(60, 17940), (18060, 35940), (36180, 86340)]
     assert [(rest.start, rest.stop) for rest in rows] == expected
 
@@ -367,6 +362,6 @@ def test_blocks_go_by_the_clock_and_share_no_sample():
     blocks = blocks_of(part(bag, slice(9000, 86400), 'rest'), 'rest')
     assert list(blocks) == list(range(8))
     times = np.concatenate([block.time_s for block in blocks.values()])
-    # The last sample would be a block alone.
+    # The last sample alone would be a block.
     assert times.tolist() == bag.time_s[9000:-1].tolist()
     assert all((block.time_s // 10800.0 == number).all() for number, block in blocks.items())

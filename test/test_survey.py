@@ -14,7 +14,6 @@ START_NS = 1_767_225_600_000_000_000
 
 
 def survey(path, temperature, *, gap_s=0.0, noise=0.5, case=True, backwards=False):
-    """Describe an hour at 5 Hz with readings every second."""
     rng = np.random.default_rng(5)
     n = 18000
     stamps = START_NS + (np.arange(n) + 1) * 200_000_000
@@ -42,7 +41,7 @@ def test_a_good_recording(tmp_path):
     result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0))
     assert result.findings == []
     assert result.n == 18000
-    assert not any('gaps' in said or 'do not rise' in said for said in result.findings)
+    assert not any('gaps' in text or 'do not rise' in text for text in result.findings)
     assert result.rate_hz == pytest.approx(5.0)
     assert result.n_still == 1
     assert result.still_s == pytest.approx(3600.0, abs=15.0)
@@ -54,7 +53,7 @@ def test_a_good_recording(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('temperature', 'options', 'said'),
+    ('temperature', 'options', 'text'),
     [
         (up_and_down(20.0, 24.0), {}, ['spans 4.0 K: 25 are advised']),
         (up_and_down(10.0, 28.0), {}, ['spans 18.0 K: 25 are advised']),
@@ -68,9 +67,9 @@ def test_a_good_recording(tmp_path):
          ['1 gaps, the longest 30.2 s', '1 stamps do not rise: those samples are left out']),
     ],
 )  # fmt: skip
-def test_what_a_fit_would_miss_is_named(tmp_path, temperature, options, said):
+def test_what_a_fit_would_miss_is_named(tmp_path, temperature, options, text):
     findings = survey(tmp_path / 'bag', temperature, **options).findings
-    assert [one for one in said if not any(one in found for found in findings)] == []
+    assert [one for one in text if not any(one in found for found in findings)] == []
 
 
 def test_one_direction_only(tmp_path):

@@ -119,14 +119,14 @@ def test_a_recording_forges_no_line(forged, tmp_path, capfd):
         ('fit', str(forged), *out, '--gravity', '9.8'),
     ):
         run([*command])
-        said, errors = capfd.readouterr()
-        for line in (said + errors).splitlines():
+        printed, errors = capfd.readouterr()
+        for line in (printed + errors).splitlines():
             assert line.isprintable()
             assert not line.startswith('thermo_comp: error: forged')
         if command[0] == 'info':
-            assert r'\x1b' in said or r'\u001b' in said
+            assert r'\x1b' in printed or r'\u001b' in printed
             if '--json' in command:
-                assert json.loads(said)['metadata']['serial'] == FORGED
+                assert json.loads(printed)['metadata']['serial'] == FORGED
 
 
 @pytest.mark.parametrize('encoding', ['latin-1', 'ascii', 'utf-8'])
@@ -142,9 +142,9 @@ def test_any_terminal_can_show_it(tmp_path, cli, monkeypatch, encoding):
             patch.setattr('sys.stdout', terminal)
             assert run(['info', str(name), *more]) == 0
         terminal.seek(0)
-        said = terminal.read()
-        assert ('Блок' if encoding == 'utf-8' and not more else r'\u0411') in said
-        assert r'not \udcff utf-8.yaml' in said
+        content = terminal.read()
+        assert ('Блок' if encoding == 'utf-8' and not more else r'\u0411') in content
+        assert r'not \udcff utf-8.yaml' in content
     if encoding == 'latin-1':  # as the user wrote it
         assert r'\u0411' in cli('info', name, PYTHONIOENCODING=encoding).stdout
     absent = cli('info', tmp_path / os.fsdecode(b'no\xff.mcap'), code=1)

@@ -79,7 +79,6 @@ def test_results_do_not_depend_on_the_origin_of_time():
 
 
 def ramp(tracker):
-    """Feed a soak and a ramp; return the weight at every second of the ramp."""
     soak = np.full(1200, 20.0)
     feed(tracker, soak, soak)
     assert tracker.detector.regime == Regime.STATIC

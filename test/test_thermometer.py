@@ -42,7 +42,6 @@ def state(thermometer):
 
 
 def settled(noise=0.001, n=600, **changes):
-    """Return a thermometer after n readings of 20 degC at 1 Hz."""
     thermometer = Thermometer(ThermometerSettings(noise, **changes))
     rng = np.random.default_rng(5)
     run(thermometer, np.arange(n), read(np.full(n, 20.0), noise, 0.0, rng))
@@ -55,7 +54,7 @@ def errors():
     Return squared errors and variances of all sensors over a soak, a ramp and a soak, three runs
     each.
     """
-    found = {}
+    collected = {}
     for name, (noise, quantum, dt) in SENSORS.items():
         runs = []
         for seed in range(3):
@@ -71,8 +70,8 @@ def errors():
             runs.append(
                 np.column_stack([t, (out[:, 0] - truth) ** 2, (out[:, 1] - rate) ** 2, out[:, 2:]])
             )
-        found[name] = np.concatenate(runs)
-    return found
+        collected[name] = np.concatenate(runs)
+    return collected
 
 
 PARTS = {
@@ -101,14 +100,11 @@ def test_variances_are_honest(errors, sensor, part):
 @pytest.mark.parametrize(
     ('sensor', 'temperature_k', 'rate_k_min'),
     [
-        ('1 mK', 0.0004, 0.001),
-        ('10 mK', 0.003, 0.006),
-        ('10 mK, 10 Hz', 0.0015, 0.005),
-        ('1 mK, 62.5 mK steps', 0.004, 0.01),
-        ('10 mK, 62.5 mK steps', 0.006, 0.01),
+        ('1 mK', 0.0004, 0.001), ('10 mK', 0.003, 0.006), ('10 mK, 10 Hz', 0.0015, 0.005),
+        ('1 mK, 62.5 mK steps', 0.004, 0.01), ('10 mK, 62.5 mK steps', 0.006, 0.01),
         ('10 mK, 1 K steps', 0.1, 0.06),
     ],
-)
+)  # fmt: skip
 def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
     # Limits at about 1.5 times the measured errors: noise averaged over the filter's memory. A
     # sensor with steps of 1 K crosses an edge every two minutes and determines the rate to 10 %.
@@ -167,13 +163,9 @@ def test_prediction_is_that_of_matrices():
     forward = np.array(
         [[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1.0 / (1.0 + dt / lag)]]
     )
-    wander = power * np.array(
-        [
-            [dt**5 / 20.0, dt**4 / 8.0, dt**3 / 6.0],
-            [dt**4 / 8.0, dt**3 / 3.0, dt**2 / 2.0],
-            [dt**3 / 6.0, dt**2 / 2.0, dt],
-        ]
-    )
+    wander = power * np.array([[dt**5 / 20.0, dt**4 / 8.0, dt**3 / 6.0],
+                               [dt**4 / 8.0, dt**3 / 3.0, dt**2 / 2.0],
+                               [dt**3 / 6.0, dt**2 / 2.0, dt]])  # fmt: skip
     upper = np.triu_indices(3)
     out = predict((*mean, *covariance[upper]), dt, lag, power)
     np.testing.assert_allclose(out[:3], forward @ mean, rtol=1e-13)
@@ -295,7 +287,7 @@ def test_extrapolation_is_linear_then_held():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # It is unknown whether the ramp continued for the other 55 s.
+    # The thermometer cannot know whether the ramp continued for the other 55 s.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 
@@ -314,7 +306,7 @@ def test_reset_forgets_the_readings():
     thermometer = settled()
     thermometer.reset()
     assert thermometer.stamp_ns is None
-    assert thermometer.update(0, 30.0)  # older than the previous one: a jump of time
+    assert thermometer.update(0, 30.0)  # older than the previous reading: a jump of time
     assert thermometer.temperature == 30.0
 
 

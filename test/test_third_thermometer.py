@@ -43,12 +43,8 @@ def unit_with_a_lid():
         (Link(AIR, 'case', 4.0), Link('case', 'board', 0.4), Link('case', 'lid', 0.1)),
     )
     drift = (PartEffect('board', bias=(6.0, 4.0, -8.0)), PartEffect('lid', bias=LID_UG_K))
-    return replace(
-        unit_preset('bare-quartz', 1),
-        network=network,
-        drift=drift,
-        load=SwitchedLoad('lid', 0.1 * LOAD_K),
-    )
+    load = SwitchedLoad('lid', 0.1 * LOAD_K)
+    return replace(unit_preset('bare-quartz', 1), network=network, drift=drift, load=load)
 
 
 def record(path, run):

@@ -36,8 +36,6 @@ def node():
 
 
 class Running:
-    """A loop in a thread; stores the data of its raw subscription."""
-
     def __init__(self, node):
         self.loop = WaitLoop(node)
         self.raw = self.loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=2000))
@@ -176,7 +174,7 @@ def test_a_regular_call_goes_on_with_and_without_samples(node, peer):
             publisher.publish(Vector3Stamped())
             running.wait_for(lambda n=n_sent: len(running.messages) == n)
         running.wait_for(lambda: len(called) > n_before and called[-1] == 50)
-        # Another timer replaces it, and fires when it is due, not earlier.
+        # Another timer replaces the first, and fires when it is due, not earlier.
         again = []
         start = time.monotonic()
 
@@ -215,7 +213,7 @@ def test_a_subscription_can_go_while_the_loop_runs(node, peer):
         peer.call(Trigger, 'drop', Trigger.Request())
         publisher.publish(Vector3Stamped())
         running.wait_for(lambda: len(running.messages) == 2)
-    assert all(one.topic != 'others' for one in node.subscriptions)
+    assert all(subscription.topic != 'others' for subscription in node.subscriptions)
 
 
 def test_quality_of_service_is_open_to_overrides(node):

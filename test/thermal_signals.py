@@ -28,7 +28,6 @@ def lagged(t, corners, lag):
 
 
 def lagged_twice(t, corners, lag, other):
-    """Return the response of two different lags in series."""
     out = np.zeros(len(t))
     before = 0.0
     for at, rate in corners:
@@ -40,19 +39,16 @@ def lagged_twice(t, corners, lag, other):
 
 
 def ripple(t, lag, period, phase=0.0, amplitude=0.1):
-    """Return the response of a lag to the ripple of a chamber's control."""
     omega = 2.0 * np.pi / period
     return amplitude / np.hypot(1.0, omega * lag) * np.sin(omega * t + phase)
 
 
 def read(truth, noise, quantum, rng):
-    """Add white noise, then round."""
     reading = truth + rng.normal(0.0, noise, len(truth))
     return np.round(reading / quantum) * quantum if quantum else reading
 
 
 def detector_settings(noise, quantum=0.0, lag=LAG_S, **changes):
-    """Default settings for a unit of known lags and sensors."""
     return DetectorSettings(
         case=ThermometerSettings(noise, quantum, lag_s=lag),
         board=ThermometerSettings(noise, quantum, lag_s=lag + BOARD_LAG_S),
@@ -61,10 +57,9 @@ def detector_settings(noise, quantum=0.0, lag=LAG_S, **changes):
 
 
 def switches(settings, t, case, board):
-    """Return the times [s], regimes and directions at which the regime changes."""
     case_thermometer, board_thermometer = Thermometer(settings.case), Thermometer(settings.board)
     detector = RegimeDetector(settings)
-    found = []
+    collected = []
     regime = Regime.UNKNOWN
     nothing = [None] * len(t)
     rows = zip(
@@ -84,6 +79,6 @@ def switches(settings, t, case, board):
             None if board is None else board_thermometer,
         )
         if now != regime:
-            found.append((stamp_ns / 1e9, now, detector.direction))
+            collected.append((stamp_ns / 1e9, now, detector.direction))
             regime = now
-    return found
+    return collected

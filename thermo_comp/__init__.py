@@ -87,7 +87,7 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    module, _, own = _HOMES.get(name, 'api').partition(':')
-    value = getattr(import_module(f'.{module}', __name__), own or name)
+    module, _, attribute = _HOMES.get(name, 'api').partition(':')
+    value = getattr(import_module(f'.{module}', __name__), attribute or name)
     globals()[name] = value
     return value

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the door of the commands: the console script and ``python -m thermo_comp``."""
+"""Owns the entry point of the console script and of ``python -m thermo_comp``."""
 
 import sys
 

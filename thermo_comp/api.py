@@ -28,9 +28,9 @@ from .unit.calibration import Calibration
 #: A temperature: one value for each sample, or (time_s, value) with separate times.
 Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
 
-#: `Columns.start_ns` is a multiple of this, so that times count from a whole minute.
+#: `Columns.start_ns` is a multiple of this time [ns], so that times count from a whole minute.
 _MINUTE_NS = 60_000_000_000
-_LONGEST_S = 4e9  # largest time accepted [s]; larger ones are most likely not in seconds
+_LONGEST_S = 4e9  # largest time accepted [s]; a larger time is most likely not in seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Corrected:
     specific_force : ndarray, shape (n, 3)
         Corrected specific force [m/s^2]; NaN where the node would publish nothing.
     covariance : ndarray, shape (n, 3, 3)
-        Covariance of the specific force [m^2/s^4]; NaN where that is NaN.
+        Covariance of the specific force [m^2/s^4]; NaN where the force is NaN.
     dynamic : ndarray of bool, shape (n,)
         Whether the regime was dynamic; False while it is unknown.
     counters : Counters
@@ -159,7 +159,7 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
         A rosbag2 folder, ``*.mcap``, ``*.db3`` or a ROS 1 ``*.bag``; a table of numbers whose
         columns can be guessed; a PX4 ``*.ulg`` or ArduPilot ``*.bin``.
     topics : recording.topics.Topics or None, optional
-        Names of the topics, where they are not the usual ones.
+        Names of the topics that differ from the usual names.
 
     Returns
     -------
@@ -178,7 +178,7 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
     with as_bags([Path(path)]) as (bag,):
         recording = read_recording(bag, topics, require=['accel'])
     block = recording.columns
-    readings = {name: one for name, one in block.temperatures.items() if len(one[0])}
+    readings = {name: pair for name, pair in block.temperatures.items() if len(pair[0])}
     stamps = [block.accel_stamp_ns, *(reading[0] for reading in readings.values())]
     first_ns = min((int(stamp.min()) for stamp in stamps if len(stamp)), default=0)
     start_ns = first_ns // _MINUTE_NS * _MINUTE_NS
@@ -251,8 +251,8 @@ def fit(
                 nothing: Temperature = ([], [])
                 readings = {'board': nothing, 'case': nothing, **one.temperatures}
                 block = _block(one.time_s, one.counts, readings, one.start_ns)
-                said = parse_sections(one.specific_force) if one.specific_force else ()
-                known = KnownForce(one.name, said) if said else None
+                text = parse_sections(one.specific_force) if one.specific_force else ()
+                known = KnownForce(one.name, text) if text else None
                 source = FitSource(one.name, partial(list, [block]), None, one.serial, known)
                 sources.append(source)
         return run(sources, FitOptions(gravity=gravity, **options)).calibration

@@ -3,8 +3,9 @@
 """
 Owns the exceptions for errors that a user can cause and correct; the message is one line.
 
-They are raised for files, bags and data that do not suffice for a fit. A caller's mistake in the
-numeric core is a plain `ValueError`. The command line prints `str(error)` and nothing else.
+The exceptions are raised for files, bags and data that do not suffice for a fit. A caller's
+mistake in the numeric core is a plain `ValueError`. The command line prints `str(error)` and
+nothing else.
 """
 
 from pathlib import Path

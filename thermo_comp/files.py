@@ -3,10 +3,10 @@
 """
 Owns the reading of files of limited size, and the writing of all output files.
 
-An output never replaces an input of the same command. Without `overwrite` it replaces no existing
-file, even if another process writes at the same time; with `overwrite`, only a file of the same
-kind. The file gets its final name once it is complete. If the name is a symbolic link, the link
-stays and its target is written.
+An output never replaces an input of the same command. Without `overwrite` an output replaces no
+existing file, even if another process writes at the same time; with `overwrite`, only a file of
+the same kind. The file gets its final name once it is complete. If the name is a symbolic link,
+the link stays and its target is written.
 """
 
 import errno
@@ -84,7 +84,7 @@ def shown_name(path: str | Path) -> str:
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """Open a regular file for reading; OSError, before a reader could block, if it is none."""
+    """Open a regular file for reading; OSError, before reading can block, for anything else."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -120,14 +120,14 @@ def _opened(file: BinaryIO) -> Path:
 def check_output(
     path: str | Path, kind: Kind, *, overwrite: bool = False, others: Iterable[str | Path] = ()
 ) -> None:
-    """Refuse an output that must not be written; `others` are files that it must not replace."""
+    """Refuse an output that must not be written, or that replaces one of the files `others`."""
     target = Path(os.path.realpath(path))
     for other in others:
         if _overlaps(target, Path(os.path.realpath(other))):
             raise OutputError(f'is {other} or a part of it, which the command needs', path)
     suffix = target.suffix.lower()
     if kind.suffixes and suffix[1:2].isalpha() and suffix not in kind.suffixes:
-        names = ' or '.join(f'*{one}' for one in kind.suffixes)
+        names = ' or '.join(f'*{suffix}' for suffix in kind.suffixes)
         raise OutputError(f'cannot be written: {suffix} is not {names}', path)
     if target.exists():
         if not overwrite:
@@ -141,7 +141,7 @@ def check_output(
     if not folder.is_dir():
         raise OutputError(f'cannot be written: {folder} is no directory', path)
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise OutputError(f'cannot be written: {folder} is closed to you', path)
+        raise OutputError(f'cannot be written: no permission to write in {folder}', path)
 
 
 class Draft:
@@ -258,8 +258,8 @@ def _overlaps(target: Path, other: Path) -> bool:
 def _identities(path: Path) -> set[tuple[int, int]]:
     """Return device and inode of a file, or of a folder and its entries."""
     identities = set()
-    for one in (path, *(path.iterdir() if path.is_dir() else ())):
+    for entry in (path, *(path.iterdir() if path.is_dir() else ())):
         with suppress(OSError):
-            status = one.stat()
+            status = entry.stat()
             identities.add((status.st_dev, status.st_ino))
     return identities

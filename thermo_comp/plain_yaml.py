@@ -23,7 +23,7 @@ from .files import read_bounded
 DEPTH_LIMIT = 12
 #: Largest number of keys, values, lists and mappings: ten times that of the largest calibration.
 NODE_LIMIT = 20_000
-_FILE_LIMIT = 1 << 16  # largest file written by hand [bytes]; usual ones have a few kB
+_FILE_LIMIT = 1 << 16  # largest file written by hand [bytes]; usual files have a few kB
 _INTEGER_DIGITS = 20  # digits of the longest integer accepted; a float64 needs no more
 _INTEGER = re.compile(r'[-+]?[0-9]+')
 _FLOAT = re.compile(r'[-+]?(?:(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf)|\.nan')
@@ -41,7 +41,7 @@ class PlainYamlError(ValueError):
 
 
 def load_plain_yaml(text: str | bytes, node_limit: int = NODE_LIMIT) -> Any:
-    """Read one YAML document of plain values (empty text: None); PlainYamlError if it is none."""
+    """Read a YAML document of plain values (empty text: None); PlainYamlError for another text."""
     try:
         return _load(text, node_limit)
     except yaml.YAMLError as error:
@@ -61,7 +61,7 @@ def read_plain_yaml(path: str | Path) -> Any:
         raise ThermoCompError(f'{path}: cannot be read: {error.strerror or error}') from error
     except UnicodeDecodeError as error:
         raise ThermoCompError(f'{path}: not UTF-8 text (byte {error.start})') from error
-    except ValueError as error:  # of YAML, of the size
+    except ValueError as error:  # YAML or file size refused
         raise ThermoCompError(f'{path}: {error}') from error
 
 
@@ -87,18 +87,18 @@ def _load(text: str | bytes, node_limit: int) -> Any:
             return _scalar(event.value, line) if event.implicit[0] else event.value
         if depth == DEPTH_LIMIT:
             raise PlainYamlError(f'nested deeper than {DEPTH_LIMIT}', line)
-        inner = takewhile(lambda one: not isinstance(one, yaml.CollectionEndEvent), events)
+        inner = takewhile(lambda inside: not isinstance(inside, yaml.CollectionEndEvent), events)
         if isinstance(event, yaml.SequenceStartEvent):
-            return [value(one, depth + 1) for one in inner]
-        found: dict[str, Any] = {}
+            return [value(part, depth + 1) for part in inner]
+        collected: dict[str, Any] = {}
         for one in inner:
             key, line = value(one, depth + 1), one.start_mark.line + 1
             if type(key) is not str:
                 raise _invalid(line, f'a key must be a text, got {key!r:.40}')
-            if key in found:
+            if key in collected:
                 raise _invalid(line, f'the key {key!r:.60} stands twice')
-            found[key] = value(next(events), depth + 1)
-        return found
+            collected[key] = value(next(events), depth + 1)
+        return collected
 
     events = bounded()
     documents: list[Any] = []

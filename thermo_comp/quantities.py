@@ -84,7 +84,7 @@ _PREPARED: dict[str, Bounds] = {
     # Temperatures.
     'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='0 K; solder melts'),
     'temperature span': _positive(1e-2, 1273.15, 'K', 'resolution of a thermometer'),
-    'temperature rate': _between(-1e5, 1e5, 'K/min', 'a thermal shock is 1e3'),
+    'temperature rate': _between(-1e5, 1e5, 'K/min', 'a thermal shock is 1000 K/min'),
     'rate span': _positive(1e-6, 2e5, 'K/min', 'a kelvin in two years'),
     'time constant': _positive(1e-3, 1e8, 's', 'a bare wire; three years'),
     'lag': _nil_or(1e-3, 1e8, 's', 'as for a time constant; 0 is no lag'),
@@ -99,12 +99,12 @@ _PREPARED: dict[str, Bounds] = {
     'rate noise density': _positive(
         1e-12, 1e3, 'rad/s/sqrt(Hz)', 'far below any sensor; 57000 deg/s'
     ),
-    'slow noise': _up_to(1e3, 'm/s^2/sqrt(h)', '100 g in an hour'),
-    'rate slow noise': _up_to(1e3, 'rad/s/sqrt(h)', '57000 deg/s in an hour'),
+    'slow noise': _up_to(1e3, 'm/s^2/sqrt(h)', 'a walk of 100 g in an hour'),
+    'rate slow noise': _up_to(1e3, 'rad/s/sqrt(h)', 'a walk of 57000 deg/s in an hour'),
     'deviation': _up_to(1e4, 'm/s^2', '1000 g: the quantity is unknown'),
     'rate deviation': _up_to(1e3, 'rad/s', '57000 deg/s: the quantity is unknown'),
     'misalignment deviation': _up_to(1.0, 'rad', 'the quantity is unknown'),
-    'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'at 1 g it reads 2 g'),
+    'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'an axis that reads 2 g at 1 g'),
     # Results of a fit and numbers of samples.
     'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
     'number': _up_to(1e15, '', 'exact as a float'),
@@ -113,13 +113,13 @@ _PREPARED: dict[str, Bounds] = {
     # Thermometers and detector.
     'reading noise': _positive(1e-6, 1e2, 'K', 'a microkelvin thermometer; a useless one'),
     'quantum': _up_to(1e2, 'K', 'coarser than any sensor'),
-    'ramp': _positive(1e-6, 1e5, 'K/min', 'a kelvin in two years; a thermal shock is 1e3'),
-    'false alarms': _positive(1e-12, 1e4, '1/h', 'one in the age of the Earth; three a second'),
+    'ramp': _positive(1e-6, 1e5, 'K/min', 'a kelvin in two years; 100 thermal shocks'),
+    'false alarms': _positive(1e-12, 1e4, '1/h', 'an alarm in 1e8 years; three a second'),
     'ripple': _up_to(1e3, 'K', 'larger than in any chamber'),
     'dwell': _up_to(1e7, 's', 'four months'),
     # Lengths of lists in a file.
     'coefficients': Bounds(shortest=1, longest=12, why='t^11 follows any curve'),
-    'knots': Bounds(longest=100, why='ten per ten kelvins'),
+    'knots': Bounds(longest=100, why='a knot per kelvin over 100 K'),
     'columns': Bounds(longest=2000, why='all columns of ten thermometers'),
 }
 Positive = Annotated[float, Bounds(above=0.0, below=math.inf)]

@@ -148,9 +148,9 @@ def replay(
 
 
 def _beyond(calibration: Calibration, block: Block) -> float:
-    """Return how far the board readings lie outside all ranges [K], single outliers ignored."""
+    """Return how far the board readings lie outside all ranges [K], ignoring single outliers."""
     ranges = [regime_set.temperature_range_c for regime_set in calibration.regime_sets()]
-    lower, upper = min(one[0] for one in ranges), max(one[1] for one in ranges)
+    lower, upper = min(bounds[0] for bounds in ranges), max(bounds[1] for bounds in ranges)
     celsius = block.temperatures['board'].celsius
     bulk = np.nanquantile(celsius, _BULK) if np.isfinite(celsius).any() else np.array([lower])
     excess = float(max(bulk - np.clip(bulk, lower, upper), key=abs))

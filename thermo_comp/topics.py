@@ -54,12 +54,12 @@ def _stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
     """Serialize a DiagnosticArray of one status, with the stamp of the reading that decides."""
     status = b''
     for text in ('regime', 'dynamic' if is_dynamic else 'static', serial):
-        # The level is one byte, and a length stands at a multiple of four.
+        # The level is one byte; the length of a text is aligned to four bytes.
         status += bytes(-(1 + len(status)) % 4) + pack('<I', len(text.encode()) + 1)
         status += text.encode() + b'\0'
     status += bytes(-(1 + len(status)) % 4) + pack('<I', 0)  # no key and value
     sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-    # An empty frame_id with its NUL, padding, one status, its level.
+    # Fields: stamp, length of the empty frame_id with its NUL, padding, number of status, level.
     head = pack('<iII4xIb', sec, nanosec, 1, 1, 0)
     return _ENCAPSULATION + head + status
 
@@ -83,7 +83,7 @@ BOARD, CASE = (
     NodeTopic(thermometer(name), TEMPERATURE, meaning, 50, is_reliable=False)
     for name, meaning in (
         ('board', 'degC; or std_msgs/Float32, Float64, or a number in any message'),
-        ('case', 'the same, and `temperature/NAME` for any other that the calibration names'),
+        ('case', 'as for the board; `temperature/NAME` for any other that a calibration names'),
     )
 )
 IMU_OUT = NodeTopic('imu/data_raw', IMU, 'specific force in m/s^2', 2000)
@@ -98,7 +98,7 @@ REGIME = NodeTopic(
 STAMPED = NodeTopic(
     'regime/stamped',
     DIAGNOSTICS,
-    'the same flag with the stamp of the reading that decides; `status[0].message` is `dynamic` '
+    'the flag with the stamp of the reading that decides; `status[0].message` is `dynamic` '
     'or `static`',
     1,
     is_latched=True,

@@ -16,5 +16,5 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def data_folder() -> Path:
-    """Return where the recordings are looked for."""
+    """Return the folder of the recordings."""
     return Path(os.environ.get('THERMO_COMP_DATA', ROOT.parent / 'shared' / 'data'))

@@ -19,21 +19,23 @@ from ..recording.overview import ThermometerSurvey, survey_thermometer, thermal_
 from ..recording.stillness import CellAccumulator, Cells, still_intervals
 from ..typing import Floats, Ints
 
-# Shortest rest that counts, or the soak if that is shorter [s].
+# Minimum length of a rest [s]; the wanted soak if that is shorter.
 _REST_S = 10.0
+# Minimum length of a cell [s], and number of samples from which it is chosen.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that are searched again for the begin of a rest.
 _LOOKED_BACK = 200
-# Sd of a position by hysteresis, mounting and drift, however long it lasts [g].
+# Sd of a position's force by hysteresis, mounting and drift, which a longer rest keeps [g].
 _FLOOR_SD = 2e-5
-# Noise of a rest / noise of the others above which it is 'restless'; noise / that of the previous
-# rest above which the unit is held by hand.
+# Ratio of a rest's noise to the median of all rests, above which the rest is 'restless'; ratio to
+# the noise of the previous rest, above which the unit is held by hand.
 _RESTLESS, _LOUDEST = 3.0, 10.0
+# Backward step of the stamps from which on the driver has restarted [ns].
 _STEP_BACK_NS = 10**9
-# Earlier than any stamp.
+# A stamp earlier than any other [ns].
 _EVER_NS = -(1 << 62)
 
-#: Surveys by thermometer.
+#: Survey of each thermometer, by its name.
 Surveys = Mapping[str, ThermometerSurvey]
 
 
@@ -60,7 +62,8 @@ class Account:
     The last position is unfinished. `worst_sd_g` is the sd of the force in the worst attitude,
     `constants_sd` that of bias [g], relative scale and M [rad], as in `coverage`. `next_up` is the
     recommended next direction, `next_deg` away from `now`, the direction of the newest reading
-    (NaN before any); `hole` is farthest from all positions. `findings` list what is missing.
+    (NaN before any); `hole` is the direction farthest from all positions. `findings` are texts
+    about missing data.
     """
 
     positions: tuple[Position, ...]
@@ -91,7 +94,7 @@ class _Rest:
 
 
 class Acquisition:
-    """The test so far; `soak_s` is the wanted rest, `offset` the reading without a force."""
+    """A running test; `soak_s` is the wanted length of a rest, `offset` the reading at 0 g."""
 
     def __init__(self, n_positions: int, soak_s: float, offset: float = 0.0) -> None:
         self._n_wanted, self._soak_s, self._offset = n_positions, soak_s, offset
@@ -106,10 +109,10 @@ class Acquisition:
         # Samples kept until there are enough to choose the length of a cell.
         self._held: list[tuple[Ints, Floats]] | None = []
         self._readings: dict[str, list[Readings]] = {}
-        #: No later position begins before this stamp.
+        #: Stamp before which no later position begins.
         self.settled_ns = self._newest_ns = self._begin_ns = _EVER_NS
         self._n_looked = 0
-        # Mean of the position's first rest, which a later, quieter rest may exclude.
+        # Mean of the position's first rest; after a quieter rest the search no longer finds it.
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:
@@ -129,7 +132,7 @@ class Acquisition:
             samples = np.hstack([samples, block.imu.angular_velocity])
         if self._held is not None:
             self._held.append((stamp_ns, samples))
-            stamp_ns, samples = (np.concatenate(one) for one in zip(*self._held, strict=True))
+            stamp_ns, samples = (np.concatenate(part) for part in zip(*self._held, strict=True))
         if len(stamp_ns) >= _SAMPLES_TO_BEGIN or self._held is None:
             self._held = None
             rates = samples[:, 3:] if samples.shape[1] > 3 else None
@@ -157,7 +160,7 @@ class Acquisition:
 
     def _turn(self, cells: Cells) -> int | None:
         """Find where the sensor first rests in another direction than before [ns]."""
-        # Search only new cells and the end of the earlier ones.
+        # Search only the new cells and the last `_LOOKED_BACK` earlier cells.
         n_looked, self._n_looked = self._n_looked, len(cells.count)
         cells = cells.part(slice(max(n_looked - _LOOKED_BACK, 0), None))
         ranges = still_intervals(cells, self._rest_s)
@@ -171,7 +174,7 @@ class Acquisition:
             for lower, upper in still_intervals(behind, self._rest_s)
             if _noise(behind, [(lower, upper)]) < _LOUDEST * _noise(cells, ranges)
         ]
-        means = np.array([_mean(cells, [one]) for one in ranges])
+        means = np.array([_mean(cells, [bounds]) for bounds in ranges])
         if self._first is None:
             self._first = means[0]
         ups = self._directions(means)
@@ -186,8 +189,10 @@ class Acquisition:
         """End the position at a stamp; later samples belong to the next position."""
         self._rests.append(self._rest(self._cells(), end_ns))
         self._readings = {
-            name: [part for one in own if len((part := _part(one, end_ns, -_EVER_NS)).stamp_ns)]
-            for name, own in self._readings.items()
+            name: [
+                later for part in parts if len((later := _part(part, end_ns, -_EVER_NS)).stamp_ns)
+            ]
+            for name, parts in self._readings.items()
         }
         self._begin_ns, self._n_looked, self._first = end_ns, 0, None
         means = np.array([rest.mean for rest in self._rests if rest.n_rests]).reshape(-1, 3)
@@ -196,10 +201,10 @@ class Acquisition:
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
         """Combine the rests of the position, up to the begin of the next."""
         by_name = {
-            name: survey_thermometer([_part(one, _EVER_NS, end_ns) for one in own])
-            for name, own in self._readings.items()
+            name: survey_thermometer([_part(part, _EVER_NS, end_ns) for part in parts])
+            for name, parts in self._readings.items()
         }
-        surveys = {name: one for name, one in by_name.items() if one is not None}
+        surveys = {name: survey for name, survey in by_name.items() if survey is not None}
         end_s = (end_ns - cells.start_ns) * 1e-9 - 0.5 * cells.cell_s
         cells = cells.part(slice(int(np.searchsorted(cells.time, end_s))))
         ranges = still_intervals(cells, self._rest_s)
@@ -221,26 +226,27 @@ class Acquisition:
         """Return the state of the test, and what is missing."""
         cells = self._cells()
         rests = [*self._rests, self._rest(cells, -_EVER_NS)]
-        means = np.array([one.mean for one in rests])
+        means = np.array([rest.mean for rest in rests])
         ups = self._directions(means)
         one_g = np.sum((means - self._centre) * ups, axis=1)
-        noise = np.array([one.noise for one in rests]) / one_g
-        usual = float(np.median(noise[np.isfinite(noise)])) if np.isfinite(noise).any() else 1.0
-        sds = np.hypot(noise / np.sqrt([max(one.n, 1) for one in rests]), _FLOOR_SD)
+        noise = np.array([rest.noise for rest in rests]) / one_g
+        median = float(np.median(noise[np.isfinite(noise)])) if np.isfinite(noise).any() else 1.0
+        sds = np.hypot(noise / np.sqrt([max(rest.n, 1) for rest in rests]), _FLOOR_SD)
         positions: list[Position] = []
-        for up, rest, one, sd in zip(ups, rests, noise, sds, strict=True):
-            reason = self._reason(rest, up, one / usual, positions)
+        for up, rest, ratio, sd in zip(ups, rests, noise / median, sds, strict=True):
+            reason = self._reason(rest, up, ratio, positions)
             positions.append(
                 Position(up, rest.still_s, rest.n_rests, float(sd), rest.surveys, reason)
             )
         known = [position for position in positions if np.isfinite(position.up).all()]
-        seen = np.array([one.up for one in known]).reshape(-1, 3)
-        covariance = coverage.constants_covariance(seen, np.array([one.sd_g for one in known]))
+        seen = np.array([position.up for position in known]).reshape(-1, 3)
+        sds = np.array([position.sd_g for position in known])
+        covariance = coverage.constants_covariance(seen, sds)
         next_up = coverage.next_direction(covariance, known[-1].sd_g if known else _FLOOR_SD, seen)
         now, is_still = self._now(cells)
         hole, hole_deg = coverage.farthest(seen)
         n_good = sum(not position.reason for position in positions)
-        thermometers = _together([one.surveys for one in rests])
+        thermometers = _together([rest.surveys for rest in rests])
         missing = self._n_wanted - n_good
         findings = [f'{missing} of {self._n_wanted} positions are missing'] * (missing > 0)
         return Account(
@@ -268,9 +274,9 @@ class Acquisition:
         if noise > _RESTLESS:
             return 'restless'
         near = math.cos(math.radians(coverage.SAME_DIRECTION_DEG))
-        for number, one in enumerate(before, 1):
-            if not one.reason and float(one.up @ up) > near:
-                return f'as position {number}'
+        for number, earlier in enumerate(before, 1):
+            if not earlier.reason and float(earlier.up @ up) > near:
+                return f'repeats position {number}'
         if rest.still_s < self._soak_s:
             is_last = len(before) == len(self._rests)
             soak = (
@@ -306,18 +312,18 @@ def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
 
 
 def _together(surveys: Sequence[Surveys]) -> Surveys:
-    """Describe thermometers over several positions."""
+    """Combine the surveys of each thermometer in several positions."""
     by_name: dict[str, list[ThermometerSurvey]] = {}
-    for name, one in (item for survey in surveys for item in survey.items()):
-        by_name.setdefault(name, []).append(one)
+    for name, survey in (item for position in surveys for item in position.items()):
+        by_name.setdefault(name, []).append(survey)
     return {
         name: replace(
-            own[-1],
-            n=sum(one.n for one in own),
-            lowest=min(one.lowest for one in own),
-            highest=max(one.highest for one in own),
-            steepest_heating_k_min=max(one.steepest_heating_k_min for one in own),
-            steepest_cooling_k_min=min(one.steepest_cooling_k_min for one in own),
+            parts[-1],
+            n=sum(part.n for part in parts),
+            lowest=min(part.lowest for part in parts),
+            highest=max(part.highest for part in parts),
+            steepest_heating_k_min=max(part.steepest_heating_k_min for part in parts),
+            steepest_cooling_k_min=min(part.steepest_cooling_k_min for part in parts),
         )
-        for name, own in by_name.items()
+        for name, parts in by_name.items()
     }

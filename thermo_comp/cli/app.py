@@ -73,7 +73,7 @@ app.add_typer(_fleet)
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and leave the process with its exit code."""
     hold_standard_streams()
-    # Threads over small matrices wait for each other: up to 16 times slower on busy cores.
+    # With several BLAS threads small matrices take up to 16 times longer on busy cores.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that clean-up code runs
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
@@ -91,8 +91,8 @@ def run(arguments: list[str]) -> int:
     except _UsageMistake as mistake:
         context = getattr(mistake, 'ctx', None)
         command = 'thermo_comp' if context is None else context.command_path
-        if said := mistake.format_message():  # empty if typer has printed the help
-            output.error(f'{_plain(said, arguments)} (see: {command} --help)')
+        if message := mistake.format_message():  # empty if typer has printed the help
+            output.error(f'{_plain(message, arguments)} (see: {command} --help)')
         return int(mistake.exit_code)
     except typer.Abort:
         return 1
@@ -126,9 +126,9 @@ def _plain(message: str, arguments: list[str]) -> str:
         for word, following in zip(arguments, [*arguments[1:], ''], strict=True)
         if word.partition('=')[0] in (option[1], option[2])
     ]
-    said = ', '.join(map(repr, given))
+    values = ', '.join(map(repr, given))
     wanted = 'a whole number' if option[3] == 'integer' else 'a number with a point, as 9.8154'
-    return f'{option[1]}: expected {wanted}, got {said}'
+    return f'{option[1]}: expected {wanted}, got {values}'
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..unit.calibration import Calibration
 
 _BAG = argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
-_AS_THE_NODE = 'As the parameter of the node, in s.'
+_AS_THE_NODE = "As the node's parameter of this name, in s."
 
 
 def info(
@@ -63,11 +63,11 @@ def info(
         facts = 'rate_hz lowest highest steepest_heating_k_min steepest_cooling_k_min'
         out.table(
             ('sensor', 'Hz', 'min degC', 'max degC', 'max K/min', 'min K/min'),
-            [(name, *picked(one, facts).values()) for name, one in thermometers.items()],
+            [(name, *picked(readings, facts).values()) for name, readings in thermometers.items()],
         )
     out.points(survey.findings)
     if not survey.findings:
-        out.line('a fit can use it, together with other positions')
+        out.line('a fit can use this bag, together with bags of other positions')
     out.end(
         int(bool(bag.truncated)),
         path=path,
@@ -110,11 +110,11 @@ def _calibration(out: Output, path: Path) -> None:
         [
             (
                 name,
-                '{:.1f} .. {:.1f}'.format(*one.temperature_range_c),
-                '{:.2f} .. {:.2f}'.format(*one.rate_range_k_min),
-                *(one.x.bias_function.kind, one.x.scale_function.kind),
+                '{:.1f} .. {:.1f}'.format(*set_.temperature_range_c),
+                '{:.2f} .. {:.2f}'.format(*set_.rate_range_k_min),
+                *(set_.x.bias_function.kind, set_.x.scale_function.kind),
             )
-            for name, one in zip(('static', 'dynamic'), calibration.regime_sets(), strict=True)
+            for name, set_ in zip(('static', 'dynamic'), calibration.regime_sets(), strict=True)
         ],
     )
     if provenance.residuals:
@@ -139,8 +139,8 @@ def tell_nonlinearity(out: Output, calibration: 'Calibration') -> None:
     rows: list[tuple[Cell, ...]] = []
     for coefficient in nonlinear_coefficients(calibration):
         axes = zip(coefficient.value.tolist(), coefficient.sd.tolist(), strict=True)
-        said = [f'{value:.4g}' + f' +- {sd:.2g}' * isfinite(sd) for value, sd in axes]
-        rows.append((coefficient.name, coefficient.unit, *said))
+        cells = [f'{value:.4g}' + f' +- {sd:.2g}' * isfinite(sd) for value, sd in axes]
+        rows.append((coefficient.name, coefficient.unit, *cells))
     terms = calibration.nonlinearity.terms
     losses = ', '.join(f'{one.kind} {one.log_evidence_change:.1f}' for one in terms) or 'no term'
     low, high = calibration.nonlinearity.force_range_m_s2
@@ -201,7 +201,7 @@ def replay(
             progress=done,
         )
     info, counters = result.info, result.counters
-    out.told([(info.path, info.chosen, info.truncated)])
+    out.sources([(info.path, info.chosen, info.truncated)])
     for note in result.notes:
         out.note(f'{info.path}: {note}')
     counts = asdict(counters)
@@ -241,7 +241,7 @@ def play(
 
     The topics are published as accel/counts (or imu/uncompensated),
     temperature/board and temperature/case, whatever their names in the bag;
-    remap them after --ros-args. It ends when every reliable subscriber has
+    remap them after --ros-args. The playback ends when every reliable subscriber has
     received everything. For other topics, pauses and loops use ros2 bag play.
 
     Example:
@@ -261,7 +261,7 @@ def play(
         out.note(f'{name} had no subscriber')
     for name in report.lossy:
         out.note(f'{name} has a best-effort subscriber, which can lose messages')
-    out.told([(bag, report.info.chosen, report.info.truncated)])
+    out.sources([(bag, report.info.chosen, report.info.truncated)])
     out.table(('topic', 'messages'), sorted(report.n_messages.items()))
     out.line(f'played in {report.duration_s:.1f} s')
     out.end(messages=report.n_messages, **picked(report, 'duration_s unheard lossy'))

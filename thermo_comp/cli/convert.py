@@ -56,12 +56,11 @@ def convert(
     Convert a table of numbers, an autopilot's log or a bag.
 
     A column map names the columns and their units; the readings at rest must
-    agree with it. config/columns has examples. Without a map it is guessed
-    from the headings and printed; a table of [t] ax ay az [wx wy wz] needs no
-    headings. In a PX4 or ArduPilot log the IMU's temperature becomes the
-    board's, the barometer's the case's. In a bag the thermometer in the
-    namespace of the Imu becomes the board's, that of a
-    barometer the case's.
+    agree with it. config/columns has examples. If no map is given, it is
+    guessed from the headings and printed; a table of [t] ax ay az [wx wy wz]
+    needs no headings. The board temperature is the IMU's in a PX4 or ArduPilot
+    log, in a bag that of the thermometer in the namespace of the Imu topic; the
+    case temperature is that of the barometer.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -87,22 +86,22 @@ def convert(
         tell_guess(out, read)
         report = write_log(read, output, force, done)
     _tell_conversion(out, report, output)
-    found, further = report.log, dict(report.messages)
-    usual = {f'{name}_messages': further.pop(name) for name in ('accel', 'board', 'case')}
+    written, further = report.log, dict(report.messages)
+    n_messages = {f'{name}_messages': further.pop(name) for name in ('accel', 'board', 'case')}
     out.end(
         output=output,
         **picked(report, 'rows rate_hz duration_s believed stillness'),
-        **picked(found, 'input unit missing chosen hint'),
-        source=found.path,
-        start_ns=int(found.stamp_ns[0]),
-        **usual,
+        **picked(written, 'input unit missing chosen hint'),
+        source=written.path,
+        start_ns=int(written.stamp_ns[0]),
+        **n_messages,
         further_messages=further,
         **report.findings,
     )
 
 
 def _tell_conversion(out: Output, report: 'ConversionReport', output: Path) -> None:
-    """Print what was written, what was left out or is strange, and when the unit moved."""
+    """Print the numbers of messages written, the findings, and the times of movement."""
     from ..convert.log import SLOW_HZ
 
     log = report.log
@@ -131,7 +130,7 @@ def _tell_conversion(out: Output, report: 'ConversionReport', output: Path) -> N
         for stretch in report.stillness.moving_ns:
             begin, end = ((stamp_ns - int(log.stamp_ns[0])) * 1e-9 for stamp_ns in stretch)
             out.line(f'  {begin:9.1f} .. {end:.1f} s')
-    out.told([(log.path, log.chosen, log.missing)])
+    out.sources([(log.path, log.chosen, log.missing)])
 
 
 @contextmanager
@@ -141,7 +140,7 @@ def flags_named() -> Iterator[None]:
         try:
             yield
         except ValueError as mistake:
-            flag = re.sub(r'`(\w+)`', lambda one: f'--{one[1].replace("_", "-")}', str(mistake))
+            flag = re.sub(r'`(\w+)`', lambda name: f'--{name[1].replace("_", "-")}', str(mistake))
             raise ValueError(flag) from mistake
 
 
@@ -152,7 +151,7 @@ def tell_guess(out: Output, log: 'ForeignLog') -> None:
 
     if log.guessed is None:
         return
-    if log.guessed.format is None:  # recognised by its headings
+    if log.guessed.format is None:  # the table has known headings
         out.line(
             f'{log.path}: guessed column map; if it is wrong, edit it and give it as --columns'
         )
@@ -233,8 +232,8 @@ def import_(
     Thermal parameters of PX4 and ArduPilot give the bias over temperature;
     the files of imu_tk, imu_calib and Kalibr give bias, scale and
     misalignment. Both regimes get the same set. The input unit is that of
-    the file: m/s^2 (node: input:=imu), or counts. Fit bags of a thermal test
-    to get the rest.
+    the file: m/s^2 (node: input:=imu), or counts. The missing parts need a fit
+    to bags of a thermal test.
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml

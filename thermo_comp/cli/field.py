@@ -20,7 +20,7 @@ def update(
     output: Path = options.NEW_CALIBRATION,
     where: tuple[float | None, float] = options.place,
     ahead: float = option(
-        'Days until the next update; the uncertainty is aged by them.', 1.0, min=0.0, max=3650.0
+        'Days until the next update, by which the uncertainty is aged.', 1.0, min=0.0, max=3650.0
     ),
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -29,9 +29,9 @@ def update(
     Update a calibration in the field, by rests that the node has logged.
 
     The calibration is the prior, aged as far as the rests show; rests may
-    be in any attitude. Days left out judge the new file against the old.
-    It is written only if it is better beyond one standard error; otherwise
-    the exit code is 3.
+    be in any attitude. Old and new calibration are compared on days left out
+    of the update. The new file is written only if it is better by more than
+    one standard error; otherwise the exit code is 3.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -51,21 +51,21 @@ def update(
         ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),
         [
             (
-                one.axis,
-                *(micro_g(one.bias), micro_g(one.bias_sd)),
-                *(micro(1e6 * one.scale), micro(1e6 * one.scale_sd)),
-                *(micro_g(one.curve), micro_g(one.curve_sd)),
-                *(micro_g(one.reading), micro_g(one.reading_sd)),
-                f'{one.reading / one.reading_sd:+.1f}' if one.is_determined else 'not told',
+                axis.axis,
+                *(micro_g(axis.bias), micro_g(axis.bias_sd)),
+                *(micro(1e6 * axis.scale), micro(1e6 * axis.scale_sd)),
+                *(micro_g(axis.curve), micro_g(axis.curve_sd)),
+                *(micro_g(axis.reading), micro_g(axis.reading_sd)),
+                f'{axis.reading / axis.reading_sd:+.1f}' if axis.is_determined else 'unknown',
             )
-            for one in result.moved
+            for axis in result.moved
         ],
-        title=f'what moved by {len(result.series)} rests of {result.series.start[-1] + 1} starts '
-        '(at rest: of the axis as it lay)',
+        title=f'changes shown by {len(result.series)} rests in {result.series.start[-1] + 1} '
+        'starts (at rest: bias plus scale at the mean force of the rests)',
     )
     out.points(what_moved(result))
     out.line(str(result.judged))
-    is_better = result.judged.is_better and any(one.is_determined for one in result.moved)
+    is_better = result.judged.is_better and any(axis.is_determined for axis in result.moved)
     if is_better:
         save_calibration(result.calibration, output, overwrite=force)
         out.line(f'{output}: written')
@@ -88,7 +88,7 @@ def evaluate_rests(
     tolerance: float | None,
     out: Output,
 ) -> None:
-    """Watch the drift of a unit over a rest log; exit code 1 once it has left its claim."""
+    """Print the drift of a unit over a rest log; exit code 1 if it exceeds the claimed sd."""
     from ..field.series import read_rests, series_of
     from ..field.watch import LIMIT, watch
     from ..unit.calibration_file import load_calibration

@@ -38,13 +38,13 @@ def fit(
     output: Path = options.NEW_CALIBRATION,
     settings: dict[str, Any] = options.fitting,
     static_curve: Curve | None = option(
-        "Bias and scale over temperature; default: the model's.", metavar='CURVE'
+        "Curve of bias and scale over temperature; default: the model's.", metavar='CURVE'
     ),
-    dynamic_curve: Curve | None = option('The same for the dynamic set alone.', metavar='CURVE'),
+    dynamic_curve: Curve | None = option('Curve of the dynamic set alone.', metavar='CURVE'),
     groups: str | None = option('Groups allowed in the fit.', metavar='A,B'),
     force_groups: str = option('Groups kept regardless of the evidence.', '', metavar='A,B'),
     prior: Path | None = option(
-        'Prior: a calibration of the type, or an old one of the unit.', metavar='YAML'
+        'Prior: a calibration of the type, or an old calibration of the unit.', metavar='YAML'
     ),
     ageing_bias: str | None = option(
         'Assumed bias change (1 sd) since the prior calibration, as 50ug; default: estimated from '
@@ -93,14 +93,14 @@ def fit(
     if report is not None:
         check_output(report, PAGE, overwrite=force, others=[*inputs, output])
     if certificate_info is not None and report is None:
-        raise options.usage('--certificate-info fills the page of --report: give that, too')
+        raise options.usage('--certificate-info fills the page of --report: give both')
 
     def tell(log: 'ForeignLog') -> None:
         tell_guess(out, log)
-        out.told([(log.path, log.chosen, None)])
+        out.sources([(log.path, log.chosen, None)])
 
     with flags_named():
-        # Until the command ends.
+        # The temporary bags exist until the command ends.
         bags = context.with_resource(as_bags(bags, tell, columns=columns, rate_hz=rate_hz))
     sources, kind = fit_sources(bags, topics, known_force)
     info = None
@@ -124,7 +124,7 @@ def fit(
         )
     with out.progress('fitting') as done:
         result = run(sources, wanted, done)
-    out.told((bag.source.name, bag.info.chosen, bag.info.truncated) for bag in result.bags)
+    out.sources((bag.source.name, bag.info.chosen, bag.info.truncated) for bag in result.bags)
     save_calibration(result.calibration, output, overwrite=force)
     if report is not None:
         from ..report.evidence import evidence_of_fit
@@ -160,7 +160,7 @@ def prior(
     units = [load_calibration(path) for path in calibrations]
     common = population(units)
     save_calibration(common, output, overwrite=force)
-    out.line(f'{output}: what {len(units)} units have in common, {len(common.response)} columns')
+    out.line(f'{output}: prior from {len(units)} units, {len(common.response)} columns')
     bent = [unit.unit.serial for unit in units if unit.nonlinearity and unit.nonlinearity.terms]
     if bent:
         out.line(f'- the prior leaves out the nonlinear terms (K2, K3) of {", ".join(bent)}')
@@ -180,7 +180,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     calibration = result.calibration
     gyroscope = calibration.gyroscope if result.rates else None
     model, left_out = calibration.provenance.model, result.residuals[-1].left_out
-    n_positions = len(distinct_directions(np.array([one.up for one in result.positions])))
+    n_positions = len(distinct_directions(np.array([rest.up for rest in result.positions])))
     if verbose:
         _say_positions(out, result)
     _say_models(out, result.fit.selected.trials)
@@ -244,10 +244,10 @@ def _say_groups(out: Output, calibration: 'Calibration') -> None:
             ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
             [
                 (
-                    *(one.group, one.part, micro_g(one.explains_m_s2)),
-                    *(f'{one.effective_parameters:.1f}', f'{one.log_evidence_change:.1f}'),
+                    *(group.group, group.part, micro_g(group.explains_m_s2)),
+                    *(f'{group.effective_parameters:.1f}', f'{group.log_evidence_change:.1f}'),
                 )
-                for one in calibration.evidence
+                for group in calibration.evidence
             ],
             title='groups kept; log evidence: its loss if the group is removed',
         )
@@ -303,9 +303,9 @@ def _say_models(out: Output, trials: Sequence['Trial']) -> None:
         return
     names = [list(columns)[k] for k in kept]
     rows: list[tuple[Cell, ...]] = []
-    for one, row in zip(trials, left, strict=True):
-        first, *more = _wrapped(_named(one.groups))
-        mark = '*' if one.is_chosen else '~' if one.is_near else ''
+    for model, row in zip(trials, left, strict=True):
+        first, *more = _wrapped(_named(model.groups))
+        mark = '*' if model.is_chosen else '~' if model.is_near else ''
         rows.append((mark, *(row[k] for k in kept), first))
         rows += [('', *[''] * len(kept), line) for line in more]
     out.table(
@@ -317,7 +317,7 @@ def _say_models(out: Output, trials: Sequence['Trial']) -> None:
 
 
 def _named(groups: tuple[str, ...]) -> str:
-    """Name a model by its groups; all but the smallest have the curve."""
+    """Name a model by its groups beside the curve, which only the smallest model lacks."""
     if len(groups) < 2 or groups[0] != 'curve':
         return '+'.join(groups) or 'constants'
     return ''.join(f'+{group}' for group in groups[1:])

@@ -34,7 +34,7 @@ def fleet_fit(
         '--with-prior',
     ),
     earlier: list[Path] | None = option(
-        'fleet.parquet of an earlier fleet, to see drift.', metavar='TABLE'
+        'fleet.parquet of an earlier fit of the fleet, to show drift.', metavar='TABLE'
     ),
     topics: Any = options.reading,
     out: Output = options.out,
@@ -43,11 +43,11 @@ def fleet_fit(
     Fit every unit below a folder.
 
     Each folder of bags is a thermal test of a unit; bags directly in DIR are
-    sorted by the serial in them. Results go to OUT/units, the table to
+    sorted by the serial they hold. Results go to OUT/units, the table to
     OUT/fleet.parquet and .csv, its statistics to OUT/fleet.html, the prior of
     the valid units (as by `thermo_comp prior`) to OUT/prior.yaml. A second
-    run only does what is missing or has changed. Exit code 1 if a unit has no
-    valid calibration from all of its bags.
+    run fits only tests that are missing or have changed. Exit code 1 if a unit
+    has no valid calibration from all of its bags.
 
     Example:
       thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates
@@ -82,7 +82,7 @@ def fleet_fit(
                 tell=tell,
             )
         except KeyboardInterrupt:
-            out.note(f'interrupted: {state}, kept in {output}; the same command does the others')
+            out.note(f'interrupted: {state}, kept in {output}; the same command continues')
             raise
     _tell_result(out, result, with_prior)
     out.end(
@@ -107,11 +107,11 @@ def _tell_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
         ],
         title='|f| - g at rest, RMS',
     )
-    out.told((row['name'], str(row['chosen']), None) for row in result.rows)
+    out.sources((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
         # The reservations of a calibrated test also name the bags left out.
-        said = (row['problem'], row['reservations'] or row['left_out'])
-        out.points(f'{row["name"]}: {one}' for one in said if one)
+        text = (row['problem'], row['reservations'] or row['left_out'])
+        out.points(f'{row["name"]}: {one}' for one in text if one)
     out.points(
         f'{one.name}: {one.label} {one.value:.4g} {one.unit}, median {one.middle:.4g}: '
         f'{one.z:+.1f} sd'

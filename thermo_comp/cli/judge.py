@@ -28,7 +28,9 @@ def evaluate(
     ),
     judging: dict[str, Any] = options.judging,
     known_force: Any = options.force,
-    csv: Path | None = option('File for the windows, one a line.', metavar='FILE'),
+    csv: Path | None = option(
+        'Table of the windows to write, one window per line.', metavar='FILE'
+    ),
     topics: Any = options.reading_part,
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -40,7 +42,8 @@ def evaluate(
     one, with the uncertainty that the calibration claims for the same
     windows; six positions or more show which axis has moved. Exit code 0
     only if the calibration is shown to be valid. Rest logs of the node
-    instead of bags show the drift over the days and when the claim ends.
+    instead of bags show the drift over the days, and when it exceeds the
+    claimed uncertainty.
 
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
@@ -67,7 +70,7 @@ def evaluate(
     models = [(one.stem if is_named else str(one), load_calibration(one)) for one in calibration]
     with out.progress('evaluating') as done:
         result = run(bags, models, **judging, topics=topics, force=known_force, progress=done)
-    out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)
+    out.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)
     judged = result.judgements[models[0][0]]
     if csv is not None:
         with table_writer(csv, {}, overwrite=force) as write:
@@ -101,30 +104,30 @@ def evaluate(
 def _tell_axes(out: Output, judged: 'Judgement') -> None:
     """Print the thermal movement of each axis, and its shift where the positions show it."""
     columns = ['axis', 'static ug', 'dynamic ug']
-    title = 'what temperature moves each axis at rest (RMS of its windows)'
+    title = 'thermal drift of each axis at rest (RMS of its windows)'
     if judged.shifts:
         columns += ['bias ug', '+-', 'scale ppm', '+-']
         title += '; shift since the fit'
     axes = [[name, *map(micro_g, rms)] for name, rms in zip('xyz', judged.axis_rms.T, strict=True)]
-    for row, one in zip(axes, judged.shifts, strict=False):
-        row += [micro_g(one.bias), micro_g(one.bias_sd)]
-        row += [micro(1e6 * one.scale), micro(1e6 * one.scale_sd)]
+    for row, shift in zip(axes, judged.shifts, strict=False):
+        row += [micro_g(shift.bias), micro_g(shift.bias_sd)]
+        row += [micro(1e6 * shift.scale), micro(1e6 * shift.scale_sd)]
     out.table(columns, axes, title=title)
 
 
 def _tell_levels(out: Output, judged: 'Judgement') -> None:
-    """Print the residuals by |f|, where it was not gravity in all windows."""
+    """Print the residuals by |f|, if |f| was not gravity in all windows."""
     if judged.by_force:
         out.table(
             ('|f| g', 'windows', 'raw ug', 'RMS ug', 'mean ug', 'claimed ug'),
             [
                 (
-                    *(f'{size / STANDARD_GRAVITY:.4g}', one.n, micro_g(one.raw_rms)),
-                    *(micro_g(one.rms), micro_g(one.mean), micro_g(one.claimed_rms)),
+                    *(f'{size / STANDARD_GRAVITY:.4g}', section.n, micro_g(section.raw_rms)),
+                    *(micro_g(section.rms), micro_g(section.mean), micro_g(section.claimed_rms)),
                 )
-                for size, one in judged.by_force.items()
+                for size, section in judged.by_force.items()
             ],
-            title='residual by |f|: corrected magnitude less the known one',
+            title='residual by |f|: corrected magnitude less the known |f|',
         )
 
 
@@ -135,12 +138,12 @@ def _tell_drifts(out: Output, drifts: Sequence['Drift']) -> None:
             ('from', 'to', 'constant', 'change', '+-', 'unit', 'sure'),
             [
                 (
-                    *(one.earlier[:10], one.later[:10], one.constant, f'{one.change:+.3g}'),
-                    *(micro(one.sd), one.unit, 'yes' if one.is_sure else 'no'),
+                    *(diff.earlier[:10], diff.later[:10], diff.constant, f'{diff.change:+.3g}'),
+                    *(micro(diff.sd), diff.unit, 'yes' if diff.is_sure else 'no'),
                 )
-                for one in drifts
+                for diff in drifts
             ],
-            title='what drifted between the calibrations, in a soak at the reference temperature',
+            title='drift between the calibrations, in a soak at the reference temperature',
         )
 
 
@@ -150,28 +153,28 @@ def tell_sections(out: Output, judgements: Mapping[str, Any]) -> None:
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
         _sections(judgements, micro_g),
-        title=f'|f| - g over {window_s:g} s at rest; outside: of the calibrated ranges',
+        title=f'|f| - g over {window_s:g} s at rest; outside: beyond the calibrated ranges',
     )
 
 
 def _sections(
     judgements: Mapping[str, Any], shown: Callable[[float], str | None]
 ) -> list[tuple[Cell, ...]]:
-    """Return the residuals of each calibration by section, after the raw ones."""
+    """Return table rows: per section the raw residuals, then those of each calibration."""
     from ..judging.verdicts import SECTIONS
 
     rows: list[tuple[Cell, ...]] = []
     for section in SECTIONS:
         for number, (name, judgement) in enumerate(judgements.items()):
-            one = judgement.sections[section]
-            if not one.n:
+            part = judgement.sections[section]
+            if not part.n:
                 continue
             if not number:
-                raw = (shown(one.raw_rms), shown(one.raw_peak))
-                rows.append((section, 'raw', one.n, *raw, None, None))
-            left = (shown(one.rms), shown(one.peak), shown(one.claimed_rms))
-            ratio = f'{one.ratio:.2f}' if isfinite(one.claimed_rms) else None
-            rows.append((section, name, one.n, *left, ratio))
+                raw = (shown(part.raw_rms), shown(part.raw_peak))
+                rows.append((section, 'raw', part.n, *raw, None, None))
+            left = (shown(part.rms), shown(part.peak), shown(part.claimed_rms))
+            ratio = f'{part.ratio:.2f}' if isfinite(part.claimed_rms) else None
+            rows.append((section, name, part.n, *left, ratio))
     return rows
 
 
@@ -179,7 +182,7 @@ def report(
     output: Path = option('Page to write (HTML).', ..., '--output', '-o'),
     bags: list[Path] | None = options.JUDGED_BAGS,
     calibration: list[Path] | None = option(
-        'Calibration of the unit; more make its history (YAML).', None, '--calibration', '-c'
+        'Calibration of the unit (YAML); several give its history.', None, '--calibration', '-c'
     ),
     figures: Path | None = option('Folder for the figures as PNG files.', metavar='DIR'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
@@ -221,7 +224,7 @@ def report(
         )
     with options.usage_of():
         evidence = evidence_of_bags(opened, loaded, **judging, others=known[1:])
-    out.told((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in opened)
+    out.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in opened)
     write_report(evidence, output, info=info, figures=figures, overwrite=force)
     out.points(evidence.findings)
     judgement = evidence.judgement

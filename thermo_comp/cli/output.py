@@ -28,7 +28,7 @@ _NUMBER = re.compile(r'-|[-+]?\d+\.?\d*(e[-+]\d+)?')
 
 
 class Output:
-    """Where one command prints: tables and sentences, or one JSON object, or only errors."""
+    """The output of a command: tables and sentences, or one JSON object, or only errors."""
 
     def __init__(self, as_json: bool = False, quiet: bool = False) -> None:
         self.as_json, self.quiet = as_json, quiet
@@ -44,7 +44,7 @@ class Output:
         if not self.quiet:
             _print(f'thermo_comp: {text}', sys.stderr)
 
-    def told(self, bags: Iterable[tuple[object, str | None, str | None]]) -> None:
+    def sources(self, bags: Iterable[tuple[object, str | None, str | None]]) -> None:
         """Print the topics chosen in bags, once for equal choices, and the missing parts."""
         alike: dict[str, list[object]] = {}
         for bag, chosen, missing in bags:
@@ -54,9 +54,9 @@ class Output:
                 # A missing part sets the exit code, so it is printed even with --quiet.
                 _print(f'thermo_comp: {bag}: {missing}', sys.stderr)
                 self._is_torn = True
-        for said, names in alike.items():
+        for chosen, names in alike.items():
             more = f' and {len(names) - 1} more' if len(names) > 1 else ''
-            self.note(f'{names[0]}{more}: {said}')
+            self.note(f'{names[0]}{more}: {chosen}')
 
     def end(self, code: int = 0, /, **data: Any) -> None:
         """End a command: print its JSON if requested; exit with `code`, or 1 for a torn bag."""
@@ -65,10 +65,10 @@ class Output:
         if code or self._is_torn:
             raise typer.Exit(code or 1)
 
-    def points(self, found: Iterable[object]) -> None:
+    def points(self, findings: Iterable[object]) -> None:
         """Print findings, one per line."""
-        for one in found:
-            self.line(f'- {one}')
+        for finding in findings:
+            self.line(f'- {finding}')
 
     def table(self, head: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = '') -> None:
         """Print a table of aligned columns, numbers flush right; None is a dash."""
@@ -143,7 +143,7 @@ def text(cell: Cell) -> str:
 
 def micro(value: float) -> str:
     """Return a number of millionths as the tables show it."""
-    # Not -0.0.
+    # Adding 0.0 turns -0.0 into 0.0.
     return f'{round(value, 1) + 0.0:.1f}' if abs(value) < 99.95 else f'{value:.0f}'
 
 

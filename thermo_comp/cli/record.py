@@ -38,7 +38,7 @@ def record(
         'Bag that another recorder writes, instead of topics.', None, metavar='[BAG]'
     ),
     positions: int = option('Positions wanted.', 18, min=1, max=999),
-    soak: str = option('Rest wanted in each: 45min, 1.5h, 30s.', '45min'),
+    soak: str = option('Rest wanted in each position: 45min, 1.5h, 30s.', '45min'),
     serial: str | None = option(
         'Serial of the unit, for the bags.', callback=options.check_serial
     ),
@@ -70,7 +70,7 @@ def record(
     bags = PositionBags(output, serial)
     over = threading.Event()
     problems: Callable[[], Sequence[str]] = tuple
-    told: dict[str, str] = {}
+    collected: dict[str, str] = {}
     # A second signal ends the process at once.
     with SignalWatch() as signals, closing(bags), ExitStack() as stack:
         signals.on_signal(over.set)
@@ -82,12 +82,12 @@ def record(
 
             live = stack.enter_context(LiveTopics(topics=topics, ros_args=context.obj))
             news, problems = live.blocks(over.wait), lambda: live.problems
-            out.line('listening; Ctrl-C ends it with complete bags')
+            out.line('listening; Ctrl-C ends the recording with complete bags')
             sys.stdout.flush()  # the reader of a pipe waits for this line
         show = stack.enter_context(out.live())
         for account in _accounts(out, news, test, bags):
             if show is None:
-                _tell(out, account, problems(), told)
+                _tell(out, account, problems(), collected)
             else:
                 lines = [*problems(), _now(account), *_lines(account)]
                 show(_COLUMNS, _rows(account.positions), lines)
@@ -119,14 +119,14 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks as they come; yield the state of the test in each pause, until it is whole."""
+    """Write blocks as they come; yield the state of the test in each pause, until complete."""
     chosen: str | None = None
     for new in news:
         if new is not None:
             block, info = new
             if info is not None and info.chosen != chosen:
                 chosen = info.chosen
-                out.told([(info.path, chosen, None)])
+                out.sources([(info.path, chosen, None)])
             bags.add(block, info)
             for begin_ns in test.add(block):
                 bags.close(begin_ns)
@@ -156,7 +156,7 @@ def _end(
         command += f' --offset {offset:g}'
     out.line(f'{counted(len(written), "bag")} in {folder}')
     if written:
-        out.line('now fit them, with the local gravity in m/s^2:')
+        out.line('now fit the bags, with the local gravity in m/s^2:')
         out.line(f'  {command}')
     bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     out.end(
@@ -182,9 +182,9 @@ def _tell_leftovers(out: Output, folder: Path, is_finishing: bool) -> None:
         try:
             made = growing.finish(path, number)
         except RecordingError as error:
-            out.note(f'{error}: it cannot be completed')
+            out.note(f'{error}: the bag cannot be completed')
         else:
-            out.note(f'{made or "nothing"} is what was in {path.name}')
+            out.note(f'{path.name}: {f"completed as {made}" if made else "no messages in it"}')
 
 
 def _duration(text: str) -> float:
@@ -204,12 +204,12 @@ def _tell(out: Output, account: 'Account', problems: Sequence[str], last: dict[s
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
     # Ignore the reading after the semicolon, which always changes a little.
-    new = {name: said for name, said in news.items() if last.get(name) != said.partition(';')[0]}
-    for name, said in new.items():
-        last[name] = said.partition(';')[0]
-        out.note(f'{name}: {said}')
-    if any(said.startswith('good') for said in new.values()):
-        out.note(_worth(account))
+    new = {name: text for name, text in news.items() if last.get(name) != text.partition(';')[0]}
+    for name, text in new.items():
+        last[name] = text.partition(';')[0]
+        out.note(f'{name}: {text}')
+    if any(text.startswith('good') for text in new.values()):
+        out.note(_accuracy(account))
         out.note(_next(account))
 
 
@@ -247,7 +247,7 @@ def _next(account: 'Account') -> str:
     return f'next: {spoken_direction(account.next_up)}{by}'
 
 
-def _worth(account: 'Account') -> str:
+def _accuracy(account: 'Account') -> str:
     bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     parts = (
         f'{spoken(account.worst_sd_g * STANDARD_GRAVITY)} in the worst attitude',
@@ -255,14 +255,14 @@ def _worth(account: 'Account') -> str:
         f'scale {" ".join(micro(1e6 * value) for value in scale)} ppm',
         f'misalignment {" ".join(micro(1e6 * value) for value in misalignment)} urad',
     )
-    return f'known to {", ".join(parts)}'
+    return f'standard deviations: {", ".join(parts)}'
 
 
 def _lines(account: 'Account') -> list[str]:
     """Return the lines below the positions: state, and what is missing."""
     from ..fitting.coverage import spoken_direction
 
-    lines = [_worth(account)]
+    lines = [_accuracy(account)]
     if account.hole_deg > 0.0:
         where = spoken_direction(account.hole)
         lines.append(f'no position within {account.hole_deg:.0f} deg of {where}')

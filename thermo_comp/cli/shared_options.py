@@ -4,7 +4,7 @@
 Owns the options that several commands share, and their conversion to library arguments.
 
 The default of a command's parameter is an option, or a function that builds the parameter from
-several options; `expanded` passes all of these options to typer.
+several options; `expanded` passes all options to typer.
 """
 
 import inspect
@@ -24,8 +24,8 @@ from ..text import valid_serial
 from ..unit.gravity import parse_acceleration
 from .output import Output
 
-# The value of an option in `--help`, by its type: short, so that a terminal of 80 columns has room
-# for the longest name.
+# Placeholder of an option's value in `--help`, by its type: short, so that a terminal of 80
+# columns has room for the longest name.
 _VALUES: dict[Any, str] = {
     bool: ' ',
     **dict.fromkeys((int, int | None), 'N'),
@@ -48,7 +48,7 @@ def argument(text: str, default: Any = ..., **rules: Any) -> Any:
 
 
 def expanded(command: Callable[..., Any]) -> Any:
-    """Turn a command of built parameters into a function of options, as typer needs it."""
+    """Turn a command with parameters built from options into a function of the options."""
     makers: dict[str, Callable[..., Any]] = {}
     options: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
@@ -65,11 +65,12 @@ def expanded(command: Callable[..., Any]) -> Any:
             values[name] = make(**{key: values.pop(key) for key in keys})
         return command(**values)
 
-    for one in options:
-        if isinstance(one.default, typer.models.OptionInfo) and one.default.metavar is None:
-            one.default.metavar = _VALUES.get(one.annotation)
+    for parameter in options:
+        default = parameter.default
+        if isinstance(default, typer.models.OptionInfo) and default.metavar is None:
+            default.metavar = _VALUES.get(parameter.annotation)
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
-    run.__annotations__ = {one.name: one.annotation for one in options}
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in options}
     return run
 
 
@@ -100,7 +101,7 @@ def check_rate(rate_hz: float | None) -> float | None:
 FORCE = option('Overwrite an output of the same kind.', False, '--force', '-f')
 QUIET = option('Print nothing but errors.', False, '--quiet', '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
-JUDGED_BAGS = argument('Bags to judge it on.', None, metavar='[BAG]...')
+JUDGED_BAGS = argument('Bags to judge the calibration on.', None, metavar='[BAG]...')
 CERTIFICATE_INFO = option('Statements of the laboratory: number, customer, ... (YAML).')
 TABLE_RATE = option('Samples per second of a table without times.', min=0.01, callback=check_rate)
 SERIAL = option(
@@ -132,9 +133,9 @@ def names(
     topic: list[str] | None = option(
         'Topic of an input: counts, imu, board, case, temperature/NAME.', metavar='INPUT=TOPIC'
     ),
-    topics: Path | None = option('The same from a file, INPUT: TOPIC a line.', metavar='YAML'),
+    topics: Path | None = option('File of topics, a line INPUT: TOPIC for each.', metavar='YAML'),
 ) -> dict[str, str]:
-    """Collect the topics of `--topic`, and those of the file that it does not name."""
+    """Collect the topics of `--topic` and, for inputs not named there, of the file."""
     from ..recording.topics import parse_name, read_names
 
     named = {} if topics is None else read_names(topics)
@@ -237,9 +238,11 @@ def force(
         'Topic of the rotation rate about a vertical axis in rad/s, with --radius.',
         metavar='TOPIC[:FIELD]',
     ),
-    radius: float | None = option('Distance of the unit from that axis, in m.', min=1e-3),
+    radius: float | None = option(
+        'Distance of the unit from the axis of rotation, in m.', min=1e-3
+    ),
     radius_sd: float | None = option(
-        'Its standard deviation, in m: the radius is then estimated.', min=0.0
+        'Standard deviation of --radius, in m: the radius is then estimated.', min=0.0
     ),
 ) -> Any:
     """Build the statement of the user about |f|."""
@@ -282,8 +285,10 @@ def fitting(
         'are not all at 1 g, else none.',
         min=1e-6,
     ),
-    k3_sd: float | None = option('The same of the cubic one, in ug/g^3; default: 10.', min=1e-6),
-    allow: list[str] | None = option('Refusal to override, as its message names it.'),
+    k3_sd: float | None = option(
+        'Bound (1 sd) of the cubic nonlinearity, in ug/g^3; default: 10.', min=1e-6
+    ),
+    allow: list[str] | None = option('Name of a refusal to override, as in its message.'),
 ) -> dict[str, Any]:
     """Return the keywords of FitOptions."""
     given = locals()

@@ -30,7 +30,7 @@ def simulate(
         'Kind of unit: thermostatted, bare-quartz, mems, or demo (that of the sample bags).',
         'thermostatted',
     ),
-    unit_seed: int = option('Seed of the specimen of that kind.', 1, min=0),
+    unit_seed: int = option('Seed of the specimen of this kind of unit.', 1, min=0),
     plan: str | None = option(
         'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
         'tumble, tumble-3, tumble-1, held-out; on a rotation: centrifuge or rate-table.'
@@ -136,7 +136,7 @@ def _metadata(
         'serial': unit.serial,
         'simulated_by': f'thermo_comp {__version__}',
         'truth': json.dumps(truth),
-        **_said_force(station, gravity, is_known=is_known),
+        **_force_metadata(station, gravity, is_known=is_known),
     }
 
 
@@ -144,7 +144,7 @@ def _metadata(
 _RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
 
 
-def _said_force(station: 'Position', gravity: float, *, is_known: bool) -> dict[str, str]:
+def _force_metadata(station: 'Position', gravity: float, *, is_known: bool) -> dict[str, str]:
     """Return the metadata from which a fit learns |f| in a rotation."""
     from ..fitting import known_force
 
@@ -191,7 +191,9 @@ def _write(
     start_ns: int | None = None
     for run in runs:
         if start_ns is None:
-            first = [one[0] for one in (run.board_stamp_ns, run.case_stamp_ns) if len(one)]
+            first = [
+                stamps[0] for stamps in (run.board_stamp_ns, run.case_stamp_ns) if len(stamps)
+            ]
             start_ns = max(first) if len(first) == 2 else 0
         keep = run.accel_stamp_ns >= start_ns
         # Temperatures first: at equal stamps a reading precedes the sample.
@@ -199,7 +201,7 @@ def _write(
         writer.write_temperature(topics.case, run.case_stamp_ns, run.case)
         stamp_ns, counts = run.accel_stamp_ns[keep], run.counts[keep]
         if is_imu:
-            # Like a driver: scaled by the nominal scale factor.
+            # Scale the counts by the nominal scale factor, as a driver does.
             force, rate = counts / np.mean(unit.scale_factor), run.angular_rate
             rest = None if rate is None else ImuColumns.of_rate(rate[keep])
             writer.write_imu(topics.imu, stamp_ns, force, np.zeros(9), 'imu_link', rest)

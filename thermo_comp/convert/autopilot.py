@@ -8,13 +8,14 @@ surroundings: it becomes the case temperature, and the board's if the IMU has no
 simulator's log is refused: without noise the fit cannot weight its samples.
 
 PX4's ULog (``.ulg``): ``sensor_accel`` holds the driver's samples before PX4's corrections, with
-the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher rate. If it is
-missing, ``sensor_combined`` is used: after PX4's calibration, and without a temperature.
+the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher rate. If
+``sensor_accel`` is missing, ``sensor_combined`` is used: after PX4's calibration, and without a
+temperature.
 
 ArduPilot's DataFlash (``.BIN``): a message type per IMU in old logs (``IMU``, ``IMU2``), a type
 with an instance number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. Samples
 logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected. The
-parameter is followed over time; learning (2) corrects nothing, and sets it to 1 at its end.
+value 2 (learning) corrects nothing; ArduPilot sets it to 1 when learning ends.
 
 https://docs.px4.io/main/en/dev_log/ulog_file_format
 https://ardupilot.org/copter/docs/logmessages.html
@@ -77,7 +78,7 @@ def read_autopilot(
         with np.errstate(invalid='ignore', over='ignore'):
             imus, baros, compensated = read(path)
     except (ArithmeticError, LookupError, TypeError, ValueError) as failure:
-        # Formats that contradict their messages.
+        # The message formats declared in the file contradict its messages.
         raise RecordingError(f'damaged: {failure}', path=path) from failure
     rows = _instance(imus, imu, 'IMU', path)
     correction = compensated.get(min(imus, default=0) if imu is None else imu)
@@ -94,10 +95,10 @@ def read_autopilot(
     heard = {number: _reported(readings) for number, readings in baros.items()}
     if baro is None:
         heard = {number: readings for number, readings in heard.items() if len(readings.celsius)}
-    found = [_reported(temperature) for temperature in rows.temperatures.values()]
+    readings = [_reported(temperature) for temperature in rows.temperatures.values()]
     if heard or baro is not None:
-        found.append(_instance(heard, baro, 'barometer', path))
-    thinned = (one.thinned() for one in found if len(one.celsius))
+        readings.append(_instance(heard, baro, 'barometer', path))
+    thinned = (thermometer.thinned() for thermometer in readings if len(thermometer.celsius))
     named = zip(('board', 'case'), thinned, strict=False)
     return replace(rows, temperatures=dict(named))
 
@@ -141,16 +142,16 @@ def _ulog(path: Path) -> _Held:
     accels, gyros, hint = by_topic['sensor_accel'], by_topic['sensor_gyro'], ''
     compensated: dict[int, _Correction] = {}
     if not accels:
-        both = {number: _combined(one) for number, one in by_topic['sensor_combined'].items()}
-        accels, gyros = ({number: one[part] for number, one in both.items()} for part in (0, 1))
+        both = {number: _combined(pair) for number, pair in by_topic['sensor_combined'].items()}
+        accels, gyros = ({number: pair[part] for number, pair in both.items()} for part in (0, 1))
         hint = f'sensor_accel is missing, sensor_combined is after CAL_ACC*; {_PROFILE}'
         name = 'TC_A_ENABLE'
-        changes = [one for one in log.changed_parameters if one[1] == name]
+        changes = [parameter for parameter in log.changed_parameters if parameter[1] == name]
         correction = _Correction(
             name,
             [0, *(int(change[0]) * 1000 for change in changes)],
-            [float(log.initial_parameters.get(name, 0)), *(float(one[2]) for one in changes)],
-            f'it holds sensor_combined alone: {_PROFILE}',
+            [float(log.initial_parameters.get(name, 0)), *(float(row[2]) for row in changes)],
+            f'the log holds sensor_combined alone: {_PROFILE}',
         )
         compensated = dict.fromkeys(accels, correction)
     imus = {}
@@ -233,18 +234,18 @@ def _dataflash(path: Path) -> _Held:
         for name in sorted(reader.name_to_id):
             if not re.fullmatch(r'IMU\d?|BARO|BAR\d|PARM', name):
                 continue
-            found, n_short = _messages(reader, name, path)
-            stamp_us = found.get('TimeUS', found.get('TimeMS', np.empty(0)) * 1000.0)
-            if name == 'PARM' and found.keys() >= {'Name', 'Value'}:
-                for at, label, value in zip(stamp_us, found['Name'], found['Value'], strict=False):
+            table, n_short = _messages(reader, name, path)
+            stamp_us = table.get('TimeUS', table.get('TimeMS', np.empty(0)) * 1000.0)
+            if name == 'PARM' and table.keys() >= {'Name', 'Value'}:
+                for at, label, value in zip(stamp_us, table['Name'], table['Value'], strict=False):
                     title = label.decode('ascii', 'replace')
                     changes.setdefault(title, []).append((int(at) * 1000, float(value)))
                 continue
-            # The second IMU's old type is IMU2: counted from 1, the first without its number.
+            # In old logs the first IMU has the type IMU, the second IMU2.
             old = int(name[-1]) - 1 if name[-1].isdigit() else 0
-            found |= {'timestamp': stamp_us, 'I': found.get('I', np.full(len(stamp_us), old))}
-            for number in np.unique(found['I'][: len(stamp_us)]).tolist():
-                columns = {title: one[found['I'] == number] for title, one in found.items()}
+            table |= {'timestamp': stamp_us, 'I': table.get('I', np.full(len(stamp_us), old))}
+            for number in np.unique(table['I'][: len(stamp_us)]).tolist():
+                columns = {title: column[table['I'] == number] for title, column in table.items()}
                 stamp_ns = _stamps(columns)
                 readings = Readings(stamp_ns, _column(columns, 'T' if 'T' in columns else 'Temp'))
                 if not name.startswith('IMU'):
@@ -275,13 +276,15 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     """Read a message type: its columns, and the number of truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
-    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # numpy calls numbers as struct does
+    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # numpy has struct's codes
     kinds = [f'S{size or 1}' if code == 's' else f'<{code}' for size, code in codes]
     if len({*layout.columns}) < len(layout.columns):
         raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)
     kind = np.dtype(list(zip(layout.columns, kinds, strict=False)))
     if _HEADER_BYTES + kind.itemsize > layout.len:
-        raise RecordingError(f'damaged: the format of {name} is longer than it says', path=path)
+        raise RecordingError(
+            f'damaged: the format of {name} is longer than its stated length', path=path
+        )
     offsets = reader.offsets[number]
     begins = [at + _HEADER_BYTES for at in offsets if at + layout.len <= reader.data_len]
     content = b''.join(reader.data_map[at : at + kind.itemsize] for at in begins)
@@ -304,14 +307,14 @@ def _read(module: str, name: str, extra: str, what: str, path: Path, *arguments:
             raise RecordingError(f'not {what} ({failure})', path=path) from failure
 
 
-def _instance(found: Mapping[int, T], wanted: int | None, what: str, path: Path) -> T:
-    if not found:
+def _instance(present: Mapping[int, T], wanted: int | None, what: str, path: Path) -> T:
+    if not present:
         raise RecordingError(f'the log holds no {what}', path=path)
-    number = min(found) if wanted is None else wanted
-    if number not in found:
-        there = ', '.join(map(str, sorted(found)))
+    number = min(present) if wanted is None else wanted
+    if number not in present:
+        there = ', '.join(map(str, sorted(present)))
         raise RecordingError(f'the log holds no {what} {number}; there are: {there}', path=path)
-    return found[number]
+    return present[number]
 
 
 def _reported(readings: Readings) -> Readings:

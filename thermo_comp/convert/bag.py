@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..recording.chunks import translated
 from ..recording.reader import inspect_recording, read_recording
-from ..recording.topics import Present, Topics, said_choice
+from ..recording.topics import Present, Topics, choice_note
 from ..topics import IMU, TEMPERATURE
 from .log import ForeignLog
 
@@ -32,7 +32,7 @@ def bag_log(
     case: str | None = None,
     unit: Unit = 'm/s^2',
 ) -> ForeignLog:
-    """Read a bag; topics that are None are searched; `unit` is that of the Imu topic."""
+    """Read a bag; topics that are None are searched; `unit` is the unit of the Imu topic."""
     present = inspect_recording(path).topics
     with translated(path):
         inputs = find_topics(present, imu, board, case)
@@ -40,7 +40,7 @@ def bag_log(
     for (role, name), given in zip(inputs.items(), (imu, board, case), strict=True):
         among = 'only' if role == 'imu' else 'nearest'
         usual = given or getattr(Topics(), role)
-        chosen.append(said_choice(name, role, usual, among) if name else '')
+        chosen.append(choice_note(name, role, usual, among) if name else '')
     # '/none', which no topic has, stands for a missing thermometer.
     names = {role: name or '/none' for role, name in inputs.items()}
     recording = read_recording(path, Topics.named(names, input='imu'), require=('accel',))
@@ -81,7 +81,7 @@ def find_topics(
         case = _most(nearer, 'case')
     if board is None:
         beside = max((_shared(name, [imu]) for name in free()), default=0)
-        board = _most([one for one in free() if _shared(one, [imu]) == beside], 'board')
+        board = _most([topic for topic in free() if _shared(topic, [imu]) == beside], 'board')
     case = case or _most(free(), 'case')
     return {'imu': imu, 'board': board, 'case': case}
 
@@ -92,8 +92,10 @@ def _of_type(present: Present, kind: str) -> list[str]:
 
 def _shared(name: str, others: list[str]) -> int:
     """Largest number of leading namespaces that a topic shares with any of the others."""
-    own, *theirs = ({*PurePosixPath('/', one.strip('/')).parents} for one in (name, *others))
-    return max((len(own & one) for one in theirs), default=0)
+    namespaces, *theirs = (
+        {*PurePosixPath('/', topic.strip('/')).parents} for topic in (name, *others)
+    )
+    return max((len(namespaces & spaces) for spaces in theirs), default=0)
 
 
 def _most(names: list[str], what: str) -> str | None:

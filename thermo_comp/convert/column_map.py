@@ -5,8 +5,8 @@ Owns tables with a column map: the content and unit of each column, and the mess
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). The map of a table of numbers alone, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: times rise; readings at rest are gravity, which gives the unit;
-degrees per second taken for radians would be faster than any turn by hand.
+wz]`` as for imu_tk, is guessed: times rise; readings at rest are gravity, which gives the unit; an
+angular rate that would be faster in rad/s than any turn by hand is in deg/s.
 """
 
 from collections.abc import Sequence
@@ -105,7 +105,7 @@ class Further(Thermometer):
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """The whole map."""
+    """A column map: the columns of stamps, accelerometer, gyroscope and thermometers."""
 
     stamp: Stamp
     accel: Accel
@@ -118,10 +118,10 @@ class ColumnMap:
     serial: Annotated[str, Bounds(shortest=1)] | None = None
 
     def __post_init__(self) -> None:
-        if len({one.name for one in self.further}) < len(self.further):
+        if len({thermometer.name for thermometer in self.further}) < len(self.further):
             raise ValueError('`further` has two thermometers of one name')
         given = [*self.accel.columns, *(self.gyro.columns if self.gyro else ())]
-        given += [one.column for one in (self.board, self.case, *self.further) if one]
+        given += [sensor.column for sensor in (self.board, self.case, *self.further) if sensor]
         if twice := {str(name) for name in given if given.count(name) > 1}:
             raise ValueError(f'column {min(twice)!r} is given twice')
         if self.gyro is not None and self.accel.output == 'counts':
@@ -143,17 +143,17 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
     """Read all rows of a table by its column map; repeated temperatures are thinned."""
     accel, gyro = columns.accel, columns.gyro
     thermometers = {'board': columns.board, 'case': columns.case}
-    thermometers |= {one.name: one for one in columns.further}
-    said = {name: one for name, one in thermometers.items() if one is not None}
-    wanted = [*accel.columns, *(gyro.columns if gyro else ()), *(t.column for t in said.values())]
+    thermometers |= {thermometer.name: thermometer for thermometer in columns.further}
+    used = {name: column for name, column in thermometers.items() if column is not None}
+    wanted = [*accel.columns, *(gyro.columns if gyro else ()), *(t.column for t in used.values())]
     table = _read(path, list(dict.fromkeys(wanted)), columns.stamp, columns.format)
     stamp_ns = table.stamp_ns
     known = stamp_ns != NO_STAMP
     temperatures = {}
-    for name, one in said.items():
-        raw = one.degc_per_count or 0.0, one.degc_at_zero or 0.0
-        slope, offset = _CELSIUS.get(one.unit, raw)
-        celsius = table.values[one.column][known] * slope + offset
+    for name, thermometer in used.items():
+        raw = thermometer.degc_per_count or 0.0, thermometer.degc_at_zero or 0.0
+        slope, offset = _CELSIUS.get(thermometer.unit, raw)
+        celsius = table.values[thermometer.column][known] * slope + offset
         temperatures[name] = Readings(stamp_ns[known], celsius).thinned()
     rate = None
     if gyro is not None:
@@ -184,18 +184,18 @@ def _read(
 
 
 def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
-    """Guess the columns of a table, by headings if any; `rate_hz` is for one without times."""
+    """Guess the columns of a table, by headings if any; `rate_hz` is for a table without times."""
     table = _read(path, None, Stamp(rate_hz=1.0))
     named = read_headings(table.headings) if table.headings else _unnamed(path, len(table.values))
     if named is None or (named.time is None and rate_hz is None):
         lacks, instead = ('accelerometer', '') if named is None else ('time', '--rate-hz, or ')
         listed = ', '.join(map(repr, table.headings[:20]))
-        said = f'its headings name no {lacks}: {listed}' if listed else 'it has no times'
-        raise RecordingError(f'{said}; give {instead}{_A_MAP}', path=path)
+        problem = f'its headings name no {lacks}: {listed}' if listed else 'the table has no times'
+        raise RecordingError(f'{problem}; give {instead}{_A_MAP}', path=path)
     place = {name: number for number, name in reversed(list(enumerate(table.headings)))}
 
     def values(columns: Sequence[Column]) -> Floats:
-        return np.column_stack([table.values[place.get(str(one), one)] for one in columns])
+        return np.column_stack([table.values[place.get(str(col), col)] for col in columns])
 
     accel = values(named.accel)
     unit = named.accel_unit
@@ -221,7 +221,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
         build(Accel, {'columns': list(named.accel), 'unit': unit, 'output': output}),
         thermometers.pop('board', None),
         thermometers.pop('case', None),
-        tuple(Further(one.column, one.unit, name=name) for name, one in thermometers.items()),
+        tuple(Further(item.column, item.unit, name=name) for name, item in thermometers.items()),
         gyro,
         None if table.headings else Format(header=False),
     )
@@ -241,11 +241,11 @@ def _unnamed(path: Path, width: int) -> Headings:
 def spoken_columns(columns: ColumnMap) -> str:
     """Describe a column map in a line."""
     stamp = columns.stamp
-    said = [f'{stamp.rate_hz:g} Hz' if stamp.column is None else f'time [{stamp.unit}]']
-    said.append(f'x y z [{columns.accel.unit}]')
+    parts = [f'{stamp.rate_hz:g} Hz' if stamp.column is None else f'time [{stamp.unit}]']
+    parts.append(f'x y z [{columns.accel.unit}]')
     if columns.gyro is not None:
-        said.append(f'angular rate x y z [{columns.gyro.unit}]')
-    return ', '.join(said)
+        parts.append(f'angular rate x y z [{columns.gyro.unit}]')
+    return ', '.join(parts)
 
 
 def _stamp(
@@ -263,7 +263,7 @@ def _stamp(
     steps = np.diff(times[np.isfinite(times)])
     step = float(np.median(steps)) if len(steps) else 0.0
     is_time = len(steps) > 0 and (steps > 0.0).mean() > 0.9
-    # From the largest unit down: an interval of 5 is not plausible in s, but in ms.
+    # Take the largest unit that gives a plausible interval: 5 is not plausible in s, but in ms.
     longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
     for unit, exponent in STAMP_EXPONENTS.items():
         if is_time and _STEPS_S[0] < step * 10.0 ** (exponent - 9) < longest:

@@ -3,7 +3,7 @@
 """
 Owns the exchange with other tools: calibrations to the content of their files, and back.
 
-All of these tools correct a reading N by ``a = A (N - b)``. In autopilots b depends on temperature
+All tools correct a reading N by ``a = A (N - b)``. In autopilots b depends on temperature
 and A is 1; in tools for tumble tests both are constant. The notes of an export name the parts of a
 calibration that are lost, with the resulting error.
 """
@@ -45,8 +45,9 @@ def export_calibration(
     Write a calibration's static set as the file of one of `TOOLS`: its `text`, and `notes` on the
     lost parts.
 
-    `number` of the set or IMU, if the file numbers them; `device_id` by which PX4 matches the
-    sensor. With `up`, a unit vector, the scale's drift in this attitude is added to the offset.
+    `number` is the number of the set or IMU, if the file numbers them; PX4 matches the sensor by
+    `device_id`. With `up`, a unit vector, the scale's drift in this attitude is added to the
+    offset.
     """
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')
@@ -54,7 +55,7 @@ def export_calibration(
     text = TOOLS[to].write(content, number, device_id)
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
     # A note is a single line; imu_tk's reader knows no comments.
-    head = [] if to == 'imu_tk' else [f'# {one_line(said)}\n' for said in (title, *content.notes)]
+    head = [] if to == 'imu_tk' else [f'# {one_line(line)}\n' for line in (title, *content.notes)]
     return replace(content, text=''.join(head) + text)
 
 
@@ -87,7 +88,7 @@ def _content(
 
 
 class _Curves(NamedTuple):
-    """The static set over the calibrated temperatures: per axis a level, and n changes."""
+    """The static set: per axis a level, and its changes at n calibrated temperatures."""
 
     temperature: Floats
     K: Floats
@@ -111,8 +112,8 @@ def _static_curves(calibration: Calibration) -> _Curves:
         temperature,
         K,
         level=np.array([axis.bias + regime.delta for axis, regime in levels]),
-        bias=np.array([one.bias_function.value(t) for one in sets]) / K[:, None],
-        scale=np.array([one.scale_function.value(t) for one in sets]) - 1.0,
+        bias=np.array([curves.bias_function.value(t) for curves in sets]) / K[:, None],
+        scale=np.array([curves.scale_function.value(t) for curves in sets]) - 1.0,
     )
 
 
@@ -174,7 +175,7 @@ def _constant(calibration: Calibration, curves: _Curves) -> Content:
 
 
 def _cubics(d: Floats, offset: Floats) -> tuple[Floats, float]:
-    """Fit a cubic to the offset of each axis; return it and its largest error."""
+    """Fit a cubic to the offset of each axis; return the cubics and their largest error."""
     cubics = polynomial.polyfit(d, offset.T, 3)
     return cubics.T, float(np.max(np.abs(polynomial.polyval(d, cubics) - offset)))
 
@@ -184,18 +185,18 @@ def _losses(calibration: Calibration) -> list[str]:
     notes = []
     lost = sorted({term.group for term in calibration.response if any(term.bias + term.scale)})
     if lost:
-        worth = [one.explains_m_s2 for one in calibration.evidence if one.group in lost]
+        worth = [group.explains_m_s2 for group in calibration.evidence if group.group in lost]
         cost = f', up to {spoken(float(np.linalg.norm(worth)))} RMS' if worth else ''
         notes.append(
             f'the thermal response is lost ({", ".join(lost)}){cost}: heating and cooling read '
             'the same'
         )
     static, dynamic = (
-        [(one.delta, one.bias_function, one.scale_function) for one in regime.axes()]
+        [(axis.delta, axis.bias_function, axis.scale_function) for axis in regime.axes()]
         for regime in calibration.regime_sets()
     )
     if static != dynamic:
-        notes.append('the dynamic set is lost: the static one is used in ramps, too')
+        notes.append('the dynamic set is lost: the static set is used in ramps, too')
     if calibration.nonlinearity is not None and calibration.nonlinearity.terms:
         notes.append('the nonlinear terms over specific force are lost')
     return notes
@@ -216,7 +217,7 @@ def import_calibration(
     `number` chooses a set or IMU, None the only one. `full_scale` is in m/s^2.
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
-    content = next((one for one in readings if one is not None), None)
+    content = next((reading for reading in readings if reading is not None), None)
     if content is None:
         raise CalibrationError(
             'no TC_A* (PX4) or INS_TCAL* (ArduPilot) parameters in the text, nor the matrices of '
@@ -230,15 +231,15 @@ def import_calibration(
     is_si = bool((K < _NEAR_ONE).all() and (K > 1.0 / _NEAR_ONE).all())
     if not is_si and float(K.min()) < 10.0 / STANDARD_GRAVITY:
         raise CalibrationError(
-            f'it takes {K.min():.3g} units per m/s^2: neither m/s^2 nor counts; convert the '
+            f'the scale is {K.min():.3g} units per m/s^2: neither m/s^2 nor counts; convert the '
             'readings first'
         )
     (_, _, _), (yx, _, _), (zx, zy, _) = (matrix * K).tolist()
     if not is_si:
         # Samples in an offset code, as 32768, extend to both sides of the offset.
         full_scale = full_scale * float(K.max()) + float(np.abs(content.bias[:, 0]).max())
-    one = Polynomial((1.0,))
-    x_set, y_set, z_set = (unit.AxisSet(curve, one) for curve in _curves(content.bias))
+    unity = Polynomial((1.0,))
+    x_set, y_set, z_set = (unit.AxisSet(curve, unity) for curve in _curves(content.bias))
     regime = unit.RegimeSet(content.range_c, (-60.0, 60.0), x_set, y_set, z_set)
     gyroscope = None
     if content.rate_bias is not None:

@@ -44,7 +44,7 @@ class Headings:
 
 def read_headings(headings: Sequence[str]) -> Headings | None:
     """Find the columns by their names; None where no accelerometer is among them."""
-    names = {_plain(one): one for one in reversed(headings)}
+    names = {_plain(heading): heading for heading in reversed(headings)}
     times = [one for name, one in names.items() if _TIME.search(name)]
     triads = dict(_triads(names))
     accel = next((key for key in triads if _ACCEL.search(key)), '' if '' in triads else None)
@@ -102,6 +102,6 @@ def _triads(names: dict[str, str]) -> Iterator[tuple[str, tuple[str, str, str]]]
         for at in (match.start() for match in re.finditer('x', name)):
             three = [f'{name[:at]}{axis}{name[at + 1 :]}' for axis in 'xyz']
             key = f'{name[:at]}{name[at + 1 :]}'.replace('__', '_').strip('_')
-            if all(one in names for one in three) and not _OTHER.search(key):
-                x, y, z = (names[one] for one in three)
+            if all(heading in names for heading in three) and not _OTHER.search(key):
+                x, y, z = (names[heading] for heading in three)
                 yield key, (x, y, z)

@@ -35,12 +35,12 @@ Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 # thermal chamber adds some; 20 % is beyond both and far below the ratios between the units.
 PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
-# The usual sensitivities, from +-16 g to +-2 g of a 16-bit sensor.
+# Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12
-# Scatter / quiet level from which a cell is handled: the sd of 12 samples of noise stays within a
-# factor of 2 of its mean.
+# Ratio of a cell's scatter to the quiet level, above which the unit is handled: the sd of 12
+# samples of noise stays within a factor of 2 of its mean.
 _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements
 
@@ -61,7 +61,7 @@ class ForeignLog:
     accel: Floats  # in the stated unit; NaN if a cell is not a number, shape (n, 3)
     gyro: Floats | None = None  # [rad/s], shape (n, 3)
     temperatures: Mapping[str, Readings] = field(default_factory=dict)
-    line: Ints | None = None  # line of each row in the file, shape (n,); None: its number
+    line: Ints | None = None  # line of each row in the file, shape (n,); None: the row's number
     input: Literal['counts', 'imu'] = 'imu'  # type of the messages to write
     unit: Unit = 'm/s^2'
     counts_per_g: float | None = None
@@ -81,7 +81,7 @@ class Stillness:
     """Rests of a recording and the readings there, in its unit; NaN without a rest."""
 
     magnitude: float  # median |a| of the quiet cells
-    noise: float  # their median sd per axis
+    noise: float  # median sd per axis of the quiet cells
     still_s: float
     moving_ns: tuple[tuple[int, int], ...]  # begin and end of each movement
 
@@ -148,7 +148,7 @@ def write_log(
         accel=log.accel[usable],
         gyro=None if log.gyro is None else log.gyro[usable],
         temperatures={
-            name: one.take(_is_in_range(one.stamp_ns)) for name, one in log.temperatures.items()
+            name: part.take(_is_in_range(part.stamp_ns)) for name, part in log.temperatures.items()
         },
     )
     line, stamp_ns = line[usable], log.stamp_ns
@@ -265,8 +265,8 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
-    # The quiet level is the lower quartile: a log may be handled for most of its time. It is at
-    # least a quantum: a sensor with less noise shows none.
+    # The quiet level is the lower quartile: a log may be handled for most of its time. The level
+    # is at least a quantum: a sensor with less noise shows none.
     is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
     cell_ns = round(cells.cell_s * 1e9)
     moving: list[tuple[int, int]] = []
@@ -284,17 +284,17 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
 def believed_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
     """Infer the unit (or ``counts``, ``unknown``) from |a| at rest; return it and the reason."""
     if not np.isfinite(magnitude):
-        return 'unknown', 'it never rests, so its unit was not checked'
-    said = f'|a| at rest is {magnitude:.4g}'
+        return 'unknown', 'the sensor never rests, so its unit was not checked'
+    reading = f'|a| at rest is {magnitude:.4g}'
     for unit, gravity in PER_G.items():
         if abs(magnitude / gravity - 1.0) <= _TOLERANCE:
-            return unit, f'{said}, gravity is {gravity:.4g} {unit}'
+            return unit, f'{reading}, gravity is {gravity:.4g} {unit}'
     for sensitivity in _SENSITIVITIES:
         if abs(magnitude / sensitivity - 1.0) <= _TOLERANCE:
-            return 'counts', f'{said}, as of a sensor with {sensitivity} counts per g'
+            return 'counts', f'{reading}, as of a sensor with {sensitivity} counts per g'
     if magnitude > 50.0:
-        return 'counts', f'{said}, which is not gravity in g or m/s^2'
-    return 'unknown', f'{said}, which is not gravity in any known unit'
+        return 'counts', f'{reading}, which is not gravity in g or m/s^2'
+    return 'unknown', f'{reading}, which is not gravity in any known unit'
 
 
 def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> str | None:

@@ -36,26 +36,26 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
 
     Table: `columns` is the path of its column map (default: guessed), `rate_hz` the sample rate if
     it has no times. Log: `imu` and `baro` count from 0, `allow_compensated` accepts samples that
-    the autopilot has corrected. Bag: `topic` names ``imu``, ``board`` and ``case``, `unit` is that
-    of the Imu topic.
+    the autopilot has corrected. Bag: `topic` names ``imu``, ``board`` and ``case``, `unit` is the
+    unit of the Imu topic.
 
     Raises ValueError for a keyword that does not apply to this kind of file, RecordingError if the
     file cannot be read.
     """
     kind = kind_of(path)
-    said = {name: value for name, value in given.items() if value is not None}
-    for name in said:
+    keywords = {name: value for name, value in given.items() if value is not None}
+    for name in keywords:
         if name not in KEYWORDS[kind]:
             has = ', '.join(f'`{keyword}`' for keyword in KEYWORDS[kind])
             raise ValueError(f'a {kind} needs no `{name}`; it has {has}')
     if kind == 'bag':
-        names = said.pop('topic', {})
+        names = keywords.pop('topic', {})
         if not names.keys() <= {'imu', 'board', 'case'}:
             raise ValueError('`topic`: only imu, board and case of a bag are converted')
-        return bag.bag_log(path, **names, **said)
+        return bag.bag_log(path, **names, **keywords)
     if kind == 'log':
-        return autopilot.read_autopilot(path, **said)
-    columns, rate_hz = said.get('columns'), said.get('rate_hz')
+        return autopilot.read_autopilot(path, **keywords)
+    columns, rate_hz = keywords.get('columns'), keywords.get('rate_hz')
     if columns is not None and rate_hz is not None:
         raise ValueError('`rate_hz`: the column map holds the rate')
     if columns is not None:
@@ -68,7 +68,7 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
 def as_bags(
     paths: Sequence[Path], tell: Callable[[ForeignLog], None] = lambda _: None, **given: Any
 ) -> Iterator[list[Path]]:
-    """Convert tables and logs to temporary bags; `told` is called with each log."""
+    """Convert tables and logs to temporary bags; `tell` is called with each log."""
     others = [path for path in paths if path.is_file() and kind_of(path) != 'bag']
     if any(given.values()) and not others:
         flags = ' and '.join(f'`{name}`' for name in given)

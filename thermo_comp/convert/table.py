@@ -52,7 +52,7 @@ _Rows = Iterator[tuple[int, list[str]]]  # line number and cells of each row
 
 @dataclass(frozen=True)
 class Format:
-    """Layout of the text; None is detected."""
+    """Layout of a table of text; what is None is detected."""
 
     delimiter: Literal[',', ';', '|', 'tab', 'blank'] | None = None
     header: bool | None = None
@@ -74,7 +74,7 @@ class Stamp:
             raise ValueError('`unit` must be s, ms, us, ns or iso if `column` is given')
 
     def ticks(self, n: int) -> Ints:
-        """Return the stamps of rows at the fixed rate, shape (n,); rounding does not add up."""
+        """Return stamps of rows at the fixed rate, shape (n,); rounding does not accumulate."""
         steps: Ints = np.rint(np.arange(n) * (1e9 / (self.rate_hz or 1.0))).astype(np.int64)
         return steps + round(self.start_s * 1e9)
 
@@ -83,7 +83,7 @@ class Stamp:
 class Table:
     """Columns of a table, in file order, shape (n,)."""
 
-    line: Ints  # line of each row in the file, from 1; in Parquet its number
+    line: Ints  # line of each row in the file, from 1; in Parquet the row's number
     values: dict[Column, Floats]  # NaN if a cell is not a number
     stamp_ns: Ints  # `NO_STAMP` if a cell is not a number
     n_short: int = 0  # number of dropped rows with too few cells, as at a cut
@@ -117,17 +117,17 @@ def read_text(
 
 def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
-    Find the delimiter of a text table, which splits most lines into the same number of cells (a
-    blank is any run of white space), and this number. Only the lines at the end of the head count,
-    after the preamble of a logger; the last line may be cut.
+    Return the delimiter of a text table and the number of cells per row: the delimiter that splits
+    most lines into one number of cells (a blank is any run of white space). Only the last lines of
+    `head` count, because a logger's preamble may come first; the very last line may be cut.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = (lines[:-1] if len(lines) > 2 else lines)[-50:]
     candidates: list[tuple[int, str, int]] = []
-    for one in (',', ';', '\t', '|', ' ') if delimiter is None else (delimiter,):
-        widths = [_n_cells(row) for _, row in _rows(lines, one)]
+    for sign in (',', ';', '\t', '|', ' ') if delimiter is None else (delimiter,):
+        widths = [_n_cells(row) for _, row in _rows(lines, sign)]
         width = max(set(widths), key=widths.count, default=0)
-        candidates.append((widths.count(width) if width > 1 else 0, one, width))
+        candidates.append((widths.count(width) if width > 1 else 0, sign, width))
     return max(candidates, key=itemgetter(0))[1:]
 
 
@@ -264,7 +264,7 @@ def read_parquet(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, _style: Format | None = None
 ) -> Table:
     """
-    Read columns of a Parquet file as of text; its own timestamps state their unit.
+    Read columns of a Parquet file like `read_text`; Parquet's timestamps state their unit.
 
     If `columns` is None all columns are read; those without numbers become NaN.
     """
@@ -275,7 +275,9 @@ def read_parquet(
         with open_regular(path) as file:
             parquet = pq.ParquetFile(file)
             if parquet.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
-                raise RecordingError(f'it declares {parquet.metadata.num_rows} rows', path=path)
+                raise RecordingError(
+                    f'too small for its {parquet.metadata.num_rows} rows', path=path
+                )
             headings = list(parquet.schema_arrow.names)
             wanted = range(len(headings)) if columns is None else columns
             names = [*wanted] if stamp.column is None else [*wanted, stamp.column]
@@ -297,8 +299,8 @@ def read_parquet(
             if columns is None:
                 values[name] = np.full(table.num_rows, nan)
                 continue
-            said = f'column {name!r} holds {cells[name].type}'
-            raise RecordingError(said, path=path) from failure
+            problem = f'column {name!r} holds {cells[name].type}, expected numbers'
+            raise RecordingError(problem, path=path) from failure
         values[name] = np.asarray(column, dtype=np.float64)
     stamp_ns = stamp.ticks(table.num_rows)
     if stamp.column is not None:

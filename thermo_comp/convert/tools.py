@@ -44,7 +44,7 @@ _NAME = re.compile(r'\b(TC_[AG]\d_\w+|TC_[AG]_ENABLE|INS_TCAL\d_\w+|INS_(?:ACC|G
 _NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
 #: Reference and range assumed for files of triads, which do not state a temperature [degC].
 _REFERENCE_C, _RANGE_C = 20.0, (-60.0, 120.0)
-_TRIAD_NOTE = 'imported: constants of one temperature, used for all; no uncertainty'
+_TRIAD_NOTE = 'imported: constants of one temperature, used at all temperatures; no uncertainty'
 _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')
 
 
@@ -126,9 +126,9 @@ def _read_px4(text: str, number: int | None) -> Content | None:
     bias, reference, lower, upper = cubics(f'TC_A{number}_')
     rate_bias = None
     if values.get('TC_G_ENABLE', 1.0) == 1.0 and f'TC_G{number}_X1_0' in values:
-        rate_bias, its_own, *edges = cubics(f'TC_G{number}_')
-        # Common reference, and common range of both.
-        moved = np.polynomial.Polynomial((reference - its_own, 1.0))
+        rate_bias, rate_reference, *edges = cubics(f'TC_G{number}_')
+        # Give both sensors one reference temperature and their common range.
+        moved = np.polynomial.Polynomial((reference - rate_reference, 1.0))
         for row in rate_bias:
             coefficients = np.polynomial.Polynomial(row)(moved).coef
             row[:] = np.pad(coefficients, (0, 4 - len(coefficients)))
@@ -186,15 +186,15 @@ class _Parameters(dict[str, float]):
         raise CalibrationError('is missing', key=name)
 
 
-def _choose(found: set[int], number: int | None, is_in_use: Callable[[int], bool]) -> int:
+def _choose(numbers: set[int], number: int | None, is_in_use: Callable[[int], bool]) -> int:
     """Choose the set `number`, or the only set in use."""
     if number is None:
-        live = [n for n in sorted(found) if is_in_use(n)] or sorted(found)
+        live = [n for n in sorted(numbers) if is_in_use(n)] or sorted(numbers)
         if len(live) > 1:
             raise CalibrationError(f'several sets of parameters {live}: choose one')
         return live[0]
-    if number not in found:
-        raise CalibrationError(f'no set of parameters {number}, there is {sorted(found)}')
+    if number not in numbers:
+        raise CalibrationError(f'no set of parameters {number}, there is {sorted(numbers)}')
     return number
 
 
@@ -212,7 +212,7 @@ def _qr(matrix: Floats) -> tuple[Floats, Floats]:
 
 
 def turned(rotation: Floats) -> list[str]:
-    """Describe the rotation of our frame in theirs for tf; empty if there is none."""
+    """Describe the rotation of our frame in the other tool's for tf; empty if there is none."""
     if np.abs(rotation - np.eye(3)).max() < 1e-9:
         return []
     roll = np.arctan2(rotation[2, 1], rotation[2, 2])
@@ -223,7 +223,7 @@ def turned(rotation: Floats) -> list[str]:
 
 
 def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str:
-    """Write the three blocks of imu_tk's ``.calib``; its reader knows no comments."""
+    """Write the three blocks of imu_tk's ``.calib``; imu_tk's reader accepts no comments."""
     rotation, upper = _qr(content.matrix)
     scale = np.diag(upper)
     content.notes.extend(turned(rotation.T))

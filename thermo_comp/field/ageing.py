@@ -25,18 +25,19 @@ from ..unit.gravity import MICRO_G
 from .series import Series
 
 #: Centres of the priors relative to the turn-on offset: random walk of the bias, and of the scale
-#: times g, per root day; scatter of a rest. Sd of their logarithms: a factor of 5 either way.
+#: times g, per root day; scatter of a rest. Sd of the logarithms of all priors: a factor of 5
+#: either way.
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
-#: Candidates of the prior sd of a jump [m/s^2].
+#: Prior standard deviations tried for a jump of the levels [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: Relative sizes of a jump in the biases and in the scales times g, which a shock changes less.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
-#: Candidates of the prior sd of a change of a curve's slope [m/s^2 per K].
+#: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
 #: Largest number of rows of a start in the solution, and in the search of the variances; largest
-#: number of rows in the search, whose time grows with its cube.
+#: number of all rows in the search, whose time grows with the cube of this number.
 _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
 
 
@@ -58,7 +59,7 @@ class Ageing:
 
 @dataclass(frozen=True)
 class Change:
-    """A jump of the levels at `time` [days since 1970]; None for a change of the curve."""
+    """A jump of the levels at `time` [days since 1970], or, with None, a change of the curve."""
 
     time: float | None
     sd: float
@@ -95,7 +96,7 @@ class Rows:
     rank: Ints
 
     def at(self, chosen: Bools) -> Rows:
-        """Return some of the rows."""
+        """Return the chosen rows."""
         return Rows(**{name: value[chosen] for name, value in vars(self).items()})
 
 
@@ -109,7 +110,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # With this normalisation the sum of n equal rests is sqrt(n) times one of them.
+        # With this normalisation the sum of n equal rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
         mean = np.full(Q.shape[1], series.temperature[at].mean() - series.reference_temperature)
         parts.append(
@@ -204,7 +205,7 @@ class Model:
                 )
                 for shares in ((0.1, 0.1, 1.0, 0.3), (1.0, 1.0, 0.3, 0.1))
             ),
-            key=lambda one: one.fun,
+            key=lambda result: result.fun,
         )
         ageing = Ageing(*np.exp(best.x).tolist())
         factor = cho_factor(self.covariance(ageing), lower=True)
@@ -238,7 +239,7 @@ def learn(series: Series, calibration: Calibration, since: float) -> tuple[Agein
             model = Model(few, calibration, since, changes)
             ageing, inverse = model.fitted(centre)
             best = max(
-                _candidates(model, inverse), key=lambda one: one.log_bayes_factor, default=None
+                _candidates(model, inverse), key=lambda jump: jump.log_bayes_factor, default=None
             )
             if best is None or best.log_bayes_factor < 5.0 or len(changes) == 4:
                 break
@@ -288,7 +289,7 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
 
 
 def _log_bayes_factor(precision: Floats, pull: Floats, sd: float) -> float:
-    """Return the gain in log evidence by a change of this prior sd, with all else integrated."""
+    """Return the gain in log evidence by a change of prior sd `sd`, marginal over all else."""
     inner = np.eye(len(pull)) + sd**2 * precision
     gain = 0.5 * sd**2 * pull @ np.linalg.solve(inner, pull)
     return float(gain - 0.5 * np.linalg.slogdet(inner)[1])

@@ -57,7 +57,7 @@ class RestFinder:
         self._run: list[_Second] = []
         self._states: list[tuple[Sequence[float], Sequence[float]]] = []
         self._n_windows = 0
-        self._last: list[_Second] = []  # the last second of the window before
+        self._last: list[_Second] = []  # the last second of the previous window
 
     def add(self, stamps: Stamps, samples: Floats) -> list[Rest]:
         """Take samples with rising stamps, (n, 3), or (n, 6) with the rate; return new rests."""
@@ -111,15 +111,15 @@ class RestFinder:
             return False
         change = LARGEST_CHANGE + 4.0 * np.sqrt(2.0 * self._noise / (3.0 * n))
         return all(
-            (np.abs(second.mean[:3] - one.mean[:3]) <= change * np.abs(self._scale)).all()
-            for one in (self._run[-1:] or self._last) + self._run[:1]
+            (np.abs(second.mean[:3] - other.mean[:3]) <= change * np.abs(self._scale)).all()
+            for other in (self._run[-1:] or self._last) + self._run[:1]
         )
 
     def _window(self) -> Rest:
-        n = sum(one.n for one in self._run)
-        weights = np.array([one.n for one in self._run]) / n
-        mean = weights @ np.array([one.mean for one in self._run])
-        within = sum(one.squares - one.total[:3] ** 2 / one.n for one in self._run)
+        n = sum(second.n for second in self._run)
+        weights = np.array([second.n for second in self._run]) / n
+        mean = weights @ np.array([second.mean for second in self._run])
+        within = sum(second.squares - second.total[:3] ** 2 / second.n for second in self._run)
         states, shares = (np.array(part) for part in zip(*self._states, strict=True))
         return Rest(
             self._run[0].number * _SECOND_NS + SECONDS * _SECOND_NS // 2,

@@ -62,7 +62,7 @@ def encode(one: Start | Rest) -> bytes:
         *memory, rates = vars(one.memory).values()
         data: Any = {**vars(one), 'memory': [*memory, rates] if rates else memory}
     else:
-        # Nine digits: a resolution of 0.001 counts for a converter of 24 bits.
+        # Nine digits resolve 0.001 counts of a 24-bit converter.
         data = [
             [float(f'{value:.9g}') for value in part] if isinstance(part, tuple) else part
             for part in astuple(one)
@@ -118,7 +118,7 @@ def _rest(data: list[Any], memory: MemorySpec) -> Rest:
 
 
 def _number(value: float) -> float:
-    # The bound is far above any sample.
+    # 1e12 is far above any sample.
     if not abs(value) < 1e12:
         raise ValueError(value)
     return float(value)
@@ -165,7 +165,7 @@ def rests_of(
     everything: dict[tuple[int, int], tuple[Start, Rest]] = {}
     n_damaged = 0
     for content in contents:
-        found, n = decode(content)
+        rests, n = decode(content)
         n_damaged += n
-        everything |= {(s.start_ns, r.stamp_ns): (s, r) for s, r in found if is_wanted(s)}
+        everything |= {(s.start_ns, r.stamp_ns): (s, r) for s, r in rests if is_wanted(s)}
     return [everything[key] for key in sorted(everything)], n_damaged

@@ -73,7 +73,7 @@ class Series:
         return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
 
     def at(self, chosen: Bools | slice) -> Series:
-        """Return some of the rests; starts are numbered anew."""
+        """Return the chosen rests; their starts are numbered anew."""
         parts: dict[str, Any] = {
             name: value[chosen]
             for name, value in vars(self).items()
@@ -100,8 +100,8 @@ def read_rests(
 
     Returns the rests, the provenance of an update aged `ahead` days, and notes for the user.
 
-    Rests before the calibration are left out, unless all are; for an update those of an earlier
-    one always are. Raises RecordingError if no rest of the unit is left.
+    Rests before the calibration are left out, unless all rests are before it; for an update, rests
+    that an earlier update used are always left out. Raises RecordingError if no rest is left.
     """
     files: list[Path] = []
     for path in paths:
@@ -119,7 +119,7 @@ def read_rests(
         return is_own
 
     try:
-        # A day of the node has at most 320 kB; the bound is 64 MB.
+        # The node writes at most 320 kB a day; a file of up to 64 MB is read.
         contents = [read_bounded(file, 1 << 26) for file in files]
     except (OSError, ValueError) as error:
         reason = getattr(error, 'strerror', None) or str(error)
@@ -149,7 +149,7 @@ def read_rests(
 
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
-    """Describe rests for the provenance of an update: its name says their end and `ahead`."""
+    """Describe rests for the provenance of an update: the name holds their end and `ahead`."""
     end = np.datetime64(rests[-1][1].stamp_ns, 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
@@ -172,7 +172,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
         ahead = float(aged.removesuffix(' d') or 0.0)
     except ValueError:
         return -np.inf, -np.inf, False
-    # A file that says it was aged by a century or more is invalid.
+    # A covariance aged by a century or more makes the file invalid.
     if np.isnat(moment) or not 0.0 <= ahead < 36525.0:
         return -np.inf, -np.inf, False
     begin = int(moment.astype(np.int64)) / _DAY_NS
@@ -182,10 +182,10 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
 def series_of(
     rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
 ) -> Series:
-    """Evaluate rests at the logged or given gravity; RecordingError if they lack a lag."""
+    """Evaluate rests at the logged or given gravity; RecordingError if their log lacks a lag."""
     correction = Correction(calibration)
     layout, K = Layout(correction.memory), correction.K[:, 0]
-    places = {one: _places(one, correction.memory) for one in {s.memory for s, _ in rests}}
+    places = {spec: _places(spec, correction.memory) for spec in {s.memory for s, _ in rests}}
     n_lags = len(correction.memory.lags)
     states = np.array([np.array(r.state)[places[s.memory][0]] for s, r in rests])
     states = states.reshape(len(rests), layout.width)
@@ -206,7 +206,7 @@ def series_of(
     first = np.searchsorted(group, np.arange(len(sizes)))
     states, mean = averaged(states), averaged(mean)
     shares, local = averaged(shares.reshape(len(rests), n_lags)), averaged(local)
-    bias, scale = (one.T for one in correction.bias_scale(states.T))
+    bias, scale = (part.T for part in correction.bias_scale(states.T))
     x = (mean - bias) / scale
     if correction.of_force is not None:
         x = correction.of_force.linearise(x, states[:, BOARD])
@@ -219,7 +219,7 @@ def series_of(
     noise = (v**2 * white).sum(axis=1) / sizes
     bare = SlowUncertainty(replace(calibration, posterior=None), correction)
     whole = SlowUncertainty(calibration, correction)
-    slow, claim = (_along(correction, states, shares, one, v, x) for one in (bare, whole))
+    slow, claim = (_along(correction, states, shares, model, v, x) for model in (bare, whole))
     unexplained = np.broadcast_to(correction.curves.unexplained(states[:, BOARD])[0].T, x.shape)
     slow -= (v**2 * unexplained).sum(axis=1)
     residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
@@ -258,8 +258,8 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     """
     Assign windows to groups of consecutive windows that are averaged, at most 60.
 
-    The windows of a group have the same start. Their direction differs by less than 1e-3 rad and
-    their temperature by less than 1 K from the first; the norm of a mean of vectors is smaller by
+    The windows of a group have the same start. Direction and temperature differ by less than 1e-3
+    rad and 1 K from those of the first window; the norm of a mean of vectors is smaller by
     half the squared angle.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))

@@ -122,7 +122,7 @@ def update(
         )
     _, aged, is_update = valid_since(calibration)
     first, last = float(series.time[0]), float(series.time[-1])
-    # The random walk begins at the end of the aged covariance, or at the first rest without one.
+    # The random walk begins where the aged covariance ends or, without ageing, at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since)
     to_file, bend = _levels(calibration), _slopes(calibration)
@@ -130,7 +130,7 @@ def update(
     determined, moved = _moved(used, calibration, solution)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
-    # Parameters that are not updated have the omitted shift as an additional error.
+    # For parameters that are not updated, the omitted shift is an additional error.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
     axis_determined = [change.is_determined for change in moved]
@@ -212,7 +212,7 @@ def _moved(
         rows[1, scale.rows] = regressors[axis + 3][:, 0] * gravity
         rows[2, bias.rows] = (regressors[axis] @ [0.0, -1.0, 1.0]) / K
         rows[3] = rows[0] + rows[1] * float(weights @ series.force[:, axis]) / gravity
-        prior, posterior = (rows @ one @ rows.T for one in (solution.prior, solution.posterior))
+        prior, posterior = (rows @ P @ rows.T for P in (solution.prior, solution.posterior))
         jitter = 1e-12 * np.trace(prior[:2, :2]) * np.eye(2) + 1e-30 * np.eye(2)
         ratio = eigh(posterior[:2, :2], prior[:2, :2] + jitter, eigvals_only=True)[0]
         is_determined = bool(ratio <= 0.6**2)
@@ -222,12 +222,12 @@ def _moved(
         of_scale = change[1] / gravity, sd[1] / gravity
         values = (change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3])
         shifts.append(Moved(name, is_determined, *map(float, values)))
-    determined[layout.misalignment :] = all(one.is_determined for one in shifts)
+    determined[layout.misalignment :] = all(shift.is_determined for shift in shifts)
     return determined, tuple(shifts)
 
 
 def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score updates by the earlier rests on each day, with fewer than five days on each start."""
+    """Score updates by earlier rests on each day; below five days, on each start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -281,16 +281,16 @@ def what_moved(result: Update) -> list[str]:
     """Describe the ageing, the changes, and the axes that the rests do not determine."""
     ageing = result.ageing
     lines = [
-        f'bias walks {spoken(ageing.bias)} and scale '
-        f'{1e6 * ageing.scale / result.calibration.gravity_m_s2:.2g} ppm per root day; a start '
-        f'differs by {spoken(ageing.turn_on)}, a rest by {spoken(ageing.rest)}'
+        f'random walk of the bias {spoken(ageing.bias)}, of the scale '
+        f'{1e6 * ageing.scale / result.calibration.gravity_m_s2:.2g} ppm per root day; '
+        f'scatter of starts {spoken(ageing.turn_on)}, of rests {spoken(ageing.rest)}'
     ]
     for change in result.changes:
         if change.time is None:
             lines.append('the curves of the bias have changed')
         else:
             day = np.datetime64(int(change.time * 86400.0), 's')
-            lines.append(f'a jump before {day}: a shock, not ageing')
+            lines.append(f'the bias jumped before {day}: a shock, not ageing')
     undetermined = [change.axis for change in result.moved if not change.is_determined]
     if undetermined:
         lines.append(

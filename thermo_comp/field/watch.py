@@ -19,7 +19,7 @@ from .ageing import Ageing
 from .series import Series
 from .update import update
 
-#: Bound of the claim in claimed standard deviations.
+#: Largest error that agrees with the claim, in claimed standard deviations.
 LIMIT = 2.0
 #: Probabilities of the forecast, and its horizon [days].
 _QUANTILES, _HORIZON = (0.1, 0.5, 0.9), 3650.0
@@ -68,7 +68,7 @@ class Watch:
 
     @property
     def exit_code(self) -> int:
-        """1 once the unit has left its claim."""
+        """1 if the error of the unit exceeds the claim, else 0."""
         return 1 if self.left else 0
 
     def __str__(self) -> str:
@@ -80,7 +80,7 @@ class Watch:
             text = f'within its claim up to {self.last}, outside from about {self._date(1)}'
             text += f' (10 to 90 %: {self._date(0)} .. {self._date(2)})'
         if self.interval:
-            low, middle, high = (f'{min(one, _HORIZON):.0f}' for one in self.interval)
+            low, middle, high = (f'{min(days, _HORIZON):.0f}' for days in self.interval)
             text += f'; recalibration interval {middle} days ({low} .. {high})'
         return text
 
@@ -92,15 +92,15 @@ class Watch:
 
 
 def watch(series: Series, calibration: Calibration, tolerance: float | None = None) -> Watch:
-    """Compare rests with the claim or a tolerance of ``|f| - g`` [m/s^2]; forecast its end."""
+    """Compare rests with the claim or a tolerance of ``|f| - g`` [m/s^2]; forecast the excess."""
     names = np.array([str(np.datetime64(int(day), 'D')) for day in series.day])
     ordered = np.unique(names)
     days = _rows(series, names, ordered.tolist(), tolerance)
     together = -(-len(ordered) // _PERIODS)
     firsts = ordered[np.searchsorted(ordered, names) // together * together]
     lower = np.floor(series.temperature / _CLASS_K) * _CLASS_K
-    classes = [f'{one:g} .. {one + _CLASS_K:g} degC' for one in lower]
-    warmer = [f'{one:g} .. {one + _CLASS_K:g} degC' for one in np.unique(lower)]
+    classes = [f'{edge:g} .. {edge + _CLASS_K:g} degC' for edge in lower]
+    warmer = [f'{edge:g} .. {edge + _CLASS_K:g} degC' for edge in np.unique(lower)]
     is_out = [not row.is_within for row in days]
     # Two days in a row are required: on a single day the unit may have been disturbed.
     n_out = ([*is_out[::-1], False]).index(False)
@@ -113,7 +113,7 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         ageing, used, solution = updated.ageing, updated.series, updated.solution
         recent = used.at(used.start == used.start[-1])
         of_parameters, of_levels = (
-            one.mean(axis=0) for one in (recent.by_parameter, recent.by_level)
+            column.mean(axis=0) for column in (recent.by_parameter, recent.by_level)
         )
         error = float(of_parameters @ solution.shift)
         variance = max(float(of_parameters @ solution.posterior @ of_parameters), 0.0)
@@ -146,11 +146,11 @@ def passage(error: float, sd: float, rate: float, bound: float) -> tuple[float, 
     """
     Return quantiles of the time [days] after which a random walk first exceeds a bound.
 
-    It begins at N(error, sd^2) and has the variance `rate` per day. From x the probability of
-    being inside (-c, c) until t is ``sum_k 4 / (k pi) sin(k pi (x + c) / 2 c) exp(-(k pi)^2 rate t
-    / 8 c^2)`` over odd k.
+    The walk begins at N(error, sd^2) and its variance grows by `rate` per day. A walk from x stays
+    inside (-c, c) until t with the probability ``sum_k 4 / (k pi) sin(k pi (x + c) / 2 c) exp(-(k
+    pi)^2 rate t / 8 c^2)`` over odd k.
     """
-    # 60 terms are sufficient from a thousandth of the median on.
+    # 60 terms of the sum suffice for times above a thousandth of the median.
     k = np.arange(1, 120, 2) * np.pi
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     inside = np.abs(x := error + sd * nodes) < bound

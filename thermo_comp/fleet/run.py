@@ -102,14 +102,14 @@ def fit_fleet(
         prior, no_prior = _common(list(rows.values()), results)
         if with_prior and prior is not None:
             rest = [
-                one
-                for one in units
-                if not _speaks(row := rows[one.name]) and row['verdict'] != FAILED
+                unit
+                for unit in units
+                if not _speaks(row := rows[unit.name]) and row['verdict'] != FAILED
             ]
             again = fitted(rest, replace(options, fit=replace(options.fit, prior=prior)))
             for name, row in again.items():
-                said = rows[name]['reservations'], f'not fitted with the prior: {row["problem"]}'
-                kept = {'reservations': '; '.join(map(str, filter(None, said)))}
+                notes = rows[name]['reservations'], f'not fitted with the prior: {row["problem"]}'
+                kept = {'reservations': '; '.join(map(str, filter(None, notes)))}
                 rows[name] = row if is_fitted(row) else {**rows[name], **kept}
     ordered = tuple(rows[unit.name] for unit in units)
     summary = summarise(ordered, earlier)
@@ -136,14 +136,14 @@ def _speaks(row: Row) -> bool:
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
     """Build the prior from the valid units; otherwise return the reason why there is none."""
-    # Only the later test of a unit that was tested twice counts.
+    # Of a unit that was tested twice only the later test is used.
     tests = sorted((row for row in rows if _speaks(row)), key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}
     if len(latest) < UNITS_NEEDED:
         return None, f'{len(latest)} units with complete data, {UNITS_NEEDED} are needed'
     units = [load_calibration(results.folder_of(name) / CALIBRATION) for name in latest.values()]
     try:
-        prior = population(sorted(units, key=lambda one: one.unit.serial))
+        prior = population(sorted(units, key=lambda unit: unit.unit.serial))
     except FitError as error:
         return None, str(error)
     save_calibration(prior, results.folder / PRIOR, overwrite=True)
@@ -153,7 +153,7 @@ def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, 
 def render_fleet(
     rows: Sequence[Row], summary: Summary, certificate_of: Callable[[Row], str]
 ) -> str:
-    """Render the page; `certificate_of` gives the relative path of a certificate, or ''."""
+    """Render the page; `certificate_of` gives the relative path of a unit's certificate, or ''."""
     from ..report.figures_unit import draw_distances, draw_shares
     from ..report.html import render
     from ..report.page import ReportFigure, drawn_figures
@@ -221,12 +221,12 @@ class Results:
         return path.relative_to(self.folder).as_posix() if path.is_file() else ''
 
     def look_up(self, unit: FoundUnit, options: FleetOptions) -> Row | None:
-        """Find the row of an earlier run; None if something changed or was not finished."""
+        """Find the row of a finished earlier run of the same bags and options, or None."""
         folder = self.folder_of(unit.name, options.fit.prior)
         try:
-            said = json.loads((folder / RESULT).read_bytes())
-            row = row_of(**said.pop('row'))
-            if not said['is_final'] or said != said | _key(unit, options):
+            record = json.loads((folder / RESULT).read_bytes())
+            row = row_of(**record.pop('row'))
+            if not record['is_final'] or record != record | _key(unit, options):
                 return None
             if is_fitted(row):
                 content = (folder / CALIBRATION).read_bytes()
@@ -242,8 +242,8 @@ class Results:
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):
-            said = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
-            return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, said)))})
+            texts = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
+            return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, texts)))})
         if outcome.calibration:
             # Until the record is written, its hash differs from the file's: the unit is not done.
             content = outcome.calibration.encode()

@@ -23,7 +23,7 @@ _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation for a normal spread, relative to the sample sd.
 _MAD_EFFICIENCY = 0.37
 #: The columns in which units are compared.
-QUANTITIES = tuple(one for one in COLUMNS if one.label)
+QUANTITIES = tuple(column for column in COLUMNS if column.label)
 
 
 class Spread(NamedTuple):
@@ -73,15 +73,15 @@ class Summary:
 
     verdicts: dict[str, int]
     spreads: tuple[Spread, ...]
-    limit: float  # of an outlier in standard deviations; infinite with too few units
+    limit: float  # smallest distance of an outlier in robust sd; infinite with too few units
     outliers: tuple[Outlier, ...]
     drifts: tuple[Retest, ...]
 
 
 def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
-    """Compute the statistics of a fleet; rows of earlier tables give the drifts."""
+    """Compute the statistics of a fleet; drifts are changes since the rows of earlier tables."""
     fitted = [row for row in rows if is_fitted(row)]
-    spreads = tuple(spread for one in QUANTITIES if (spread := spread_of(one, fitted)))
+    spreads = tuple(spread for quantity in QUANTITIES if (spread := spread_of(quantity, fitted)))
     limit = outlier_limit(len(fitted), len(spreads))
     serials = {str(row['name']): str(row['serial']) for row in fitted}
     outliers = [
@@ -92,13 +92,13 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
     ]
     wide = Verdict.WIDE.value
     # Drop the amount from the verdict, so that equal verdicts count together.
-    said = (str(row['verdict']) for row in rows)
-    verdicts = (f'{wide} little' if one.startswith(wide) else one for one in said)
+    texts = (str(row['verdict']) for row in rows)
+    verdicts = (f'{wide} little' if text.startswith(wide) else text for text in texts)
     return Summary(
         verdicts=dict(Counter(verdicts)),
         spreads=spreads,
         limit=limit,
-        outliers=tuple(sorted(outliers, key=lambda one: -abs(one.z))),
+        outliers=tuple(sorted(outliers, key=lambda outlier: -abs(outlier.z))),
         drifts=tuple(_drifts(fitted, [row for row in earlier if is_fitted(row)])),
     )
 
@@ -144,22 +144,22 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
         if before[0] == after[0]
         and before[3]['calibration_sha256'] != after[3]['calibration_sha256']
     ]
-    compared = [one for one in QUANTITIES if one.sd]
+    compared = [quantity for quantity in QUANTITIES if quantity.sd]
     limit = norm.isf(0.5 * _FALSE_ALARMS / max(len(pairs) * len(compared), 1))
     drifts = []
     for (serial, begun, before, old), (_, again, after, new) in pairs:
         changes = []
-        for one in compared:
+        for column in compared:
             was, was_sd, now, now_sd = np.array(
-                [row[name] for row in (old, new) for name in (one.name, one.sd)], np.float64
+                [row[name] for row in (old, new) for name in (column.name, column.sd)], np.float64
             ).tolist()
-            change = (now / was - 1.0) * 1e6 if one.by == 'ppm' else now - was
+            change = (now / was - 1.0) * 1e6 if column.by == 'ppm' else now - was
             sd = np.nan_to_num(np.hypot(was_sd, now_sd)).item()
-            changes.append(Drift(before, after, one.label, one.unit, change, sd))
-        is_significant = any(_sds(one) > limit for one in changes)
+            changes.append(Drift(before, after, column.label, column.unit, change, sd))
+        is_significant = any(_sds(change) > limit for change in changes)
         days = _days(begun, again)
         drifts.append(Retest(serial, before, after, days, tuple(changes), is_significant))
-    return sorted(drifts, key=lambda one: -_sds(one.worst))
+    return sorted(drifts, key=lambda drift: -_sds(drift.worst))
 
 
 def _sds(drift: Drift) -> float:

@@ -31,7 +31,7 @@ Row = Mapping[str, Cell]
 REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
 # First characters of a spreadsheet formula.
 _FORMULA = ('=', '+', '-', '@')
-# Findings of the fit on incomplete data: the prior decides part of the calibration.
+# Findings of a fit to incomplete data, whose calibration partly follows from the prior.
 _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
 
@@ -54,7 +54,7 @@ _TABLE = (
     ('lot', 'text', '`lot` in the metadata, else the folder above the unit'),
     ('verdict', 'text', 'verdict of evaluate on the bags of the fit; or refused, failed'),
     ('reason', 'text', 'the numbers of the verdict'),
-    ('problem', 'text', 'why there is no calibration'),
+    ('problem', 'text', 'reason why there is no calibration'),
     ('reservations', 'text', 'reservations on the certificate'),
     ('left_out', 'text', 'bags that were left out, each with its reason'),
     ('chosen', 'text', 'topics chosen by their type, as the usual name is missing'),
@@ -66,7 +66,7 @@ _TABLE = (
     ('n_bytes', 'whole', 'size of the bags'),
     ('model', 'text', 'the model of the fit'),
     ('is_whole', 'whole', '1 if the bags determine every parameter: then the prior may use them'),
-    ('prior', 'text', 'SHA-256 of the prior.yaml of its fit'),
+    ('prior', 'text', 'SHA-256 of the prior.yaml used in the fit'),
     ('start', 'text', 'UTC of the first sample'),
     ('hours', 'number', 'length of the bags together'),
     ('gravity_m_s2', 'number', 'local gravity used'),
@@ -76,10 +76,10 @@ _TABLE = (
     ('cooling_k_min', 'number', 'fastest fall of the board in the range'),
     ('heating_k_min', 'number', 'fastest rise of the board in the range'),
     ('scale_{0}', 'number', '{1}: scale factor at T_ref, input units per m/s^2'),
-    ('scale_sd_{0}_ppm', 'number', '{1}: its standard deviation'),
+    ('scale_sd_{0}_ppm', 'number', '{1}: standard deviation of the scale factor'),
     ('scale_slope_{0}_ppm_k', 'number', '{1}: slope of the static scale at T_ref'),
     ('bias_{0}_ug', 'number', '{1}: bias in a soak at T_ref'),
-    ('bias_sd_{0}_ug', 'number', '{1}: its standard deviation'),
+    ('bias_sd_{0}_ug', 'number', '{1}: standard deviation of the bias'),
     ('bias_slope_{0}_ug_k', 'number', '{1}: slope of the static bias at T_ref'),
     ('m_{0}_urad', 'number', '`{1}`'),
     ('m_sd_{0}_urad', 'number', 'standard deviation of `{1}`'),
@@ -92,12 +92,12 @@ _TABLE = (
     ('all_ug', 'number', '|f| - g at rest, RMS'),
     ('peak_ug', 'number', 'largest |f| - g of a window at rest'),
     ('unseen_ug', 'number', '|f| - g of each position by a fit to the others, RMS'),
-    ('claimed_ug', 'number', 'RMS of the claimed standard deviation of these windows'),
+    ('claimed_ug', 'number', 'RMS of the claimed standard deviation of the windows'),
     ('cpu_s', 'number', 'processor time of reading and fit'),
-    ('tool_version', 'text', 'version that fitted it'),
+    ('tool_version', 'text', 'version of thermo_comp that fitted the unit'),
     ('calibration_sha256', 'text', 'SHA-256 of calibration.yaml'),
 )
-# Compared quantities: by value, in ppm of the median, or by logarithm.
+# Quantities compared between units: by value, in ppm of the median, or by logarithm.
 _COMPARED = {
     'scale_{0}': ('scale factor {1}', 'ppm', 'ppm', 'scale_sd_{0}_ppm'),
     'scale_slope_{0}_ppm_k': ('slope of scale {1}', 'ppm/K'),
@@ -128,7 +128,7 @@ COLUMNS = tuple(
 
 def row_of(**known: Any) -> dict[str, Cell]:
     """Build a row from the known cells; other texts are empty, other numbers None."""
-    row: dict[str, Cell] = {one.name: '' if one.kind == 'text' else None for one in COLUMNS}
+    row: dict[str, Cell] = {col.name: '' if col.kind == 'text' else None for col in COLUMNS}
     strange = known.keys() - row.keys()
     if strange:
         raise ValueError(f'no column {sorted(strange)[0]!r}')
@@ -163,12 +163,12 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
     parts: dict[str, Sequence[float] | Floats] = {
         'scale_{0}': scale,
         'scale_sd_{0}_ppm': scale_sd * 1e6,
-        'scale_slope_{0}_ppm_k': [float(one.scale_function.slope(0.0)) * 1e6 for one in static],
+        'scale_slope_{0}_ppm_k': [float(axis.scale_function.slope(0.0)) * 1e6 for axis in static],
         'bias_{0}_ug': bias / MICRO_G,
         'bias_sd_{0}_ug': bias_sd / MICRO_G,
         'bias_slope_{0}_ug_k': [
-            float(one.bias_function.slope(0.0)) / (axis.scale_factor * MICRO_G)
-            for one, axis in zip(static, calibration.axes, strict=True)
+            float(curves.bias_function.slope(0.0)) / (axis.scale_factor * MICRO_G)
+            for curves, axis in zip(static, calibration.axes, strict=True)
         ],
         'm_{0}_urad': [calibration.misalignment[i][j] * 1e6 for i, j in _BELOW],
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,
@@ -184,10 +184,10 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
         'hours': sum(bag.end_ns - bag.start_ns for bag in bags) * 1e-9 / 3600.0,
         'gravity_m_s2': calibration.gravity_m_s2,
         'reference_temperature_c': calibration.reference_temperature_c,
-        'lowest_c': min(one.temperature_range_c[0] for one in sets),
-        'highest_c': max(one.temperature_range_c[1] for one in sets),
-        'cooling_k_min': min(one.rate_range_k_min[0] for one in sets),
-        'heating_k_min': max(one.rate_range_k_min[1] for one in sets),
+        'lowest_c': min(part.temperature_range_c[0] for part in sets),
+        'highest_c': max(part.temperature_range_c[1] for part in sets),
+        'cooling_k_min': min(part.rate_range_k_min[0] for part in sets),
+        'heating_k_min': max(part.rate_range_k_min[1] for part in sets),
         **{
             name: float(value)
             for pattern, values in parts.items()
@@ -223,7 +223,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
     buffer = pa.BufferOutputStream()
     parquet.write_table(pa.Table.from_pylist(list(rows), schema=schema), buffer)
     text = io.StringIO()
-    writer = csv.DictWriter(text, [one.name for one in COLUMNS], lineterminator='\n')
+    writer = csv.DictWriter(text, [column.name for column in COLUMNS], lineterminator='\n')
     writer.writeheader()
     for row in rows:
         # Quote texts that a spreadsheet would run as a formula.
@@ -236,7 +236,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read a table of an earlier run; missing columns are empty. ThermoCompError if not one."""
+    """Read a table of an earlier run; missing columns are empty. ThermoCompError if no table."""
     from pyarrow import ArrowException, parquet
 
     try:
@@ -245,7 +245,7 @@ def read_parquet(path: Path) -> list[Row]:
         raise ThermoCompError(
             f'{path}: not a fleet table: {" ".join(str(error).split())}'
         ) from error
-    names = {one.name for one in COLUMNS}
+    names = {column.name for column in COLUMNS}
     if not all('serial' in row and 'verdict' in row for row in rows):
         raise ThermoCompError(
             f'{path}: not a fleet table: it lacks the columns serial and verdict'

@@ -65,15 +65,15 @@ class Storage:
         """List all files below the folder except hidden ones, sorted by name."""
         try:
             if self._is_local:
-                found = {path: self._fs.info(path) for path in _walk(self._root)}
+                listing = {path: self._fs.info(path) for path in _walk(self._root)}
             else:
-                found = self._fs.find(self._root, detail=True)
-            if not found and not self._fs.isdir(self._root):
+                listing = self._fs.find(self._root, detail=True)
+            if not listing and not self._fs.isdir(self._root):
                 raise NotADirectoryError(errno.ENOTDIR, 'no such directory')
         except Exception as error:  # each file system has different exceptions
             raise ThermoCompError(f'{self.url}: cannot be listed: {words(error)}') from error
         files = []
-        for path, facts in found.items():
+        for path, facts in listing.items():
             name = path.removeprefix(f'{self._root}/')
             if facts['type'] == 'file' and not any(p.startswith('.') for p in name.split('/')):
                 stamp = next((str(facts[key]) for key in _STAMPS if facts.get(key)), '')
@@ -92,13 +92,13 @@ class Storage:
             )
             try:
                 self._fs.get(there, copies)
-            except Exception as error:  # as above
+            except Exception as error:  # each file system has different exceptions
                 raise OSError(errno.EIO, words(error)) from error
             yield Path(scratch, name)
 
 
 def _walk(root: str) -> Iterator[str]:
-    """Yield the files of a local tree, following links, which fsspec does not."""
+    """Yield the files of a local tree; links are followed, unlike by fsspec."""
     for folder, folders, names in os.walk(root, followlinks=True):
         here = Path(folder).resolve()
         # Skip links to a containing folder: they would never end.
@@ -108,8 +108,8 @@ def _walk(root: str) -> Iterator[str]:
 
 def words(error: Exception) -> str:
     """Return the text of an error on one line."""
-    said = getattr(error, 'strerror', None) or ' '.join(str(error).split())
-    return said or type(error).__name__
+    text = getattr(error, 'strerror', None) or ' '.join(str(error).split())
+    return text or type(error).__name__
 
 
 def find_units(storage: Storage) -> list[FoundUnit]:
@@ -139,19 +139,19 @@ def group_files(files: Sequence[StoredFile]) -> Bags:
         by_folder[_folder(file.name)].append(file)
     bags: Bags = {}
     for folder, inside in by_folder.items():
-        stored = [one for one in inside if one.name.endswith(('.mcap', '.db3', '.bag'))]
+        stored = [file for file in inside if file.name.endswith(('.mcap', '.db3', '.bag'))]
         if stored and folder and _is_bag(folder, inside, stored):
             bags[folder] = inside
         else:
-            bags |= {one.name: [one] for one in stored}
+            bags |= {file.name: [file] for file in stored}
     return dict(sorted(bags.items()))
 
 
 def _is_bag(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
     """Whether a folder is a rosbag2 directory, even without metadata (recorder killed)."""
-    stems = [one.name.rpartition('.')[0].rpartition('_') for one in stored]
+    stems = [file.name.rpartition('.')[0].rpartition('_') for file in stored]
     usual = f'{folder}/{folder.rpartition("/")[2]}'
-    return any(one.name == f'{folder}/metadata.yaml' for one in inside) or all(
+    return any(file.name == f'{folder}/metadata.yaml' for file in inside) or all(
         stem == usual and number.isdigit() for stem, _, number in stems
     )
 

@@ -48,8 +48,8 @@ class FleetOptions:
     def digest(self) -> str:
         """Hash everything that a result depends on besides its bags."""
         plain = replace(self, fit=replace(self.fit, prior=None))
-        said = {'version': __version__, 'prior': self.prior_sha256, **asdict(plain)}
-        return sha256(json.dumps(said, sort_keys=True, default=repr))
+        content = {'version': __version__, 'prior': self.prior_sha256, **asdict(plain)}
+        return sha256(json.dumps(content, sort_keys=True, default=repr))
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class UnitOutcome:
 
     row: dict[str, Cell]
     hashes: dict[str, str]  # of its bags
-    is_final: bool  # another attempt would give the same; False if the file system failed
+    is_final: bool  # a second attempt would give the same result; False if the file system failed
     calibration: str = ''
     certificate: str = ''
 
@@ -94,7 +94,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
                 bags[name] = reduce_bag(replace(source, sha256=hashes[name]), how)
         except RecordingError as error:  # noqa: PERF203 - a bad bag does not stop the others
             # Name the bag by its path in the fleet, not by that of a local copy.
-            problems.append(': '.join(one for one in (name, error.key, error.message) if one))
+            problems.append(': '.join(part for part in (name, error.key, error.message) if part))
             is_final = is_final and not isinstance(error.__cause__, OSError)
         except OSError as error:
             problems.append(f'{name}: {error.strerror or error}')
@@ -122,8 +122,8 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
             raise ThermoCompError('none of its bags can be used')
         kinds = {_UNIT_OF[bag.info.input]: name for name, bag in bags.items()}
         if len(kinds) > 1:
-            said = ', '.join(f'{name} holds {kind}' for kind, name in sorted(kinds.items()))
-            raise FitError(f'{said}: choose one with --input')
+            contents = ', '.join(f'{name} holds {kind}' for kind, name in sorted(kinds.items()))
+            raise FitError(f'{contents}: choose one input with --input')
         how = replace(options.fit, input=next(iter(kinds)), serial=serial)
         row, calibration, page = _fitted(row, list(bags.values()), how, options.certificates)
     except FitError as refusal:
@@ -164,7 +164,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Keep Ctrl-C, which a terminal sends to all processes, from workers; raise it afterwards."""
+    """Hide Ctrl-C, which a terminal sends to all processes, from workers; raise it afterwards."""
     heard: list[int] = []
     # Processes inherit the ignored signal from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -180,7 +180,7 @@ def _uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def connected(scheduler: str | None = None, n_workers: int | None = None) -> Iterator[Any]:
-    """Yield a client of a running cluster with workers of this version, or of a local one."""
+    """Yield a client of a running cluster with workers of this version, or of a local cluster."""
     import dask
     from distributed import Client
     from distributed.utils import get_mp_context
@@ -197,29 +197,31 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
         if scheduler is None:
             get_mp_context().set_forkserver_preload(['distributed', __name__])
             with _uninterrupted():
-                own = Client(n_workers=n_workers, threads_per_worker=1, processes=True, **local)
-                stack.enter_context(own)
-            yield own
+                local_client = Client(
+                    n_workers=n_workers, threads_per_worker=1, processes=True, **local
+                )
+                stack.enter_context(local_client)
+            yield local_client
             return
         versions = {}
         try:
-            said = 'no Dask scheduler answers there'
+            problem = 'no Dask scheduler answers there'
             client = stack.enter_context(Client(scheduler, timeout=_WAIT_S))
-            said = 'has no worker'
+            problem = 'the cluster has no worker'
             client.wait_for_workers(1, timeout=_WAIT_S)
-            said = f'a worker lacks thermo_comp {__version__}'
+            problem = f'a worker lacks thermo_comp {__version__}'
             versions = client.run(version)
         except Exception as error:  # an import on a worker may raise any exception
-            raise ThermoCompError(f'{scheduler}: {said}') from error
+            raise ThermoCompError(f'{scheduler}: {problem}') from error
         for worker, answer in versions.items():
             if answer != __version__:
-                said = f'worker {worker} runs thermo_comp {answer}, not {__version__}'
-                raise ThermoCompError(f'{scheduler}: {said}')
+                problem = f'worker {worker} runs thermo_comp {answer}, not {__version__}'
+                raise ThermoCompError(f'{scheduler}: {problem}')
         yield client
 
 
 def version() -> str:
-    """Return the version of the process that runs this."""
+    """Return the version of thermo_comp in the process that runs this function."""
     return __version__
 
 
@@ -240,7 +242,7 @@ def run(
 
 
 def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
-    """Return a task's result, or the reason of its failure, which a later run repeats."""
+    """Return a task's result, or the reason of its failure; a later run repeats the task."""
     from distributed import KilledWorker
 
     if future.status == 'finished':
@@ -251,7 +253,7 @@ def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
         problem = 'the scheduler was lost'
     elif isinstance(error, KilledWorker):
         n_died = error.allowed_failures + 1
-        problem = f'its worker died {n_died} times: too little memory?'
+        problem = f'the worker of its task died {n_died} times: too little memory?'
     else:
         problem = f'{type(error).__name__}: {words(error)}'
     return UnitOutcome(_started_row(unit, verdict=FAILED, problem=problem), {}, is_final=False)

@@ -27,7 +27,7 @@ from ..unit.provenance import Source
 from .judgement import Judgement, judge
 from .windows import WINDOW_S, corrected_windows, sum_length
 
-# Largest scatter of a unit at rest / noise that its calibration states.
+# Largest ratio of a unit's scatter at rest to the noise that its calibration states.
 _NOISES = 4.0
 # Smallest significant change, in standard deviations.
 _SURE_SDS = 3.0
@@ -152,8 +152,8 @@ def evaluate(
 @dataclass(frozen=True)
 class Epoch:
     """
-    A calibration of a history, in a soak at the reference temperature of the first: bias of x, y,
-    z [ug], change of scale since the first [ppm], shape (6,); an unknown sd is NaN.
+    A calibration of a history, in a soak at the first calibration's reference temperature: bias of
+    x, y, z [ug], change of scale since the first [ppm], shape (6,); an unknown sd is NaN.
     """
 
     created: str
@@ -180,26 +180,26 @@ class Drift:
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
-    Sort the calibrations of the first one's unit by date; of calibrations fitted on the same bags
-    only the first counts, as two models are no history.
+    Sort the calibrations of the first calibration's unit by date. Of calibrations fitted on the
+    same bags only the first is kept: two models of the same data are no history.
     """
     known: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []
-    for one in calibrations:
-        sources = one.provenance.sources
-        if one.unit.serial == calibrations[0].unit.serial and not (sources and sources in known):
-            ordered.append(one)
+    for cal in calibrations:
+        sources = cal.provenance.sources
+        if cal.unit.serial == calibrations[0].unit.serial and not (sources and sources in known):
+            ordered.append(cal)
         known.add(sources)
-    ordered.sort(key=lambda one: one.provenance.created)
+    ordered.sort(key=lambda calibration: calibration.provenance.created)
     epochs: list[Epoch] = []
     first = np.ones(3)
-    for number, one in enumerate(ordered):
-        bias, bias_sd, scale, scale_sd = in_a_soak(one, ordered[0].reference_temperature_c)
+    for number, cal in enumerate(ordered):
+        bias, bias_sd, scale, scale_sd = in_a_soak(cal, ordered[0].reference_temperature_c)
         first = first if number else scale
         value = np.concatenate((bias / MICRO_G, 1e6 * (scale / first - 1.0)))
         sd = np.concatenate((bias_sd / MICRO_G, 1e6 * scale_sd))
-        created = one.provenance.created or f'no. {number + 1}'
-        epochs.append(Epoch(created, value, sd if one.has_uncertainty else np.full(6, np.nan)))
+        created = cal.provenance.created or f'no. {number + 1}'
+        epochs.append(Epoch(created, value, sd if cal.has_uncertainty else np.full(6, np.nan)))
     return tuple(epochs)
 
 

@@ -46,7 +46,7 @@ class Judgement:
 
     `left_out_rms` is the fit's RMS on positions left out, NaN if the bags are not those of the
     fit; `tolerance` is the user's limit [m/s^2]. `shifts` are per axis, empty with fewer than six
-    distinct positions; `moved` lists the significant ones. For `axis_rms` see `rms_by_axis`. A
+    distinct positions; `moved` lists the significant shifts. For `axis_rms` see `rms_by_axis`. A
     gyroscope is judged separately.
     """
 
@@ -76,7 +76,7 @@ class Judgement:
 
     @property
     def headline_rms(self) -> float:
-        """RMS expected in a new attitude: on positions left out, or on bags that the fit lacks."""
+        """RMS expected in a new attitude: on positions left out, or bags not used in the fit."""
         in_sample = self.sections['all'].rms
         return self.left_out_rms if np.isfinite(self.left_out_rms) else in_sample
 
@@ -106,7 +106,7 @@ class Judgement:
             'moved': self.moved,
             'shifts': self.shifts,
             'by_force_m_s2': [
-                {'size': size, **asdict(one)} for size, one in self.by_force.items()
+                {'size': size, **asdict(section)} for size, section in self.by_force.items()
             ],
             'axis_rms_m_s2': self.axis_rms,
             'angular_rate': None if self.rate is None else self.rate.facts(),
@@ -148,56 +148,56 @@ def judge(
     return replace(judgement, kind=kind, reason=reason)
 
 
-def _verdict(found: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict, str]:
-    sections, windows, tolerance = found.sections, found.windows, found.tolerance
-    one, outside, left_out = sections['all'], sections['outside'], found.left_out_rms
-    if not one.n:
+def _verdict(judgement: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict, str]:
+    sections, windows, tolerance = judgement.sections, judgement.windows, judgement.tolerance
+    full, outside, left_out = sections['all'], sections['outside'], judgement.left_out_rms
+    if not full.n:
         span = f'at {np.min(windows.board):.1f} to {np.max(windows.board):.1f} degC'
-        said = f'all {_windows(outside.n, windows)} lie there, {span}; {_numbers(outside)}'
-        return Verdict.OUTSIDE, said
-    worst = max([s.rms for s in sections.regimes or [one]] + [found.headline_rms])
+        text = f'all {_windows(outside.n, windows)} lie there, {span}; {_numbers(outside)}'
+        return Verdict.OUTSIDE, text
+    worst = max([s.rms for s in sections.regimes or [full]] + [judgement.headline_rms])
     ratio = sections.worst_ratio
     # Without a claim the value is NaN, and the comparison false.
-    is_wide = one.claimed_rms > (tolerance or min(verdicts.WIDE_PART * one.raw_rms, _WIDE_CLAIM))
+    is_wide = full.claimed_rms > (tolerance or min(verdicts.WIDE_PART * full.raw_rms, _WIDE_CLAIM))
     if windows.is_swapped.any():
         kind = Verdict.SWAPPED
-    elif one.rms >= one.raw_rms and is_thermal:
+    elif full.rms >= full.raw_rms and is_thermal:
         kind = Verdict.NO_BETTER
     elif tolerance is not None and worst > tolerance:
         kind = Verdict.RECALIBRATE
     elif tolerance is None and not claims:
         kind = Verdict.NO_CLAIM
-    elif tolerance is None and (ratio > verdicts.LARGEST_RATIO or found.moved):
+    elif tolerance is None and (ratio > verdicts.LARGEST_RATIO or judgement.moved):
         kind = Verdict.RECALIBRATE
     else:
         kind = Verdict.WIDE if is_wide else Verdict.VALID
-    says = [f'{_numbers(one)} over {_windows(one.n, windows)}']
+    parts = [f'{_numbers(full)} over {_windows(full.n, windows)}']
     if np.isfinite(left_out):
-        says = [f'{spoken(left_out)} RMS of |f| - g on positions left out; in sample {says[0]}']
+        parts = [f'{spoken(left_out)} RMS of |f| - g on positions left out; in sample {parts[0]}']
     if tolerance is not None:
         where = 'on positions left out' if worst == left_out else 'in the worse regime'
-        says.append(f'{spoken(worst)} {where}, {spoken(tolerance)} tolerated')
+        parts.append(f'{spoken(worst)} {where}, {spoken(tolerance)} tolerated')
     elif claims:
-        says.append(f'largest ratio of a regime {ratio:.2g}, limit {verdicts.LARGEST_RATIO:g}')
+        parts.append(f'largest ratio of a regime {ratio:.2g}, limit {verdicts.LARGEST_RATIO:g}')
     else:
-        says.append('the calibration states no uncertainty: give a tolerance')
+        parts.append('the calibration states no uncertainty: give a tolerance')
     if kind is Verdict.SWAPPED:
-        says.insert(0, SWAPPED)
-    if found.moved:
-        says.append('moved: ' + ', '.join(found.moved))
+        parts.insert(0, SWAPPED)
+    if judgement.moved:
+        parts.append('moved: ' + ', '.join(judgement.moved))
     if outside.n:
-        says.append(
+        parts.append(
             f'{_windows(outside.n, windows)} outside the calibrated ranges not judged: '
             f'{spoken(outside.rms)}'
         )
-    return kind, '; '.join(says)
+    return kind, '; '.join(parts)
 
 
 def _numbers(section: Section) -> str:
-    said = f'{spoken(section.rms)} RMS of |f| - g, {spoken(section.raw_rms)} raw'
+    text = f'{spoken(section.rms)} RMS of |f| - g, {spoken(section.raw_rms)} raw'
     if np.isfinite(section.claimed_rms):
-        said += f', {spoken(section.claimed_rms)} claimed'
-    return said
+        text += f', {spoken(section.claimed_rms)} claimed'
+    return text
 
 
 def _windows(n: int, windows: Windows) -> str:
@@ -242,15 +242,15 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
 
 def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
     """Name the significant shifts, as in ``z bias +12 +- 3 ug``."""
-    said = []
+    collected = []
     for axis, shift in zip('xyz', shifts, strict=False):
         for name, value, sd, unit in (
             ('bias', shift.bias / MICRO_G, shift.bias_sd / MICRO_G, 'ug'),
             ('scale', 1e6 * shift.scale, 1e6 * shift.scale_sd, 'ppm'),
         ):
             if abs(value) > _SURE_SDS * sd:
-                said.append(f'{axis} {name} {value:+.3g} +- {sd:.2g} {unit}')
-    return tuple(said)
+                collected.append(f'{axis} {name} {value:+.3g} +- {sd:.2g} {unit}')
+    return tuple(collected)
 
 
 def rms_by_axis(windows: Windows) -> Floats:

@@ -22,7 +22,7 @@ LARGEST_RATIO = 2.0
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST = 6
-# Known |f| in rising order belong to one level up to this ratio of neighbours.
+# Successive known |f|, in rising order, belong to one level up to this ratio.
 _NEXT_LEVEL = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
@@ -74,16 +74,16 @@ class Sections(dict[str, Section]):
     @property
     def regimes(self) -> list[Section]:
         """The regimes with enough windows to be judged separately."""
-        return [one for one in (self['static'], self['dynamic']) if one.n >= _FEWEST]
+        return [part for part in (self['static'], self['dynamic']) if part.n >= _FEWEST]
 
     @property
     def worst_ratio(self) -> float:
         """Largest ratio of a regime, or of all."""
-        return max(one.ratio for one in (*self.regimes, self['all']))
+        return max(part.ratio for part in (*self.regimes, self['all']))
 
     def facts(self) -> dict[str, Any]:
         """Return everything, as in JSON."""
-        return {name: {**asdict(one), 'ratio': one.ratio} for name, one in self.items()}
+        return {name: {**asdict(part), 'ratio': part.ratio} for name, part in self.items()}
 
 
 def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats) -> Sections:
@@ -109,7 +109,7 @@ def by_force(windows: Windows, claimed: Floats) -> dict[float, Section]:
 
 def _section(raw: Floats, residual: Floats, claimed: Floats, rows: Bools | Ints) -> Section:
     before, after, claim = (
-        residual_statistics(one[rows].ravel()) for one in (raw, residual, claimed)
+        residual_statistics(column[rows].ravel()) for column in (raw, residual, claimed)
     )
     n = after.n // max(1, residual[:1].size)
     return Section(n, before.rms, before.peak, after.rms, after.mean, after.peak, claim.rms)
@@ -180,23 +180,23 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
 
 
 def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict, str]:
-    one, outside = sections['all'], sections['outside']
-    if not one.n:
+    whole, outside = sections['all'], sections['outside']
+    if not whole.n:
         return Verdict.OUTSIDE, f'{outside.n} windows of {window_s:g} s lie there'
-    said = f'{_mdeg(one.rms)} RMS of its changes at rest, {_mdeg(one.raw_rms)} raw'
-    over = f'over {one.n} windows of {window_s:g} s'
+    text = f'{_mdeg(whole.rms)} RMS of its changes at rest, {_mdeg(whole.raw_rms)} raw'
+    over = f'over {whole.n} windows of {window_s:g} s'
     if not claims:
-        kind = Verdict.NO_BETTER if one.rms > one.raw_rms else Verdict.NO_CLAIM
-        return kind, f'{said} {over}; the calibration states no uncertainty'
+        kind = Verdict.NO_BETTER if whole.rms > whole.raw_rms else Verdict.NO_CLAIM
+        return kind, f'{text} {over}; the calibration states no uncertainty'
     ratio = sections.worst_ratio
-    said = (
-        f'{said}, {_mdeg(one.claimed_rms)} claimed {over}; '
+    text = (
+        f'{text}, {_mdeg(whole.claimed_rms)} claimed {over}; '
         f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
     )
-    # At constant temperature the correction is constant, so equal to raw is no fault.
+    # At constant temperature the correction is constant: a residual equal to raw is no fault.
     if ratio > LARGEST_RATIO:
-        return Verdict.NO_BETTER if one.rms >= one.raw_rms else Verdict.RECALIBRATE, said
-    return Verdict.WIDE if one.claimed_rms > WIDE_PART * one.raw_rms else Verdict.VALID, said
+        return Verdict.NO_BETTER if whole.rms >= whole.raw_rms else Verdict.RECALIBRATE, text
+    return Verdict.WIDE if whole.claimed_rms > WIDE_PART * whole.raw_rms else Verdict.VALID, text
 
 
 def _mdeg(rate: float) -> str:

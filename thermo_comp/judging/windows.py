@@ -29,11 +29,12 @@ from ..unit.metrics import norm_residual
 
 #: Default length of a window [s].
 WINDOW_S = 60.0
-# Distance outside a calibrated range that still counts as inside, in half ranges: noise.
+# Distance outside a calibrated range that noise can explain and counts as inside [half ranges].
 _EDGE = 0.02
-# Largest relative difference of a known |f| from gravity at which the rest counts as one at 1 g.
+# Largest relative difference of a known |f| from gravity at which the rest counts as a rest at 1
+# g.
 _USUAL = 0.01
-# Smallest number of samples of a partial sum / median number.
+# Smallest ratio of a partial sum's number of samples to the median number.
 _LEAST_FILLED = 0.9
 
 

@@ -3,8 +3,8 @@
 """
 Owns the batch form of the compensator: whole arrays at once, with the bits of the stream.
 
-The compensator takes the readings one by one. Its segments are collected, evaluated together and
-applied to all samples with the arithmetic of the stream.
+The compensator takes the readings one by one. The segments of the stream are collected, evaluated
+together and applied to all samples with the arithmetic of the stream.
 """
 
 from dataclasses import dataclass, fields
@@ -41,7 +41,7 @@ _SAMPLE = [0, 1, 2, 3, 4, 5, 7, 8, 11]
 class CompensatedBlock:
     """The published samples of a block."""
 
-    index: Ints  # indices of these samples in the block, shape (n,)
+    index: Ints  # indices of the samples in the block, shape (n,)
     stamp_ns: Stamps
     specific_force: Floats  # [m/s^2], shape (n, 3)
     covariance: Floats  # row-major 3x3 [m^2/s^4], shape (n, 9)
@@ -109,7 +109,7 @@ def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list
         runs[-1].append(number)
         compensator.last_ns = last_ns = stamp_ns
     compensator.last_ns = before_ns
-    compensator.reading_ns = max(compensator.reading_ns, *(one[3] for one in waiting), EVER_NS)
+    compensator.reading_ns = max(compensator.reading_ns, *(entry[3] for entry in waiting), EVER_NS)
     return [np.array(run, dtype=np.int64) for run in runs]
 
 
@@ -184,7 +184,7 @@ def _apply(
             counts = [count for _, count in segments]
             compensator.counters.n_unsound += int(np.sum(counts, where=~is_good))
             index = index[np.repeat(is_good, counts)]
-            segments = [one for one, good in zip(segments, is_good, strict=True) if good]
+            segments = [segment for segment, good in zip(segments, is_good, strict=True) if good]
             line, rate_line = line[:, is_good], rate_line[:, is_good[: rate_line.shape[1]]]
     if len(index) < len(stamps):
         stamps, samples = stamps[index], samples[index]
@@ -203,10 +203,10 @@ def _apply(
 
 
 def _line(correction: Correction, segments: Segments, part: slice) -> Floats:
-    """Evaluate the lines of segments, with `part` of their slow variance, see `line`."""
+    """Evaluate `Correction.line` for segments, with `part` of their slow variance."""
     each = [segment for segment, _ in segments]
     start, end, slow = (np.array([one[at] for one in each]).T for at in (4, 5, 6))
-    excess = np.array([one.noise_excess for one in each])
+    excess = np.array([segment.noise_excess for segment in each])
     return correction.line(start, end, slow[part], excess)
 
 
@@ -225,7 +225,7 @@ def _corrected(
     corrected_force = corrected if len(table) == 21 else corrected_nonlinear
     n = len(stamps)
     result = np.empty((len(order), n))
-    # Samples that are not finite are corrected like the rest; the caller drops them.
+    # Samples that are not finite are corrected like all others; the caller drops them.
     with np.errstate(invalid='ignore', over='ignore'):
         for begin in range(0, n, PIECE):
             stop = min(begin + PIECE, n)

@@ -23,9 +23,9 @@ from .status import GravityResidual
 
 #: Smallest number of equal samples in a row that counts as stuck.
 STUCK_SAMPLES: Final = 50
-#: Largest long-term rate of samples / calibrated rate ...
+#: Largest ratio of the long-term rate of samples to the calibrated rate.
 LARGEST_RATE: Final = 1.5
-#: ... plus a burst of this number of samples, or of this time's samples [s]: a driver's buffer.
+#: Burst allowed beyond `LARGEST_RATE`, as by a driver's buffer: number of samples, or time [s].
 BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
 #: Relative excess of the rate up to which the calibrated noise holds.
@@ -36,9 +36,9 @@ WINDOW_NS: Final = 1_000_000_000
 LONGEST_WINDOW_NS: Final = 30_000_000_000
 PROBE_NS: Final = 90_000_000  # shortest time between samples added to a window
 SMALLEST_WINDOW: Final = 5  # smallest number of samples in a window
-#: Largest scatter of a still window / noise of its samples.
+#: Largest ratio of a still window's scatter to the noise of its samples.
 SCATTER_FACTOR: Final = 3.0
-#: Largest change of the mean between two still windows, noise apart [m/s^2]: half a milli-g.
+#: Largest change of the mean between two still windows beyond noise [m/s^2]: half a milli-g.
 LARGEST_CHANGE: Final = 5e-3
 #: Number of still windows averaged into one residual, with exponentially falling weight.
 MEMORY_WINDOWS: Final = 30.0
@@ -61,7 +61,7 @@ class StuckCheck:
         self.n_same = 0  # number of repetitions of that sample
 
     def again(self, stamp_ns: int) -> bool:
-        """Count another equal sample; whether the samples are stuck."""
+        """Count another equal sample; return whether the samples are stuck."""
         self.n_same += 1
         return self.n_same >= STUCK_SAMPLES and stamp_ns - self.run[3] > self.limit_ns
 
@@ -73,13 +73,13 @@ class StuckCheck:
         same[0] = (x[0], y[0], z[0]) == self.run[:3]
         same[1:] = (x[1:] == x[:-1]) & (y[1:] == y[:-1]) & (z[1:] == z[:-1])
         changed = np.flatnonzero(~same)
-        found = np.zeros(n, dtype=np.bool_)
+        is_stuck = np.zeros(n, dtype=np.bool_)
         if int(np.max(np.diff(changed, prepend=-1 - self.n_same, append=n))) > STUCK_SAMPLES:
             row = np.arange(n)
             begin = np.maximum.accumulate(np.where(same, -1, row))
             n_same = np.where(begin < 0, row + 1 + self.n_same, row - begin)
             since = np.where(begin < 0, self.run[3], stamps[begin])
-            found |= same & (n_same >= STUCK_SAMPLES) & (stamps - since > self.limit_ns)
+            is_stuck |= same & (n_same >= STUCK_SAMPLES) & (stamps - since > self.limit_ns)
         if len(changed):
             last = changed.item(-1)
             self.run = (x.item(last), y.item(last), z.item(last), int(stamps[last]))
@@ -88,12 +88,12 @@ class StuckCheck:
             self.n_same += n
         if self.is_on:
             zeros = np.flatnonzero(x == 0.0)
-            found[zeros[~samples[zeros].any(axis=1)]] = True
-        return found
+            is_stuck[zeros[~samples[zeros].any(axis=1)]] = True
+        return is_stuck
 
 
 class RateCheck:
-    """Compares the rate of the samples with the calibrated one, at the start of each segment."""
+    """Compares the rate of samples with the calibrated rate, at the start of each segment."""
 
     def __init__(self, cycle_s: float, counts_cycles: bool = True) -> None:
         self._cycle_s, self._counts_cycles = cycle_s, counts_cycles
@@ -123,7 +123,7 @@ class RateCheck:
             self._level = 0.0
             self.is_too_fast = False
         else:
-            # Limited to twice the allowance, so that the alarm ends soon after a long excess.
+            # At most twice the allowance, so that the alarm ends soon after a long excess.
             self._level = min(level, 2.0 * self._allowance)
             self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
@@ -190,7 +190,7 @@ class GravityCheck:
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
             return
-        # Noise of the difference of two samples, as for means in `_close`.
+        # Largest change plus four sd of the difference of two samples, as for means in `_close`.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
         was_resting, reference = (
             self._is_resting,

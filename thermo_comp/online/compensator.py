@@ -34,7 +34,7 @@ TIME_JUMP_NS: Final = 1_000_000_000
 #: a second sample confirms it: a single damaged stamp would erase the memory.
 LEAP_NS: Final = 15_000_000_000
 LEAP_CYCLES: Final = 10.0
-#: Age at which a board temperature is stale, in usual intervals of readings, and at least [s].
+#: Age above which a board temperature is stale: number of reading intervals, at least this [s].
 STALE_INTERVALS: Final = 5.0
 SHORTEST_STALE_S: Final = 0.5
 #: Texts about a status, for diagnostics and offline reports.
@@ -66,7 +66,7 @@ class CompensatorStatus:
     state: tuple[float, ...] = ()
     regime: Regime = Regime.UNKNOWN
     direction: int = 0  # -1 cooling, +1 heating, 0 neither
-    is_settled: bool = False  # the unseen start no longer matters to the memory
+    is_settled: bool = False  # the unknown initial lag states have decayed
     #: Ages of the last used readings at the last sample [s]; infinite without a reading.
     board_age_s: float = math.inf
     case_age_s: float = math.inf
@@ -174,7 +174,7 @@ class Compensator:
             self.counters.n_saturated += 1
 
     def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
-        """Correct the first sample after an event, and run the checks on it."""
+        """Correct the first sample after an event, and run the checks of the samples."""
         if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
             self.reading_ns = EVER_NS
@@ -186,7 +186,7 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Until there is a temperature every sample takes this branch and is counted here.
+            # Until a temperature arrives every sample takes this branch and is counted here.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -203,7 +203,7 @@ class Compensator:
             is_good &= is_sound(rate_line)
             self.rate_line = rate_line.tolist()
         if not is_good:
-            # A correction that is not finite: every sample takes this branch and is dropped.
+            # While the correction is not finite every sample takes this branch and is dropped.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None

@@ -39,7 +39,7 @@ class Segment(NamedTuple):
     """A time interval with a linear correction, and the checks that apply to its samples."""
 
     start_ns: int
-    is_new: bool  # False for the rest of a segment cut by the end of a block or by a call
+    is_new: bool  # False for the second part of a segment cut by the end of a block or a call
     is_too_fast: bool  # samples come faster than conversions can
     noise_excess: float  # excess noise variance by the rate of the samples, relative
     start: tuple[float, ...]  # thermal states at both ends
@@ -100,7 +100,7 @@ class ThermalSide:
         return replace(self.config, transition_time_s=gentle_s), self.calibration.board_lag_s
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Continue with another model or configuration; the original of this copy stays."""
+        """Continue with another model or configuration; the original of a copy stays unchanged."""
         old, self.queue = self.tracker, copy(self.queue)
         self._use(model, config)
         self.queue.keep(lambda entry: entry[2] in self.inputs)

@@ -50,7 +50,7 @@ def is_sound_sample(row: Corrected) -> bool:
 
 def _samples(model: Model) -> Iterator[Corrected]:
     calibration = model.calibration
-    edges = [edge for one in calibration.regime_sets() for edge in one.temperature_range_c]
+    edges = [edge for set_ in calibration.regime_sets() for edge in set_.temperature_range_c]
     largest = 0.999 * calibration.unit.full_scale
     for celsius in (calibration.reference_temperature_c, *edges, *_BEYOND):
         compensator = Compensator(model, CompensatorConfig(gravity_tolerance_m_s2=0.0))

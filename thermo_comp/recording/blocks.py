@@ -76,8 +76,9 @@ class RecordingInfo:
     """
     The content of a bag, known before its messages are read.
     `topics`: message type (several joined by `` | ``) and number of messages. Start and end are
-    log times, or 0. `truncated` describes the missing part; `metadata` is the writer's; `input` is
-    the accelerometer topic that is read; `chosen` lists topics selected by their type.
+    log times, or 0. `truncated` describes the missing part; `metadata` holds the writer's pairs of
+    key and value; `input` is the accelerometer topic that is read; `chosen` lists topics selected
+    by their type.
     """
 
     path: Path
@@ -120,7 +121,7 @@ class ImuColumns(NamedTuple):
 
     def take(self, rows: Ints | Bools) -> ImuColumns:
         """Select messages."""
-        return ImuColumns(*(one[rows] for one in self))
+        return ImuColumns(*(column[rows] for column in self))
 
 
 class Readings(NamedTuple):
@@ -135,7 +136,7 @@ class Readings(NamedTuple):
         return Readings(self.stamp_ns[which], self.celsius[which])
 
     def thinned(self) -> Readings:
-        """Keep the finite readings that changed, and one every ten seconds."""
+        """Keep the finite readings that changed, and a reading every ten seconds."""
         # Readings repeated at the rate of other columns would look like a stuck sensor.
         kept: list[int] = []
         last_ns, last = 0, math.nan
@@ -196,7 +197,7 @@ class Block:
             self.imu and self.imu.take(is_taken),
             temperatures,
             {role: log_ns[rows[role]] for role, log_ns in self.log_ns.items()},
-            {role: one.take(rows[role]).packed() for role, one in self.raw.items()},
+            {role: messages.take(rows[role]).packed() for role, messages in self.raw.items()},
         )
 
 
@@ -218,7 +219,7 @@ def gathered(blocks: Iterable[Block]) -> Iterator[Block]:
                 waiting = []
             frame_id = block.frame_id
         waiting.append(block)
-        if sum(one.n_messages for one in waiting) >= BLOCK_MESSAGES:
+        if sum(block.n_messages for block in waiting) >= BLOCK_MESSAGES:
             yield joined(waiting)
             waiting, frame_id = [], None
     if waiting:
@@ -233,7 +234,7 @@ def joined(blocks: Sequence[Block]) -> Block:
     temperatures = {}
     for name in blocks[0].temperatures:
         parts = zip((block.temperatures[name] for block in blocks), begins, strict=False)
-        moved = [one._replace(after=one.after + begin) for one, begin in parts]
+        moved = [part._replace(after=part.after + begin) for part, begin in parts]
         temperatures[name] = Readings(*map(np.concatenate, zip(*moved, strict=True)))
     imus = [block.imu for block in blocks if block.imu is not None]
     raws = {role: [b.raw[role] for b in blocks if role in b.raw] for b in blocks for role in b.raw}
@@ -268,7 +269,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
             if name in block.raw:
                 _restamp(block.raw[name], stamp_ns)
     if kept:
-        everything = {role: np.ones(len(own), bool) for role, own in block.log_ns.items()}
+        everything = {role: np.ones(len(times), bool) for role, times in block.log_ns.items()}
         block = replace(block, temperatures=temperatures).take({**everything, **kept})
     return block, int(newest[-1])
 
@@ -302,9 +303,9 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     n_jumps = n_messages = span_ns = 0
     for block in blocks:
         thermometers = block.temperatures.values()
-        # Reading order: a reading precedes the sample for which it counts.
+        # Sort in reading order: a reading precedes the sample for which it counts.
         places = [*(thermometer.after for thermometer in thermometers), np.arange(len(block))]
-        stamps = np.concatenate([*(one.stamp_ns for one in thermometers), block.accel_stamp_ns])
+        stamps = np.concatenate([*(part.stamp_ns for part in thermometers), block.accel_stamp_ns])
         if not len(stamps):
             yield block
             continue
@@ -323,12 +324,12 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
             raise RecordingError(clocks_apart(block) or reason, path)
         offsets = np.empty_like(moved)
         offsets[order] = moved
-        parts = np.split(offsets, np.cumsum([len(one.after) for one in thermometers]))
+        parts = np.split(offsets, np.cumsum([len(readings.after) for readings in thermometers]))
         yield replace(
             block,
             accel_stamp_ns=block.accel_stamp_ns + parts[-1],
             temperatures={
-                name: one._replace(stamp_ns=one.stamp_ns + by)
-                for (name, one), by in zip(block.temperatures.items(), parts, strict=False)
+                name: part._replace(stamp_ns=part.stamp_ns + by)
+                for (name, part), by in zip(block.temperatures.items(), parts, strict=False)
             },
         )

@@ -10,9 +10,10 @@ from ..unit.gravity import STANDARD_GRAVITY
 from .blocks import Block
 from .stillness import Cells
 
-# Shares of the samples: below the first a fault is a glitch, above the second it concerns all.
+# Share of faulty samples below which the fault is a glitch, and above which it concerns them all.
 _SOME, _MOST = 0.01, 0.5
-# Reading at rest / gravity: range with gravity, and upper limit without gravity.
+# Ratio of |a| at rest to gravity: range if the samples contain gravity, upper limit if gravity is
+# subtracted from them.
 _ABOUT_ONE, _NONE = (0.8, 1.25), 0.3
 
 
@@ -33,7 +34,7 @@ class CauseCounter:
         self._is_imu |= imu is not None
         if covariance is not None:
             self._n_absent += int(np.count_nonzero(covariance[:, 0] == -1.0))
-        if len(self._stamps_ns) < 2:  # only "all equal" matters
+        if len(self._stamps_ns) < 2:  # two stamps show that not all are equal
             self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
 
     def cause(self, cells: Cells, still_sd: float) -> str:

@@ -3,10 +3,9 @@
 """
 Owns the spans of a file that hold messages: unpacking within limits, and finding the messages.
 
-The size that a chunk or frame declares is only used as an upper limit. Its message index is never
-trusted: the records it points at must fill the chunk without gap or overlap; otherwise the records
-are read one by one.
-https://mcap.dev/spec
+The size that a chunk or frame declares is only used as an upper limit. The message index of a
+chunk is never trusted: the records it points at must fill the chunk without gap or overlap;
+otherwise the records are read one by one. https://mcap.dev/spec
 """
 
 import bz2
@@ -48,7 +47,7 @@ MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
-_STEP_BYTES = 1 << 16  # decompressed at a time: the most that is lost before a damage [bytes]
+_STEP_BYTES = 1 << 16  # size of a decompressed piece, the largest loss before damaged data [bytes]
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,
@@ -176,7 +175,8 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
     if begin != len(index) or not is_inside:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
-    # Unsigned on purpose: a length that is too small wraps around to a huge one.
+    # The numbers are unsigned on purpose: a length that is too small wraps around to a huge
+    # number.
     length = number_at(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
     if int(np.max(length)) > len(data) or (number_at(head, 0, 'u1') != MESSAGE).any():
         return None
@@ -189,8 +189,8 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
 
 def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
     """
-    Read record by record while they are complete; return the messages and the reason of the stop.
-    Before zeros the last message is dropped: its end may be zeros, too.
+    Read complete records one by one; return the messages and the reason why reading stopped. If
+    zeros follow the last message, it is dropped: its last bytes may be zeros, too.
     """
     view = data.data
     places: list[int] = []
@@ -214,17 +214,17 @@ def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
         else:
             on_record(opcode, bytes(view[at + PREFIX.size : end]))
         at = end
-    found = np.array(places[:-1] if reason == _ZERO_OPCODE else places, np.int64)
-    head = gather(data, found, MESSAGE_HEAD_BYTES)
+    starts = np.array(places[:-1] if reason == _ZERO_OPCODE else places, np.int64)
+    head = gather(data, starts, MESSAGE_HEAD_BYTES)
     size = number_at(head, 1, '<i8') - _MESSAGE_FIELDS_BYTES
-    return _messages(data, found, size, head), reason
+    return _messages(data, starts, size, head), reason
 
 
 def _messages(data: Bytes, at: Ints, size: Ints, head: NDArray[np.void]) -> Messages:
     log_ns = number_at(head, 15, '<i8').astype(np.int64)
     if len(log_ns) and int(np.min(log_ns)) < 0:
         raise DamagedError('a message has a log time beyond the year 2262')
-    channel = number_at(head, 9, '<u2').astype(np.uint16)  # contiguous: every role searches it
+    channel = number_at(head, 9, '<u2').astype(np.uint16)  # contiguous for fast searches
     return Messages(data, at + MESSAGE_HEAD_BYTES, size, channel, log_ns)
 
 

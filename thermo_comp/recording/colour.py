@@ -15,9 +15,10 @@ from ..typing import Bools, Floats
 if TYPE_CHECKING:
     from .stillness import Cells
 
-# Quantiles in sd: a tenth, and what chance exceeds once in 1e11; degrees of freedom, as a part of
-# the samples', from which on noise is coloured, and the fewest of a cell.
+# Standard normal quantiles of the probabilities 0.1 and 1 - 1e-11.
 _TENTH, _NEVER = -1.2816, 6.7
+# Ratio of the degrees of freedom to those of white noise, below which noise is coloured; smallest
+# number of degrees of freedom of a cell; number of iterations, and of values in a search.
 _COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
 
 
@@ -26,8 +27,8 @@ def spread_of_variances(cells: Cells, believable: Bools, level: Floats) -> Float
     Return the spread of the variances of cells at rest relative to white noise, per axis.
 
     After a low pass a cell has few independent samples. With a correlation r of successive samples
-    their effective number is smaller by (1 - r) / (1 + r), and the roughness is 1 - r of the
-    variance, which follows from the tenth percentile `level` for these degrees of freedom.
+    their effective number is smaller by the factor (1 - r) / (1 + r), and the roughness is 1 - r
+    times the variance, which follows from its tenth percentile `level` and this number.
     """
     n_free = float(np.median(cells.count[believable])) - 1.0
     quiet = believable & (cells.variance <= level).any(axis=1)

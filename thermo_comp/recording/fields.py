@@ -58,14 +58,14 @@ def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitio
                 defined |= get_types_from_idl(part.partition('\n')[2] if _IDL in text else part)
     except TypesysError as error:
         raise RecordingError(f'the definition of {kind} cannot be read') from error
-    found = ChainMap(defined, typestore().fielddefs)
-    if kind not in found:
+    known_types = ChainMap(defined, typestore().fielddefs)
+    if kind not in known_types:
         raise RecordingError(f'the bag does not define its type {kind}')
-    return found
+    return known_types
 
 
 def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[str]:
-    """List the numbers of a type whose name says temperature, but for extremes of another."""
+    """List the fields of a type that are numbers named temperature, without minima and maxima."""
     try:
         fields = definitions_of(kind, known)[kind][1]
     except RecordingError:
@@ -115,7 +115,7 @@ class Field:
         if not self.has_stamp:
             return np.full(len(messages), NO_STAMP_NS), values
         seconds, rest = (
-            self._find(messages, f'{self._header}stamp.{one}') for one in ('sec', 'nanosec')
+            self._find(messages, f'{self._header}stamp.{part}') for part in ('sec', 'nanosec')
         )
         return seconds.astype(np.int64) * 10**9 + rest, values
 

@@ -76,12 +76,12 @@ def growing_blocks(
 
 
 def _size(path: Path) -> int:
-    return sum(one.stat().st_size for one in (path.iterdir() if path.is_dir() else [path]))
+    return sum(file.stat().st_size for file in (path.iterdir() if path.is_dir() else [path]))
 
 
 def numbered_bags(folder: Path) -> list[Path]:
     """List the bags of a folder, in the order of their numbers."""
-    bags = {int(one.stem): one for one in folder.glob('*.mcap') if one.stem.isdecimal()}
+    bags = {int(path.stem): path for path in folder.glob('*.mcap') if path.stem.isdecimal()}
     return [bags[number] for number in sorted(bags)]
 
 
@@ -160,12 +160,12 @@ class PositionBags:
             self.written.append(path)
             self._number += 1
         accel = COUNTS if block.imu is None else IMU_IN
-        for role, one in block.raw.items():
+        for role, messages in block.raw.items():
             is_accel = role == 'accel'
             topic = accel.name if is_accel else thermometer(role)
             kind = accel.type if is_accel else TEMPERATURE
-            if self._writer is not None and len(one):
-                self._writer.write_raw(topic, kind, one.log_ns, one)
+            if self._writer is not None and len(messages):
+                self._writer.write_raw(topic, kind, messages.log_ns, messages)
 
     def close(self, before_ns: int = _NEVER_NS) -> None:
         """Write the held messages stamped before `before_ns`, by default all; close the bag."""

@@ -42,7 +42,7 @@ _MAX_SUMMARY_BYTES = 1 << 28
 _MAX_SMALL_RECORD = 1 << 22
 _WINDOW_BYTES = 1 << 22
 _MAX_HELD_BYTES = 1 << 26  # largest memory for messages of overlapping chunks [bytes]
-#: Texts for a file that ends inside a record, by its opcode; -1 for the others.
+#: Texts for a file that ends inside a record, by the record's opcode; -1: any other opcode.
 _CUTS = {
     0: 'it is unreadable from byte {at} on',
     int(Opcode.CHUNK): 'it ends inside a chunk, of which the first {} messages are read',
@@ -84,7 +84,7 @@ class McapFile(BagFile):
         order = sorted(range(len(self.spans)), key=lambda row: self.spans[row].start_ns)
         spans = [self.spans[row] for row in order]
         loaded = map(partial(self._load, channels), spans)
-        if any(one.end_ns > other.start_ns for one, other in pairwise(self.spans)):
+        if any(span.end_ns > other.start_ns for span, other in pairwise(self.spans)):
             following = [*(span.start_ns for span in spans[1:]), None]
             return _in_order(zip(order, loaded, following, strict=True))
         return loaded
@@ -143,27 +143,27 @@ class McapFile(BagFile):
             reader = StreamReader(BytesIO(content), skip_magic=True, emit_chunks=True)
             for record in reader.records:
                 records_of.setdefault(type(record), []).append(record)
-            (said,) = records_of[Statistics]
+            (text,) = records_of[Statistics]
         except Exception:  # noqa: BLE001 - damaged bytes surface as nearly any exception type
             return
-        counts, n_messages = said.channel_message_counts, said.message_count
+        counts, n_messages = text.channel_message_counts, text.message_count
         channels: dict[int, Channel] = {one.id: one for one in records_of.get(Channel, [])}
         chunks = sorted(records_of.get(ChunkIndex, []), key=lambda one: one.chunk_start_offset)
         spans = [Span(*_SPAN_FIELDS(chunk)) for chunk in chunks]
         if (
             sum(counts.values()) != n_messages
             or not counts.keys() <= channels.keys()
-            or not len(spans) == len({span.position for span in spans}) == said.chunk_count
+            or not len(spans) == len({span.position for span in spans}) == text.chunk_count
             or any(span.position + span.length + span.index_length > self._size for span in spans)
         ):
             return
         self._channels = channels
-        self._schemas = {one.id: one for one in records_of.get(Schema, [])}
+        self._schemas = {schema.id: schema for schema in records_of.get(Schema, [])}
         self.spans = [span for span in spans if span.size]
         if self.spans:
             self._counts.update(counts)
             if n_messages:
-                self.start_ns, self.end_ns = said.message_start_time, said.message_end_time
+                self.start_ns, self.end_ns = text.message_start_time, text.message_end_time
         for index in records_of.get(MetadataIndex, []):
             is_small = PREFIX.size <= index.length <= _MAX_SMALL_RECORD
             if index.name == METADATA_NAME and is_small and index.offset < self._size:
@@ -176,7 +176,7 @@ class McapFile(BagFile):
             return
         try:
             record = _KINDS[opcode].read(_new_stream(BytesIO(content)))
-        except Exception as error:  # see above
+        except Exception as error:  # damaged bytes surface as nearly any exception type
             raise DamagedError('a record is shorter than its content') from error
         if opcode == Opcode.SCHEMA:
             self._schemas[record.id] = record
@@ -200,7 +200,7 @@ class McapFile(BagFile):
                     raise DamagedError(f'the record at byte {at} is not whole')
                 words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
-                    # Include the following zeros, which end the span: its end may be zeros too.
+                    # Add the zeros that follow the span: its own last bytes may be zeros, too.
                     kind = last.kind if last.kind == 'loose' else 'torn'
                     spans[-1] = replace(last, length=last.length + PREFIX.size, kind=kind)
                 elif opcode == Opcode.CHUNK:
@@ -245,8 +245,8 @@ class McapFile(BagFile):
                 self._counts.update(messages.channel.tolist())
                 start, end = int(np.min(messages.log_ns)), int(np.max(messages.log_ns))
                 self.spans.append(replace(span, start_ns=start, end_ns=end))
-        self.start_ns = min((one.start_ns for one in self.spans), default=None)
-        self.end_ns = max((one.end_ns for one in self.spans), default=None)
+        self.start_ns = min((span.start_ns for span in self.spans), default=None)
+        self.end_ns = max((span.end_ns for span in self.spans), default=None)
         return words.format(n_torn)
 
 
@@ -258,15 +258,15 @@ def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Me
     for row, piece, next_ns in pieces:
         held[row] = piece
         ready = []
-        for number, one in sorted(held.items()):
-            n = len(one) if next_ns is None else int(np.searchsorted(one.log_ns, next_ns))
+        for number, part in sorted(held.items()):
+            n = len(part) if next_ns is None else int(np.searchsorted(part.log_ns, next_ns))
             if n:
-                ready.append(one.take(slice(0, n)))
-            if n == len(one):
+                ready.append(part.take(slice(0, n)))
+            if n == len(part):
                 del held[number]
             elif n or number == row:
-                held[number] = one.take(slice(n, None)).packed()
-        if sum(len(one.data) for one in held.values()) > _MAX_HELD_BYTES:
+                held[number] = part.take(slice(n, None)).packed()
+        if sum(len(piece.data) for piece in held.values()) > _MAX_HELD_BYTES:
             raise DamagedError(
                 'too many of its chunks overlap in time to be read in bounded memory; '
                 'sort it by time with another tool'

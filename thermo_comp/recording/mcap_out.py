@@ -39,7 +39,7 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
     'lz4': lambda data, _: lz4.frame.compress(data),
     'zstd': zstandard.compress,
 }
-#: Topics of which a late reader gets the last message, perhaps in a namespace.
+#: Topics of which a late subscriber gets the last message; a namespace may precede the name.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 # Versions of mcap differ in its type hints.
@@ -119,7 +119,7 @@ class McapOutput:
         return channel.id
 
     def append(self, batches: Sequence[Messages]) -> None:
-        """Add messages in log-time order; full chunks are written, the rest is kept."""
+        """Add messages in log-time order; full chunks are written, the other messages are kept."""
         messages = join_messages([*self._tail, *batches])
         n_old = sum(map(len, self._tail))
         order = np.argsort(messages.log_ns[n_old:], kind='stable')
@@ -137,13 +137,13 @@ class McapOutput:
         for messages in self._tail:
             if len(messages):
                 self._put_chunk(messages)
-        found = self._information()
-        self._put_metadata('rosbag2', {'serialized_metadata': dump_yaml(found).strip()})
+        information = self._information()
+        self._put_metadata('rosbag2', {'serialized_metadata': dump_yaml(information).strip()})
         self._put_record(records.DataEnd(data_section_crc=0))
         self._put_summary()
         os.fsync(self._stream.fileno())
         self.close()
-        return found
+        return information
 
     def _information(self) -> dict[str, Any]:
         """Build metadata.yaml as in Jazzy."""

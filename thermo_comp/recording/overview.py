@@ -24,8 +24,8 @@ from .topics import PLAIN, Topics, shown
 #: Range of readings that are probably kelvins: no board endures them in degC.
 KELVINS = (180.0, 480.0)
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
-_CELL_S, _MIN_REST_S = 0.5, 3.0
-_GAP_INTERVALS = 5.0  # pause that counts as a gap, in usual intervals
+_CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
+_GAP_INTERVALS = 5.0  # pause that counts as a gap, in median intervals
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name yours with '
     '--topic counts=TOPIC or --topic imu=TOPIC'
@@ -48,7 +48,7 @@ class ThermometerSurvey:
 @dataclass(frozen=True)
 class Survey:
     """
-    Summary of a recording for a fit. The rate follows from the usual interval; still intervals
+    Summary of a recording for a fit. The rate follows from the median interval; still intervals
     last at least 3 s; findings are obstacles to a fit, with the next step.
     """
 
@@ -99,9 +99,9 @@ def thermal_findings(
 
 
 def unused_thermometers(reader: RecordingReader) -> list[str]:
-    """List unused topics that may hold a temperature: a barometer's, the air's, another IMU's."""
+    """List unused topics that may hold a temperature, as of a barometer, the air, another IMU."""
     candidates = []
-    paths = {role: one.path for role, one in reader.fields.items()}
+    paths = {role: field.path for role, field in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}
     for name, (kind, count) in sorted(reader.info.topics.items()):
         # A message of one bare number needs no name of a field.
@@ -123,7 +123,7 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         cells, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        # Kept in memory: a thermal test has few readings compared with its samples.
+        # Readings are kept in memory: a thermal test has few readings compared with its samples.
         readings: dict[str, list[Readings]] = {}
         clock = _Clock()
         for block in reader.blocks():
@@ -148,11 +148,11 @@ def survey_recording(
         (info.truncated, f'cut off: {info.truncated}'),
         (reader.apart, 'a fit needs one clock for all'),
         (not n, _NO_SAMPLES),
-        *((True, one) for one in thermal_findings(thermometers, candidates)),
+        *((True, finding) for finding in thermal_findings(thermometers, candidates)),
         (cause, cause),
         (
             n and not still and not cause,
-            f'it never rests for 3 s, and a fit needs rests: {why_restless(reduced)}',
+            f'the unit never rests for 3 s, and a fit needs rests: {why_restless(reduced)}',
         ),
         (clock.n_backwards, f'{clock.n_backwards} stamps do not rise: those samples are left out'),
         (clock.n_gaps, f'{clock.n_gaps} gaps, the longest {clock.longest_gap_s:.3g} s'),
@@ -174,7 +174,7 @@ def survey_recording(
 
 @dataclass
 class _Clock:
-    """The stamps so far: the usual interval, gaps, and stamps that do not rise."""
+    """The stamps so far: their median interval, gaps, and stamps that do not rise."""
 
     n: int = 0
     first_ns: int = 0

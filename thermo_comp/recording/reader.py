@@ -55,8 +55,8 @@ class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
 
-    An absent role in `require` is an error. `info` describes the bag; after all blocks are read,
-    its `truncated` names the missing messages. `topics` are the bag's names by role, `fields` the
+    The roles in `require` must be in the bag. `info` describes the bag; after all blocks are read,
+    `info.truncated` names the missing messages. `topics` are the bag's names by role, `fields` the
     fields read from messages with more content, `definitions` encoding and text of message types.
     Raises RecordingError if it is not a bag or damaged, or a topic is missing or ambiguous.
     """
@@ -75,9 +75,9 @@ class RecordingReader(ExitStack):
                 selected = select_topics(self.info.topics, topics, require, self.info.metadata)
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
-            bare = [role for role, one in self.fields.items() if not one.has_stamp]
-            said = f'{", ".join(bare)} without a stamp: counts from the sample before it'
-            chosen = '; '.join(filter(None, (selected.chosen, said if bare else '')))
+            bare = [role for role, field in self.fields.items() if not field.has_stamp]
+            note = f'{", ".join(bare)} without a stamp: counts from the sample before it'
+            chosen = '; '.join(filter(None, (selected.chosen, note if bare else '')))
             self.info = replace(self.info, input=selected.input, chosen=chosen or None)
         except BaseException as error:
             self.close()
@@ -85,13 +85,14 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Begin of the part that is read since the bag's first sample [s]; set by that sample.
+        #: Time from the bag's first sample to the begin of the part [s]; set when that sample is
+        #: read.
         self.since_s = 0.0
         self.apart = ''  # warning about a thermometer with another clock, so far
 
-    def _fields(self, found: Selected) -> Iterator[tuple[Role, Field]]:
-        for role, path in found.fields.items():
-            topic = found.topics[role]
+    def _fields(self, selected: Selected) -> Iterator[tuple[Role, Field]]:
+        for role, path in selected.fields.items():
+            topic = selected.topics[role]
             kind = self.info.topics[topic][0]
             try:
                 yield role, Field(kind, path, definitions_of(kind, self.definitions))
@@ -112,22 +113,25 @@ class RecordingReader(ExitStack):
                 with translated(name):
                     notes.append(expand(name, file))
             is_packed = described.compression == 'message'
-            one: McapFile | ForeignFile
+            opened: McapFile | ForeignFile
             if described.storage == 'mcap' and not is_packed:
-                one = McapFile(file, name)
+                opened = McapFile(file, name)
             else:
-                one = ForeignFile(file, name, is_packed=is_packed)
-            self.callback(one.close)
-            self._files.append(one)
-            if one.truncated is not None:
+                opened = ForeignFile(file, name, is_packed=is_packed)
+            self.callback(opened.close)
+            self._files.append(opened)
+            if opened.truncated is not None:
                 front = f'{name.name}: ' if len(described.files) > 1 else ''
-                notes.append(front + one.truncated)
+                notes.append(front + opened.truncated)
         channels: dict[str, list[Topic]] = {}
-        for topic in (topic for one in self._files for topic in one.topics.values()):
+        for topic in (topic for file in self._files for topic in file.topics.values()):
             channels.setdefault(topic.name, []).append(topic)
         topics = {
-            name: (' | '.join(dict.fromkeys(o.type for o in own)), sum(o.n_messages for o in own))
-            for name, own in channels.items()
+            name: (
+                ' | '.join(dict.fromkeys(o.type for o in carriers)),
+                sum(o.n_messages for o in carriers),
+            )
+            for name, carriers in channels.items()
         }
         for wanted, n_promised in described.counts.items():
             notes.append(_loss(wanted, topics.get(wanted, ('', 0))[1], n_promised))
@@ -179,8 +183,8 @@ class RecordingReader(ExitStack):
         """Read serialized messages of topics (the bag's names), roughly in log-time order."""
         for _, channels, messages in self._read(topics, {'cdr'}):
             for number, topic in channels.items():
-                if len(one := messages.of_channels([number])):
-                    yield topic, one.packed()
+                if len(batch := messages.of_channels([number])):
+                    yield topic, batch.packed()
 
     def _read(
         self, names: Collection[str], encodings: Collection[str]
@@ -238,7 +242,7 @@ open_recording = RecordingReader
 def read_recording(
     path: str | Path, topics: Topics | None = None, *, require: Collection[Role] = ROLES
 ) -> Recording:
-    """Read a whole bag into memory; as `open_recording`, and RecordingError for damaged data."""
+    """Read a whole bag into memory; raises as `open_recording`, also for damaged data."""
     with open_recording(path, topics, require=require) as reader:
         blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), (), ROLES)
         return Recording(reader.info, joined(blocks))
@@ -259,7 +263,7 @@ def _described(path: Path) -> _Description:
         if described is not None:
             return described
         for suffix in ('.mcap', '.db3'):
-            files = [one for one in path.iterdir() if one.suffix == suffix and one.is_file()]
+            files = [file for file in path.iterdir() if file.suffix == suffix and file.is_file()]
             if files:
                 if len({re.sub(r'_[0-9]+$', '', file.stem) for file in files}) > 1:
                     raise RecordingError(
@@ -306,8 +310,8 @@ def _read_metadata(directory: Path) -> _Description | None:
             raise TypeError('no files')
         files = tuple(directory / PurePath(str(name)).name for name in names)
         counts: Counter[str] = Counter()
-        for one in content.get('topics_with_message_count') or ():
-            counts[str(one['topic_metadata']['name'])] += int(one['message_count'])
+        for entry in content.get('topics_with_message_count') or ():
+            counts[str(entry['topic_metadata']['name'])] += int(entry['message_count'])
         description = _Description(
             storage=str(content['storage_identifier']),
             files=files,
@@ -361,26 +365,26 @@ class ForeignFile(BagFile):
             if reader.message_count:
                 self.start_ns = int(reader.start_time)
                 self.end_ns = int(reader.end_time) - 1
-            for number, one in enumerate(reader.connections):
+            for number, link in enumerate(reader.connections):
                 # Columns of an SQLite database have no fixed type.
-                if not (isinstance(one.topic, str) and isinstance(one.msgtype, str)):
+                if not (isinstance(link.topic, str) and isinstance(link.msgtype, str)):
                     raise RecordingError('a topic has no name or no type')
-                self.topics[number] = Topic(one.topic, one.msgtype, encoding, one.msgcount)
-                if one.msgdef.data and not is_ros1:
-                    kind = f'ros2{one.msgdef.format.name.lower()}'
-                    self.definitions[one.msgtype] = kind, one.msgdef.data
+                self.topics[number] = Topic(link.topic, link.msgtype, encoding, link.msgcount)
+                if link.msgdef.data and not is_ros1:
+                    kind = f'ros2{link.msgdef.format.name.lower()}'
+                    self.definitions[link.msgtype] = kind, link.msgdef.data
 
     def read(self, channels: Collection[int]) -> Iterator[Messages]:
         """Read the messages of channels (the reader's connections) in reading order."""
         chosen = [self._reader.connections[number] for number in channels]
-        known = {(one.topic, one.msgtype): n for n, one in zip(channels, chosen, strict=True)}
+        known = {(link.topic, link.msgtype): n for n, link in zip(channels, chosen, strict=True)}
         batch: list[tuple[bytes, int, int]] = []
         n_bytes = 0
-        for one, log_ns, packed in self._reader.messages(connections=chosen):
+        for channel, log_ns, packed in self._reader.messages(connections=chosen):
             data = packed
             if self._is_packed:
                 data = inflate('zstd', packed, MAX_CHUNK_BYTES).tobytes()
-            batch.append((data, known[one.topic, one.msgtype], log_ns))
+            batch.append((data, known[channel.topic, channel.msgtype], log_ns))
             n_bytes += len(data)
             is_long = n_bytes >= _BATCH_BYTES or log_ns - batch[0][2] > _BATCH_NS
             if is_long or len(batch) >= _BATCH_MESSAGES:

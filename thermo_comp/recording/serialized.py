@@ -94,8 +94,8 @@ class Messages:
         ends = np.cumsum(self.size + room)
         data = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
         for each in np.unique(self.size[self.size > 0]).tolist():
-            own = np.flatnonzero(self.size == each)
-            scatter(data, ends[own] - each, gather(self.data, self.start[own], each))
+            rows = np.flatnonzero(self.size == each)
+            scatter(data, ends[rows] - each, gather(self.data, self.start[rows], each))
         return Messages(data, ends - self.size, self.size, self.channel, self.log_ns)
 
 
@@ -106,6 +106,6 @@ def join_messages(pieces: Sequence[Messages]) -> Messages:
     begins = np.cumsum([0, *(len(piece.data) for piece in pieces)])
     return Messages(
         np.concatenate([piece.data for piece in pieces]),
-        np.concatenate([one.start + at for one, at in zip(pieces, begins, strict=False)]),
+        np.concatenate([piece.start + at for piece, at in zip(pieces, begins, strict=False)]),
         *(np.concatenate([getattr(piece, n) for piece in pieces]) for n in Messages.__slots__[2:]),
     )

@@ -22,8 +22,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..typing import Bools, Floats, Ints
 from .colour import roughest_at_rest, spread_of_variances
 
-#: Largest variance of a cell at rest (n >= 30 samples) / quiet level: noise exceeds 4 with a
-#: probability below 1e-11, and vibration that must be cut out is far above.
+#: Largest ratio of a cell's variance (n >= 30 samples) at rest to the quiet level: noise exceeds 4
+#: with a probability below 1e-11, and vibration that must be cut out is far above.
 VARIANCE_RATIO = 4.0
 #: Largest scatter at rest [g]: above that of the noisiest sensors, below that of most flights.
 STILL_SD = 0.05
@@ -41,11 +41,11 @@ _DRIFT_STEPS, _DRIFT = 9, 5e-5
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # possible lengths of a cell of slow samples, in windows
 _LONGEST_CELL_NS = 86400e9  # a longer cell comes from wrong stamps
-MIN_SAMPLES = 30
+MIN_SAMPLES = 30  # smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: the square of a larger one may overflow
 _WORD = 32768.0  # the middle of unsigned 16-bit words
-_LONGER = (23, 31)  # magnitude bits of longer words
-_STUCK = 0.3  # noise / quantum below which a sensor repeats one number for long
+_LONGER = (23, 31)  # magnitude bits of 24- and 32-bit words
+_STUCK = 0.3  # ratio of noise to quantum below which a sensor mostly repeats one number
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,11 @@ class Cells:
     """
     Sufficient statistics of short runs of samples, shape (n,) and (n, 3).
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
-    Dropped are samples that are not finite or whose stamp does not rise. `quantum` is their step,
-    0 without one; `middle` that of words of 16 bits without a sign, or 0; rates are in rad/s.
+    Dropped are samples that are not finite or whose stamp does not rise. `quantum` is the step of
+    the samples, 0 if there is none; `middle` is 32768 for unsigned 16-bit words, else 0; rates are
+    in rad/s.
     `roughness` is half the mean square change from sample to sample: the variance of white noise;
-    `seam` the change to a cell's first sample from the last one of the cell right before it.
+    `seam` the change to a cell's first sample from the last sample of the cell right before it.
     """
 
     start_ns: int
@@ -101,8 +102,8 @@ class CellAccumulator:
         self._last_ns: int | None = None
         self._last = np.zeros((0, 3))  # the sample before
         self._shift = np.zeros(3)
-        # Number, samples, time, sums, sums of squares, change from the cell before, and sums of
-        # squared changes of each cell; the last one is open.
+        # Row of a cell: its number, number of samples, and sums of times, samples and their
+        # squares; change from the cell before; sum of squared changes. The last cell is open.
         self._sums: list[Floats] = [np.empty((0, 15))]
         self._n_dropped = self._n_saturated = self._n_looked_at = 0
         self._is_integer, self._is_negative = True, False
@@ -276,16 +277,16 @@ def still_runs(
     # A sensor that repeats one number does not show its noise: toggling between two adjacent
     # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
     # variance is a little below its mean; 1.3 covers it for cells of 32 samples.
-    usual = np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
+    noise = np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice that allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
     by_drift = within**2 / 6.0 if len(within) else 0.0
     result = []
     for ratio in ratios:
-        quiet = believable & (cells.variance <= ratio * usual + by_drift).all(axis=1)
+        quiet = believable & (cells.variance <= ratio * noise + by_drift).all(axis=1)
         roughest = roughest_at_rest(cells, quiet, wider > 1.0, ratio)
         quiet &= (cells.roughness <= roughest).all(axis=1)
-        # A single change of this many sd has the roughness of a whole cell.
+        # Noise of this roughness changes between two cells by at most `_STEP_SDS` sd.
         is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
         broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
         # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.
@@ -300,7 +301,7 @@ def still_runs(
 def without_rotation(cells: Cells) -> Cells:
     """
     Subtract from the angular rate of each cell the median rate of the cells before it, so that a
-    unit at a constant angular rate counts as at rest, and one whose rate changes does not.
+    unit at a constant angular rate counts as at rest, and a unit whose rate changes does not.
     """
     n = max(1, round(_ROTATION_S / cells.cell_s)) if cells.cell_s else 1
     if len(cells.rate) <= n or not cells.rate.any():

@@ -24,7 +24,7 @@ from .blocks import Input, Role
 PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {key: topic.type for key, topic in INPUTS.items()}
-#: Name of a driver's topic in REP 145 and of the node's output; other topics of the bag decide.
+#: Name of a driver's topic in REP 145 and of the node's output; the bag's other topics show which.
 _RAW = IMU_OUT.name
 #: Words in the names of vector topics that are not a specific force.
 _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
@@ -44,7 +44,7 @@ Present = Mapping[str, tuple[str, int]]
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """From `begin` to before `end`: seconds since the first sample, or stamps, from 1e8 on."""
+    """Part of a bag: seconds from its first sample, or stamps (from 1e8 on); `end` is excluded."""
 
     begin: float | None = None
     end: float | None = None
@@ -60,7 +60,7 @@ class Part:
 
     @property
     def is_stamped(self) -> bool:
-        """Whether the times are stamps."""
+        """Whether begin and end are stamps, not seconds from the first sample."""
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
 
     def limits_ns(self, first_ns: float) -> tuple[float, float]:
@@ -95,18 +95,18 @@ class Topics:
     case: str = CASE.name
     further: Mapping[str, str] = field(default_factory=dict)
     part: Part = WHOLE
-    input: Input = 'auto'  # which prefers the counts
+    input: Input = 'auto'  # auto prefers the counts
 
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> Topics:
         """
         Build from topics by ``counts``, ``imu``, ``board``, ``case`` or ``temperature/<name>``; if
-        only one of counts and Imu is named, that one is read.
+        only one of counts and Imu is named, this input is read.
         """
         roles: dict[str, Any] = {}
         further = {}
         for name, topic in names.items():
-            if name == 'output':  # of the node
+            if name == 'output':  # the node's output is no input
                 continue
             role = name.removeprefix('temperature/')
             if not topic.strip('/'):
@@ -142,7 +142,7 @@ class Selected(NamedTuple):
 def read_names(path: str | Path) -> dict[str, str]:
     """Read a file of ``INPUT: TOPIC`` lines, as in config/drivers."""
     names = read_plain_yaml(path)
-    if not isinstance(names, dict) or not all(isinstance(one, str) for one in names.values()):
+    if not isinstance(names, dict) or not all(isinstance(name, str) for name in names.values()):
         raise ThermoCompError('expected lines of INPUT: TOPIC', path)
     return names
 
@@ -171,7 +171,7 @@ def shown(name: str) -> str:
     return one_line(name if len(name) <= _MAX_SHOWN else name[:_MAX_SHOWN] + '...')
 
 
-def said_choice(name: str, key: str, wanted: str, among: str = 'only') -> str:
+def choice_note(name: str, key: str, wanted: str, among: str = 'only') -> str:
     """Note that a topic was chosen for an input by its type; empty if it has the wanted name."""
     kind = _TYPES[key].rpartition('/')[2]
     is_named = is_called(name, split_field(wanted)[0])
@@ -193,10 +193,10 @@ def select_topics(
         raise RecordingError('the bag holds no messages')
     name_of: dict[Role, str] = {}
     keys: dict[Role, str] = {}
-    own = _corrected(present, metadata)
+    corrected = _corrected(present, metadata)
     inputs = ['counts', 'imu'] if topics.input == 'auto' else [topics.input]
     for role, wanted in {'accel': inputs, 'board': ['board'], 'case': ['case']}.items():
-        names = dict(_candidates(present, topics, wanted, own))
+        names = dict(_candidates(present, topics, wanted, corrected))
         key = next((key for key, name in names.items() if present[name][1]), next(iter(names), ''))
         if key:
             name = _of_type(present, names[key], _TYPES[key], getattr(topics, key))
@@ -205,16 +205,16 @@ def select_topics(
             elif role in require:
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
-            raise _missing(present, {key: getattr(topics, key) for key in wanted}, own)
+            raise _missing(present, {key: getattr(topics, key) for key in wanted}, corrected)
     among = ["driver's", 'only']  # chosen by the name that drivers use, or as the only one
     chosen = [
-        said_choice(
+        choice_note(
             name_of[role], key, getattr(topics, key), among[not is_called(name_of[role], _RAW)]
         )
         for role, key in keys.items()
     ]
-    if own and 'accel' not in name_of:
-        chosen.append(_said_corrected(own))
+    if corrected and 'accel' not in name_of:
+        chosen.append(_said_corrected(corrected))
     name_of |= _further(present, topics, name_of, is_read=bool(require))
     named = {**topics.further, 'board': topics.board, 'case': topics.case}
     fields = {role: split_field(named.get(role, ''))[1] for role in name_of if role != 'accel'}
@@ -223,14 +223,14 @@ def select_topics(
     }
     fields = {role: one for role, one in fields.items() if one}
     _check_twins(name_of, fields)
-    said = '; '.join(filter(None, chosen)) or None
-    return Selected(name_of, fields, cast(Any, keys.get('accel')), said)
+    text = '; '.join(filter(None, chosen)) or None
+    return Selected(name_of, fields, cast(Any, keys.get('accel')), text)
 
 
-def _check_twins(found: Mapping[Role, str], fields: Mapping[Role, str]) -> None:
+def _check_twins(topics_of: Mapping[Role, str], fields: Mapping[Role, str]) -> None:
     """Refuse a topic, or a field of it, for two inputs."""
     roles: dict[tuple[str, str], Role] = {}
-    for role, name in found.items():
+    for role, name in topics_of.items():
         if (twin := roles.setdefault((name, fields.get(role, '')), role)) != role:
             raise RecordingError(TWINS.format(twin, role), key=shown(name))
 
@@ -282,7 +282,7 @@ def _said_corrected(name: str) -> str:
 
 
 def _further(
-    present: Present, topics: Topics, found: Mapping[Role, str], *, is_read: bool
+    present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
     """Find the further thermometers: those named, and those beside the board's or the case's."""
     both = {}
@@ -292,10 +292,10 @@ def _further(
             both[sensor] = _of_type(present, name, TEMPERATURE, wanted)
         elif is_read:
             raise _missing(present, {thermometer(sensor): wanted})
-    beside = found.get('board') or found.get('case') or ''
+    beside = topics_of.get('board') or topics_of.get('case') or ''
     namespace, is_usual, _ = beside.rpartition('temperature/')
     front = f'{namespace}temperature/' if is_usual else '/temperature/'
-    taken = {*found.values(), *both.values()}
+    taken = {*topics_of.values(), *both.values()}
     for name, (kind, count) in present.items():
         sensor = name.removeprefix(front)
         is_beside = kind == TEMPERATURE and count and sensor != name and name not in taken
@@ -327,7 +327,7 @@ def _match(present: Present, wanted: str, key: str) -> str | None:
     spaced = spaced or sorted(name for name in present if name.endswith('/' + bare))
     if len(spaced) > 1:
         raise RecordingError(
-            f'several topics end in it: {", ".join(map(shown, spaced[:_MAX_LISTED]))}; '
+            f'several topics end in this name: {", ".join(map(shown, spaced[:_MAX_LISTED]))}; '
             f'choose one with --topic {key}=TOPIC',
             key=wanted,
         )

@@ -84,7 +84,7 @@ def decode_blocks(
             if changes:
                 runs = (slice(*run) for run in pairwise([0, *changes, len(messages)]))
                 pieces = (messages.take(run) for run in runs)
-                return [decode_blocks(one, feeds, roles, keep_raw=keep_raw)[0] for one in pieces]
+                return [decode_blocks(part, feeds, roles, keep_raw=keep_raw)[0] for part in pieces]
             accel, samples_ns, samples, frames = rank, stamp_ns, numbers, frame
         else:
             after = np.searchsorted(accel, rank).astype(np.int64)

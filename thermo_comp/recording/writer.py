@@ -52,7 +52,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         path: str | Path,
         *,
         compression: Compression = 'zstd',
-        # On Imu messages a sixth faster than level 1, and at most a few percent larger.
+        # zstd's level -1 writes Imu messages a sixth faster than 1, at most a few percent larger.
         level: int = -1,
         metadata: Mapping[str, str] | None = None,
         overwrite: bool = False,
@@ -115,12 +115,12 @@ class BagWriter(AbstractContextManager['BagWriter']):
         ]
         imu = imu or ImuColumns.of_rate(None)
         places = zip((0, 4, 13, 16), imu._fields, imu, (4, 9, 3, 9), strict=False)
-        columns += [(at, f'imu.{name}', one, width) for at, name, one, width in places]
+        columns += [(at, f'imu.{name}', part, width) for at, name, part, width in places]
         self._write_stamped(topic, IMU, stamp_ns, log_ns, frame_id, columns)
 
     def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
         """Write std_msgs/Bool."""
-        rows = [b'\0\1\0\0' + bytes([one]) for one in np.asarray(values, np.bool_).tolist()]
+        rows = [b'\0\1\0\0' + bytes([flag]) for flag in np.asarray(values, np.bool_).tolist()]
         self.write_raw(topic, BOOL, log_ns, rows)
 
     def write_raw(
@@ -151,9 +151,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
         try:
             self.flush()
             with self._translated():
-                found = self._file.finish()
+                information = self._file.finish()
                 if not self._is_file:
-                    text = dump_yaml({'rosbag2_bagfile_information': found})
+                    text = dump_yaml({'rosbag2_bagfile_information': information})
                     with (self._draft.partial / 'metadata.yaml').open('wb') as file:
                         file.write(text.encode())
                         file.flush()
@@ -255,7 +255,7 @@ def table_writer(
     path: str | Path, metadata: Mapping[str, str], *, overwrite: bool = False
 ) -> Iterator[WriteRows]:
     """
-    Write a table in the format of its suffix (`TABLES`, else CSV), which appears at the end.
+    Write a table in the format of its suffix (`TABLES`, else CSV); the file appears when complete.
     Yields a function that takes columns by name, shape (n,), the same names every time; CSV drops
     the metadata. OutputError if the table may not or cannot be written, or pyarrow is missing.
     """
@@ -270,7 +270,7 @@ def table_writer(
                 if writer is None:
                     writer = csv.writer(text, lineterminator='\n')
                     writer.writerow(columns)
-                writer.writerows(zip(*(one.tolist() for one in columns.values()), strict=True))
+                writer.writerows(zip(*(col.tolist() for col in columns.values()), strict=True))
 
             yield write_lines
             return

@@ -53,7 +53,7 @@ class StateResult(NamedTuple):
     bias: str  # [micro-g]
     bias_expanded: str
     bias_deviation: str
-    scale: str  # from that at the reference temperature [ppm]
+    scale: str  # relative to the scale at the reference temperature [ppm]
     scale_expanded: str
     scale_deviation: str
 
@@ -117,7 +117,7 @@ def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | N
 
 def combined(contributions: tuple[Contribution, ...]) -> float:
     """Return the combined standard uncertainty of the stated contributions [m/s^2]."""
-    return float(np.sqrt(sum((one.standard or 0.0) ** 2 for one in contributions)))
+    return float(np.sqrt(sum((part.standard or 0.0) ** 2 for part in contributions)))
 
 
 def results(
@@ -133,7 +133,7 @@ def results(
     known = COVERAGE if calibration.has_uncertainty else np.nan
     scale_sd = np.hypot(scale_sd, _gravity_part(evidence, info)) * np.abs(scale)
     below = ((1, 0), (2, 0), (2, 1))
-    said = {
+    constants = {
         'scale factor {}': (AXES, scale, scale_sd, f'{unit} per m/s²'),
         'bias {}': (AXES, bias / MICRO_G, bias_sd / MICRO_G, 'µg'),
         'misalignment {}': (
@@ -145,7 +145,7 @@ def results(
     }
     rows = [
         Result(name.format(part), *rounded(float(value), float(known * sd)), of)
-        for name, (parts, values, sds, of) in said.items()
+        for name, (parts, values, sds, of) in constants.items()
         for part, value, sd in zip(parts, values, sds, strict=True)
     ]
     for term in nonlinear_coefficients(calibration):
@@ -156,10 +156,10 @@ def results(
     if contributions and evidence.judgement is not None:
         expanded_ug = COVERAGE * combined(contributions) / MICRO_G
         for name in ('static', 'dynamic'):
-            one = evidence.judgement.sections[name]
-            if one.n:
+            section = evidence.judgement.sections[name]
+            if section.n:
                 is_known = known > 0.0 and unclaimed_gravity_sd(evidence, info) is not None
-                mean_ug = one.mean / MICRO_G
+                mean_ug = section.mean / MICRO_G
                 texts = rounded(mean_ug, expanded_ug) if is_known else (number(mean_ug), '–')
                 rows.append(Result(f'mean of |f| − g, {name}', *texts, 'µg'))
     return rows
@@ -190,8 +190,8 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
                     expanded = float(known * sd[row, column])
                     both = float(value[row, column]), float(off[row, column])
                     if math.isfinite(expanded):
-                        said, deviation = (rounded(one, expanded)[0] for one in both)
-                        cells += said, rounded(both[0], expanded)[1], deviation
+                        text, deviation = (rounded(part, expanded)[0] for part in both)
+                        cells += text, rounded(both[0], expanded)[1], deviation
                     else:
                         cells += number(both[0], 4), '–', number(both[1], 4)
                 celsius = minus(f'{at[row]:.1f}')
@@ -221,7 +221,7 @@ def withheld_because(evidence: Evidence, info: CertificateInfo) -> str:
 
 
 def conformity(evidence: Evidence) -> tuple[str, str]:
-    """State conformity to the limit that was specified, and the rule; no limit, no statement."""
+    """Return the statement of conformity to the specified limit, '' without a limit; the rule."""
     judgement = evidence.judgement
     if judgement is None:
         return '', 'No recording was judged: no statement of conformity is made.'
@@ -234,7 +234,7 @@ def conformity(evidence: Evidence) -> tuple[str, str]:
     return (
         f'The unit {does} to the limit of {limit} µg.',
         'Rule: simple acceptance. The RMS of |f| − g of each regime within the calibrated ranges '
-        'is at most the limit, and below that without the correction; the uncertainty is not '
+        'is at most the limit, and below the RMS without correction; the uncertainty is not '
         'subtracted from the limit (guard band 0).',
     )
 

@@ -34,7 +34,7 @@ RAW = 'raw'
 CHOSEN = 'calibration'
 #: For each position of a fit: the calibration fitted to the other positions.
 LEFT_OUT = 'left out'
-# Rate range of a set below which it has no ramps in that direction [K/min].
+# Rate of a set's range below which the set has no ramps in this direction [K/min].
 _SLOWEST_RAMP_K_MIN = 0.05
 #: Key of a bag's metadata in which the simulator stores the truth.
 _SIMULATED = 'truth'
@@ -42,7 +42,7 @@ _SIMULATED = 'truth'
 
 @dataclass(frozen=True)
 class Position:
-    """A still position: direction of the force in the output frame, RMS of |f| - g by rung."""
+    """A still position: direction of the force in the output frame, RMS of |f| - g by `rung`."""
 
     number: int
     bag: int
@@ -98,7 +98,7 @@ class Evidence:
 
     @property
     def headline(self) -> str:
-        """The verdict with its numbers, or why there is none."""
+        """The verdict with its numbers, or the reason why nothing was judged."""
         if self.judgement is not None:
             return str(self.judgement)
         if self.calibration is not None:
@@ -122,8 +122,8 @@ class Evidence:
         """The bag of the time figures, with the node's thermal state."""
         if not self.bags:
             return None
-        one, index = self.calibration, widest(self.bags)
-        detector = learn_detector(self.bags) if one is None else one.detector
+        calibration, index = self.calibration, widest(self.bags)
+        detector = learn_detector(self.bags) if calibration is None else calibration.detector
         return shown_bag(self.bags[index], index, detector)
 
     @property
@@ -138,7 +138,7 @@ class Evidence:
 
     @cached_property
     def residuals(self) -> dict[str, Floats]:
-        """``|f| - g`` of each of `forces` [m/s^2]; empty without gravity."""
+        """``|f| - g`` for each entry of `forces` [m/s^2]; empty if gravity is not known."""
         if self.gravity is None or self.windows is None:
             return {}
         sizes = self.windows.size
@@ -149,7 +149,7 @@ class Evidence:
         """The attitude with the largest uncertainty; None if the calibration states none."""
         if self.calibration is None:
             return None
-        return least_known(self.calibration, np.array([one.up for one in self.positions]))
+        return least_known(self.calibration, np.array([rest.up for rest in self.positions]))
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
@@ -176,11 +176,11 @@ class Evidence:
 
     @property
     def positions_text(self) -> str:
-        """Count the distinct directions, and the rests if there are more of them."""
+        """Count the distinct directions, and the rests if these are more than the directions."""
         n_rests = len(self.positions)
-        n = len(distinct_directions(np.array([one.up for one in self.positions]).reshape(-1, 3)))
-        said = counted(n, 'position')
-        return said if n == n_rests else f'{said} ({counted(n_rests, "rest")})'
+        n = len(distinct_directions(np.array([rest.up for rest in self.positions]).reshape(-1, 3)))
+        text = counted(n, 'position')
+        return text if n == n_rests else f'{text} ({counted(n_rests, "rest")})'
 
     def axis_residuals(self) -> dict[str, Floats]:
         """Return by rung the residual of each axis about its position's mean, (n, 3) [m/s^2]."""
@@ -218,7 +218,7 @@ def evidence_of_bags(
     calibration of another unit; RecordingError if the samples are too slow for the windows.
     """
     windows = judgement = None
-    said = sorted({bag.source.serial for bag in bags if bag.source.serial})
+    serials = sorted({bag.source.serial for bag in bags if bag.source.serial})
     if calibration is None:
         windows = corrected_windows(bags, None, gravity=gravity, window_s=window_s)
     else:
@@ -230,7 +230,7 @@ def evidence_of_bags(
             bags, calibration, gravity=gravity, window_s=window_s, tolerance=tolerance
         )
     return Evidence(
-        serial=serial or ', '.join(said) or 'unknown',
+        serial=serial or ', '.join(serials) or 'unknown',
         calibration=calibration,
         gravity=gravity,
         bags=tuple(bags),
@@ -243,9 +243,9 @@ def evidence_of_bags(
 
 def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
     """Collect the results of a fit on its bags; `gravity_sd` as given to the fit [m/s^2]."""
-    rests = [(bag.source.name, one.start_ns) for bag in result.bags for one in bag.intervals]
-    left_out = {(one.source, one.start_ns): one.left_out_rms for one in result.positions}
-    against = [f'{one.name}: {one.message}' for one in result.findings if _is_reservation(one)]
+    rests = [(bag.source.name, rest.start_ns) for bag in result.bags for rest in bag.intervals]
+    left_out = {(place.source, place.start_ns): place.left_out_rms for place in result.positions}
+    against = [f'{note.name}: {note.message}' for note in result.findings if _is_reservation(note)]
     window_s = usual_window(result.bags)
     judged = evidence_of_bags(result.bags, result.calibration, window_s=window_s, serial='')
     return replace(
@@ -254,7 +254,7 @@ def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
         gravity_sd=gravity_sd,
         left_out={k: left_out[one] for k, one in enumerate(rests) if left_out.get(one, 0.0) > 0.0},
         findings=tuple(dict.fromkeys((*judged.findings, *against))),
-        checks=tuple(one.message for one in result.findings if not _is_reservation(one)),
+        checks=tuple(note.message for note in result.findings if not _is_reservation(note)),
     )
 
 
@@ -264,19 +264,19 @@ def _is_reservation(finding: Finding) -> bool:
 
 
 def _against(calibration: Calibration) -> tuple[str, ...]:
-    """List the reservations about a calibration itself, except the advice of more positions."""
+    """List the reservations about a calibration, except the advice to record more positions."""
     lower, upper = calibration.dynamic.rate_range_k_min
     notes = [
         f'the bags hold no {name}: the dynamic set is extrapolated there'
         for name, rate in (('heating', upper), ('cooling', -lower))
         if rate < _SLOWEST_RAMP_K_MIN
     ]
-    for one in calibration.provenance.residuals:
-        left_out = one.left_out_rms_m_s2
-        if one.section == 'all' and left_out is not None and left_out >= one.raw_rms_m_s2:
+    for part in calibration.provenance.residuals:
+        left_out = part.left_out_rms_m_s2
+        if part.section == 'all' and left_out is not None and left_out >= part.raw_rms_m_s2:
             notes.append(
                 f'on positions left out {spoken(left_out)} are no better than '
-                f'{spoken(one.raw_rms_m_s2)} raw: the positions do not predict a new attitude'
+                f'{spoken(part.raw_rms_m_s2)} raw: the positions do not predict a new attitude'
             )
     if not calibration.has_uncertainty:
         notes.append('the calibration states no uncertainty')

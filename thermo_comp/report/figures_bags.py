@@ -19,7 +19,7 @@ from .evidence import LEFT_OUT, RAW, Evidence, Position, given
 from .html import number
 from .trace import ShownBag
 
-# Time over which the zero of the drift is averaged [s]: against noise, short against any ramp.
+# Time over which readings are averaged to the zero of the drift [s]; short compared with any ramp.
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
@@ -88,7 +88,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
             _symmetric(axes, residual[rows])
         stats = statistics_by_regime(residual[rows], dynamic)
         del stats['all']
-        parts = [f'{name} {number(one.rms / MICRO_G)}' for name, one in stats.items() if one.n]
+        parts = [f'{name} {number(stat.rms / MICRO_G)}' for name, stat in stats.items() if stat.n]
         title = f'{rung}: RMS {", ".join(parts)} µg'
         if axes is panels[0]:
             style.legend_above(axes, title)
@@ -102,7 +102,7 @@ def draw_gravity(evidence: Evidence) -> Figure:
     """Draw |f| over time, before and after, and after in detail (the paper's Fig. 7)."""
     residuals = evidence.residuals
     corrected = [rung for rung in residuals if rung != RAW]
-    sets = [one for one in (list(residuals), corrected) if one]
+    sets = [forces for forces in (list(residuals), corrected) if forces]
     figure, panels, _, unit = _panels(evidence, [1.6] * len(sets), more=0.4)
     for axes, drawn in zip(panels, sets, strict=True):
         for rung in drawn:
@@ -119,7 +119,7 @@ def draw_gravity(evidence: Evidence) -> Figure:
 def _panels(
     evidence: Evidence, heights: Sequence[float], *, more: float = 0.0, is_flagged: bool = False
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
-    """Make panels over the time of the shown bag, grey where dynamic; and their time unit [s]."""
+    """Make panels over time for the shown bag, grey where dynamic; return also the time unit."""
     shown = given(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
@@ -161,7 +161,7 @@ def _drift(evidence: Evidence) -> tuple[Floats, str]:
         begin = windows.time[rows] <= windows.time[rows][0] + _ZERO_S
         drift[rows] -= windows.mean[rows][begin].mean(axis=0)
     if evidence.calibration is not None:
-        K = [one.scale_factor for one in evidence.calibration.axes]
+        K = [axis.scale_factor for axis in evidence.calibration.axes]
         return drift / K / MICRO_G, 'µg'
     return (drift / MICRO_G, 'µg') if evidence.is_imu else (drift, 'counts')
 
@@ -199,11 +199,11 @@ def draw_every_position(evidence: Evidence) -> Figure:
     """Draw |f| - g over time in every position, or in those with the largest residuals."""
     windows = given(evidence.windows)
     judged, residual = list(evidence.residuals.items())[-1]
-    worst = sorted(evidence.positions, key=lambda one: -one.residual_rms[judged])[:_MOST]
-    shown = sorted(worst, key=lambda one: one.number)
+    worst = sorted(evidence.positions, key=lambda place: -place.residual_rms[judged])[:_MOST]
+    shown = sorted(worst, key=lambda place: place.number)
     numbers = np.unique(windows.position)
     limit = float(np.quantile(np.abs(residual), 0.998)) * 1.15
-    unit, name = style.time_unit(max(one.duration_s for one in shown))
+    unit, name = style.time_unit(max(position.duration_s for position in shown))
     figure = style.new_figure(0.8 + 0.24 * len(shown))
     axes = figure.subplots()
     for row, one in enumerate(shown):
@@ -212,14 +212,14 @@ def draw_every_position(evidence: Evidence) -> Figure:
         value = row - 0.5 * residual[rows] / limit
         dynamic = windows.is_dynamic[rows]
         axes.axhline(row, color='black', linewidth=0.4)
-        # Dashes would hide noise: the regimes differ by line width.
+        # The regimes differ by line width, because dashes would hide noise.
         for is_drawn, color, width in ((~dynamic, style.BLACK, 1.4), (dynamic, style.RED, 0.7)):
             axes.plot(time, np.where(is_drawn, value, np.nan), color=color, linewidth=width)
     axes.set_ylim(len(shown) - 0.4, -0.6)
-    axes.set_yticks(range(len(shown)), [str(one.number) for one in shown])
+    axes.set_yticks(range(len(shown)), [str(position.number) for position in shown])
     right = axes.secondary_yaxis('right')
     right.set_yticks(
-        range(len(shown)), [number(one.residual_rms[judged] / MICRO_G) for one in shown]
+        range(len(shown)), [number(position.residual_rms[judged] / MICRO_G) for position in shown]
     )
     right.set_ylabel('RMS, µg')
     axes.set_ylabel('position')
@@ -241,10 +241,10 @@ def draw_positions(evidence: Evidence) -> Figure:
         if least is not None and (least.up[2] >= 0.0) == (side > 0):
             place = equal_area(least.up, side)
             axes.plot(*place, 'x', markersize=7.0, color=style.RED, mew=1.6)
-            said = '±' + spoken(least.sd_m_s2).replace('ug', 'µg')
-            # Towards the middle: the names of the axes are outside.
+            text = '±' + spoken(least.sd_m_s2).replace('ug', 'µg')
+            # Shift the label towards the middle, as the names of the axes are outside.
             by = (0.0, 6.0 if place[1] < 0.0 else -12.0)
-            _note(axes, said, place, by, ha='center', color=style.RED)
+            _note(axes, text, place, by, ha='center', color=style.RED)
         axes.set_title(name, loc='center')
     return figure
 
@@ -265,7 +265,7 @@ def _note(
 def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, rung: str) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     axes.plot(np.cos(angle), np.sin(angle), color='black', linewidth=0.8)
-    # 45 degrees of elevation, in the same projection.
+    # Radius of the circle at an elevation of 45 degrees, in the projection of `equal_area`.
     ring = np.sqrt(1.0 - np.sin(np.pi / 4.0))
     for line in (
         (ring * np.cos(angle), ring * np.sin(angle)),

@@ -60,11 +60,11 @@ def utc(stamp_ns: int) -> dt.datetime:
 
 def _css_text(value: str) -> Markup:
     """Quote a text for a style sheet: characters other than letters and digits are escaped."""
-    said = ''.join(
+    text = ''.join(
         c if c.isalnum() and c.isascii() else f'\\{ord(c):06x}'
         for c in label_text(value, _LONGEST_MARGIN)
     )
-    return Markup(f'"{said}"')  # noqa: S704 - everything is escaped
+    return Markup(f'"{text}"')  # noqa: S704 - everything is escaped
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -77,7 +77,7 @@ def number(value: float, digits: int = 3) -> str:
     if size > 8:
         return f'{value:.{digits - 1}e}'
     decimals = min(digits - 1 - size, digits)
-    # Not -0.
+    # Adding 0.0 turns -0.0 into 0.0.
     return minus(f'{round(value, decimals) + 0.0:.{max(decimals, 0)}f}')
 
 
@@ -93,15 +93,15 @@ def spelt(text: str) -> str:
 
 
 def rounded(value: float, expanded: float) -> tuple[str, str]:
-    """Round an uncertainty to two digits, its value to that place; an unknown one is a dash."""
+    """Round an uncertainty to two digits, the value to the same place; unknown is a dash."""
     if not 0.0 < expanded < math.inf:
         return number(value, 6), '–'
     place = 1 - math.floor(math.log10(expanded))
     if round(expanded, place) >= 10.0 ** (2 - place):  # 0.0996 is 0.10
         place -= 1
-    # Not -0.
-    said = (f'{round(one, place) + 0.0:.{max(place, 0)}f}' for one in (value, expanded))
-    return minus(next(said)), next(said)
+    # Adding 0.0 turns -0.0 into 0.0.
+    texts = (f'{round(x, place) + 0.0:.{max(place, 0)}f}' for x in (value, expanded))
+    return minus(next(texts)), next(texts)
 
 
 def label_text(value: str, limit: int = 40) -> str:

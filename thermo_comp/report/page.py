@@ -65,9 +65,9 @@ def write_report(
     page = render_report(evidence, info)
     if figures is not None:
         with drawing():
-            for number, one in enumerate(figures_of(evidence), 1):
-                name = Path(figures) / f'{number}_{one.name}.png'
-                write_atomically(name, png(one.draw()), PICTURE, overwrite=overwrite)
+            for number, figure in enumerate(figures_of(evidence), 1):
+                name = Path(figures) / f'{number}_{figure.name}.png'
+                write_atomically(name, png(figure.draw()), PICTURE, overwrite=overwrite)
     write_atomically(path, page.encode(), PAGE, overwrite=overwrite)
 
 
@@ -143,18 +143,18 @@ def remarks_of(bag: ReducedBag) -> list[str]:
 
 
 def _seen(evidence: Evidence) -> list[str]:
-    """Describe the bags of the verdict, and state if their regime was never known."""
-    said = []
+    """Describe the bags of the verdict; add a sentence if their regime was never known."""
+    collected = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board
         which = 'bags of the fit' if evidence.is_seen else 'bags that the fit did not use'
-        said.append(
+        collected.append(
             f'{evidence.positions_text} in {which}, {np.min(board):.1f} to {np.max(board):.1f} °C.'
         )
     shown = evidence.shown
     if shown is not None and all(stretch.regime == Regime.UNKNOWN for stretch in shown.stretches):
-        said.append('The regime was never known: the bag is too short for the detector.')
-    return said
+        collected.append('The regime was never known: the bag is too short for the detector.')
+    return collected
 
 
 def _programs(evidence: Evidence) -> str:
@@ -280,7 +280,7 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             of_bags.draw_every_position,
             'A row for each position: |f| − g after the correction, over the time since the '
             'position began; all rows have the scale that is written above. Black and wide: '
-            'static regime; red and thin: dynamic regime. On the right the RMS.',
+            'static regime; red and thin: dynamic regime. On the right: RMS of the position.',
         )
     if evidence.positions:
         yield (

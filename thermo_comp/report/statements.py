@@ -17,7 +17,7 @@ Text = Annotated[str, Bounds(longest=500)]
 
 @dataclass(frozen=True)
 class Party:
-    """Who calibrates, or for whom."""
+    """The laboratory that calibrates, or its customer."""
 
     name: Text = ''
     address: Text = ''
@@ -46,7 +46,7 @@ class Instrument:
 
 @dataclass(frozen=True)
 class GravityStatement:
-    """How well local gravity is known, and from where."""
+    """Standard uncertainty of local gravity, and its source."""
 
     standard_uncertainty_m_s2: NotNegative | None = None
     source: Text = ''
@@ -61,7 +61,7 @@ class Thermometers:
 
 @dataclass(frozen=True)
 class Dates:
-    """When, as in 2026-03-31; `receipt` is when the unit came to the laboratory."""
+    """Dates like 2026-03-31; `receipt` is the day on which the laboratory received the unit."""
 
     receipt: Text = ''
     test: Text = ''

@@ -19,7 +19,7 @@ _MOST_TEMPERATURES = 8
 
 
 class Program(NamedTuple):
-    """A soak, or a ramp through the whole range of a set from a soak at its end."""
+    """A soak, or a ramp through the whole range of a set from a soak at an end of the range."""
 
     name: str  # soak, heating or cooling
     regime: RegimeSet
@@ -84,10 +84,10 @@ def slopes(soak: Curve) -> Floats:
 
 
 def table_temperatures(lowest: float, highest: float) -> Floats:
-    """Choose the temperatures of a table: both ends of a range, and round ones between them."""
+    """Choose the temperatures of a table: both ends of a range, and round numbers between them."""
     span = highest - lowest
     step = next((one for one in _STEPS_K if span <= one * (_MOST_TEMPERATURES - 2)), _STEPS_K[-1])
     within = step * np.arange(math.ceil(lowest / step), math.floor(highest / step) + 1)
-    # A round temperature within a quarter of the step from an end would repeat the end's row.
+    # Skip round temperatures within a quarter of a step from an end: their row repeats the end's.
     kept = within[(within - lowest > 0.25 * step) & (highest - within > 0.25 * step)]
     return np.array([lowest, *kept, highest])

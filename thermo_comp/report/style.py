@@ -23,7 +23,7 @@ Line = dict[str, Any]
 BLACK, BLUE, RED, GREEN, GREY = '#000000', '#0072B2', '#D55E00', '#007A5A', '#8A8A8A'
 _DASHED, _DOTTED = (0, (5, 2)), (0, (1.2, 1.6))
 
-#: For `set_prop_cycle`: one plot of three columns draws all axes.
+#: Colours and dashes of x, y, z for `set_prop_cycle`, so that one plot call draws all three.
 AXIS_CYCLE = cycler(
     color=(BLUE, RED, GREEN), linestyle=('-', _DASHED, _DOTTED), linewidth=(1.1, 1.1, 1.5)
 )

@@ -47,7 +47,7 @@ class ShownBag:
 
     @property
     def leader(self) -> str:
-        """The leading sensor: the case's, if there is one."""
+        """The leading sensor: the case's if the bag has a case thermometer, else the board's."""
         return 'case' if len(self.bag.case.value) else 'board'
 
 
@@ -80,7 +80,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
         rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *lead.acceleration))
         flags.append((tracker.detector.regime, tracker.detector.direction))
     time: Floats = np.array([stamp_ns - start_ns for _, stamp_ns, _ in readings]) * 1e-9
-    # The last of several states at one time holds; consecutive equal states are one stretch.
+    # Of several states at the same time the last applies; consecutive equal states are a stretch.
     state_at = {
         0.0: (Regime.UNKNOWN, 0),
         **dict(zip(np.clip(time, 0.0, end).tolist(), flags, strict=True)),

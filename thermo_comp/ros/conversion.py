@@ -20,7 +20,7 @@ from sensor_msgs.msg import Imu, Temperature
 
 #: Compensates a sample: stamp and three components in, force and covariance out; None = dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
-#: Corrects the angular rate of that sample: rate and variances out.
+#: Corrects the angular rate of the same sample: stamp and rate in, rate and variances out.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 
 #: Longest message read [bytes]; an Imu with the longest frame name is shorter.
@@ -32,7 +32,8 @@ _HEADER = struct.Struct('<4siI4x')
 # linear acceleration 3 + 9 follow.
 _PASSED = 8 * 25
 _NO_GYRO = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
-#: Offset of the angular rate in these bytes; its format with the first covariance element.
+#: Offset of the angular rate in the `_PASSED` bytes; formats of the rate with the first element
+#: of its covariance, and with all of them.
 _RATE_AT = 8 * 13
 _RATE_IN, _RATE_OUT = struct.Struct('<4d'), struct.Struct('<12d')
 _CELSIUS = struct.Struct('<d')

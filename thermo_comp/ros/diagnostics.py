@@ -33,7 +33,7 @@ from .waitloop import WaitLoop
 IDLE_S = 5.0  # time without samples after which readings take effect without them [s]
 #: Lead of the readings' stamps over the samples' [s] above which the clocks differ.
 AHEAD_S = 5.0
-#: Samples have stopped when the next one is late by both limits: cycles, and [s].
+#: Samples have stopped when the next sample is late by both limits: cycles, and [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Largest error of |f| at rest, in its standard deviations.
 GRAVITY_SIGMAS = 5.0
@@ -59,7 +59,7 @@ _RISEN = {
 
 _FAULTS = {
     Fault.STILL: 'stands still to the bit, its uncertainty grows',
-    Fault.FROZEN: 'frozen: the other moves; its readings are not used',
+    Fault.FROZEN: 'frozen while the other thermometer moves: not used',
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
 }
 
@@ -102,11 +102,11 @@ class Reporter:
         if status.stamp_ns is not None and self._before_ns is not None:
             passed_s = (status.stamp_ns - self._before_ns) * 1e-9
             if passed_s > 0.0 and new['n_in'] and self._before['n_in']:
-                # In samples per second of the stamps.
+                # The rate in samples per second, by the samples' stamps.
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
-        found = findings_of(loaded, status, new, rate, silence_s)
-        findings = [*self._inputs(), *self._lost_rests(), *found]
+        findings = [*self._inputs(), *self._lost_rests()]
+        findings += findings_of(loaded, status, new, rate, silence_s)
         if (over := self._force_excess(loaded.calibration)) > 0.0:
             findings.append((_WARN, f'|f| {over:.3g} m/s^2 {_BEYOND_FORCE}'))
         findings.sort(key=lambda finding: -finding[0])
@@ -123,7 +123,7 @@ class Reporter:
         self._publisher.publish(array)
         if message.level != self._level:
             self._level, log = message.level, self._node.get_logger()
-            # rclpy wants one call per severity and place.
+            # rclpy fixes the severity of a place of call, so each severity has its own call.
             if message.level == DiagnosticStatus.OK:
                 log.info(message.message)
             elif message.level == DiagnosticStatus.WARN:
@@ -153,15 +153,15 @@ class Reporter:
 
     def _inputs(self) -> Iterator[Finding]:
         """List the problems of the publishers of the inputs."""
-        for name, one in self._relay.inputs.items():
-            n_publishers, topic = one.count_publishers(), one.subscription.topic_name
-            if n_publishers > 1 and one.sources.is_contested:
+        for name, source in self._relay.inputs.items():
+            n_publishers, topic = source.count_publishers(), source.subscription.topic_name
+            if n_publishers > 1 and source.sources.is_contested:
                 text = f'{n_publishers} publishers on {topic}'
                 yield _ERROR, f'{text}, the topic is not used until only one of them sends'
             elif n_publishers > 1:
                 # The middleware lists a killed publisher until its lease ends.
                 yield _WARN, f'{n_publishers} publishers on {topic}, of which one sends'
-            elif not n_publishers and (mismatch := _mismatch(self._node, one.subscription)):
+            elif not n_publishers and (mismatch := _mismatch(self._node, source.subscription)):
                 level = _ERROR if name in ('sample', 'board') else _WARN
                 yield level, f'no messages of a publisher on {topic}: {mismatch}'
 
@@ -194,8 +194,8 @@ class Reporter:
                 if name not in ('n_in', 'n_out')
             },
             **{
-                f'{name} publishers': str(one.count_publishers())
-                for name, one in self._relay.inputs.items()
+                f'{name} publishers': str(topic.count_publishers())
+                for name, topic in self._relay.inputs.items()
             },
             'sample stamp [ns]': str(status.stamp_ns).lower(),
             'serial': calibration.unit.serial,
@@ -205,7 +205,7 @@ class Reporter:
         }
 
     def _force_values(self, calibration: Calibration, status: CompensatorStatus) -> dict[str, str]:
-        """List what concerns the samples: |f|, rests, noise and uncertainty of each axis."""
+        """List the figures of the samples: |f|, rests, noise and uncertainty of each axis."""
         values, gravity = {}, status.gravity
         if calibration.nonlinearity is not None:
             values['force excess [m/s^2]'] = f'{self._force_excess(calibration):.3f}'
@@ -271,8 +271,8 @@ def _mismatch(node: Node, subscription: Subscription) -> str:
             return f'its type is {publisher.topic_type}, not {expected}'
         fit, reason = qos_check_compatible(publisher.qos_profile, subscription.qos_profile)
         if fit == QoSCompatibility.ERROR:
-            said = reason.replace('ERROR: ', '').rstrip('; ')
-            return f'{said} (qos_overrides.{topic}.subscription)'
+            text = reason.replace('ERROR: ', '').rstrip('; ')
+            return f'{text} (qos_overrides.{topic}.subscription)'
     return ''
 
 

@@ -69,7 +69,7 @@ class LiveTopics:
     @property
     def n_lost(self) -> int:
         """Number of messages that were sent and not received."""
-        return sum(one.n_lost for one in self._heard.values())
+        return sum(topic.n_lost for topic in self._heard.values())
 
     def blocks(self, wait: Callable[[float], bool]) -> Iterator[News | None]:
         """Yield the received blocks, and None after each `wait` [s], until `wait` returns True."""
@@ -79,15 +79,19 @@ class LiveTopics:
             if is_over:
                 self._stack.close()
             waiting = self._came[:]
-            # The thread may have appended more meanwhile.
+            # The thread may have appended more messages meanwhile.
             del self._came[: len(waiting)]
             if waiting:
                 feeds = [Feed(k, *one) for k, one in enumerate(self._feeds.items())]
                 numbers = {feed.role: feed.channel for feed in feeds}
                 messages = Messages.of(
-                    [one for role, own, _ in waiting for one in self._readable(role, own)],
+                    [
+                        message
+                        for role, messages, _ in waiting
+                        for message in self._readable(role, messages)
+                    ],
                     [numbers[role] for role, messages, _ in waiting for _ in messages],
-                    [one for _, _, received_ns in waiting for one in received_ns],
+                    [stamp for _, _, received_ns in waiting for stamp in received_ns],
                 ).in_order()
                 for decoded in decode_blocks(messages, feeds, numbers, keep_raw=True):
                     block, self._last_ns = with_stamps(decoded, self._last_ns)
@@ -99,7 +103,7 @@ class LiveTopics:
         return messages if field is None else list(map(field.as_temperature, messages))
 
     def _look(self) -> None:
-        """Subscribe to the published topics; note the others in `problems`."""
+        """Subscribe to the published topics; list topics without a publisher in `problems`."""
         problems: list[str] = []
         resolved = self._node.resolve_topic_name
         chosen = self._feeds.get('accel')
@@ -125,7 +129,7 @@ class LiveTopics:
         self.problems = tuple(problems)
 
     def _hear(self, role: Role, topic: str, kind: str, problems: list[str]) -> bool:
-        """Subscribe to a topic if it has a publisher; whether there is a subscription."""
+        """Subscribe to a topic if it has a publisher; return whether it is subscribed."""
         name = self._node.resolve_topic_name(split_field(topic)[0])
         if role in self._heard:
             n_publishers = self._heard[role].count_publishers()

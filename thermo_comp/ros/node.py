@@ -32,8 +32,9 @@ from .waitloop import WaitLoop, overrides
 
 NODE_NAME = 'thermo_comp'
 
-#: Pause after a wake-up, in which samples of 7 kHz or more gather [s], with best effort only. It
-#: saves a third of the CPU time at 10 kHz; at 5 kHz it would delay a sample longer than its relay.
+#: Pause after a wake-up, in which samples of 7 kHz or more gather [s], with best effort only. The
+#: pause saves a third of the CPU time at 10 kHz; at 5 kHz it would delay a sample longer than its
+#: relay.
 REST_S = 0.2e-3
 
 #: Time within which the process ends after a signal, even if a call hangs [s].
@@ -80,8 +81,8 @@ class CompensationNode:
         self._reader = Reader()
         self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
         self._report_every(config.diagnostics_period)
-        topics = [self.node.resolve_topic_name(one.name) for one in SAMPLES.values()]
-        # QoS overrides of the input that is not open: it may be opened later.
+        topics = [self.node.resolve_topic_name(sample.name) for sample in SAMPLES.values()]
+        # Accept QoS overrides also of the input that is not open: it may be opened later.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
         for name in overrides(self.node):
             if not (self.node.has_parameter(name) or name.startswith(known)):
@@ -152,13 +153,13 @@ class CompensationNode:
             if new:
                 self._say_calibration()
             self._loop.call_soon(partial(self._relay.release, before.samples))
-            # A failure up to here has changed nothing.
+            # Up to this line a failure changes nothing.
             return result  # noqa: TRY300
         except BaseException:
             self._run_with(before)
             self._relay.release(after.samples)
             changed = [
-                one for one in values if self.node.get_parameter(one.name).value != one.value
+                new for new in values if self.node.get_parameter(new.name).value != new.value
             ]
             self.node.set_parameters_atomically(changed)
             raise

@@ -51,7 +51,7 @@ class NodeConfig:
 
     calibration_file: str = _parameter(
         '',
-        'Path of the calibration (YAML). Required. Setting it again reads the file again.',
+        'Path of the calibration (YAML). Required. Setting the same path reads the file again.',
         longest=4096,
     )
     calibration_directory: str = _parameter(
@@ -142,11 +142,11 @@ def declare(node: Node) -> NodeConfig:
     """Declare every parameter with the user's value; ParameterError if it breaks the rule."""
     values, given = {}, overrides(node)
     names = named_topics(_checked('topics', given.get('topics', '')))
-    inputs = [one for one in ('counts', 'imu') if one in names]
+    inputs = [name for name in ('counts', 'imu') if name in names]
     if len(inputs) == 1:
         given['input'] = inputs[0]
     for name, entry in _TABLE.items():
-        # Checked here: rclpy refuses an integer for a float.
+        # The value is checked here, because rclpy refuses an integer for a float.
         values[name] = _checked(name, given.get(name, entry.default))
         node.declare_parameter(name, values[name], descriptor(name), ignore_override=True)
     return NodeConfig(**values)
@@ -182,7 +182,7 @@ def descriptor(name: str) -> ParameterDescriptor:
 
 def updated(config: NodeConfig, parameters: Iterable[Parameter]) -> NodeConfig:
     """Apply values set together, skipping unknown parameters; ParameterError as in `declare`."""
-    values = {one.name: _checked(one.name, one.value) for one in parameters if one.name in _TABLE}
+    values = {new.name: _checked(new.name, new.value) for new in parameters if new.name in _TABLE}
     return replace(config, **values)
 
 
@@ -247,7 +247,7 @@ class ParameterRequests:
 
     def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
         is_each, n, reason = kind is srv.SetParameters, len(request.parameters), ''
-        groups = [[one] for one in request.parameters] if is_each else [request.parameters]
+        groups = [[change] for change in request.parameters] if is_each else [request.parameters]
         waits = any(parameter.name == 'calibration_file' for parameter in request.parameters)
         results: list[SetParametersResult] = []
 
@@ -319,15 +319,15 @@ def read_parameter(message: ParameterMessage) -> Parameter:
         # rclpy would treat the empty name as declared.
         raise ParameterError('a parameter without a name')
     try:
-        one = Parameter.from_parameter_msg(message)
+        given = Parameter.from_parameter_msg(message)
     except (ValueError, TypeError) as error:
         raise ParameterError(
             f'parameter {message.name!r:.60} has no readable value (type {message.value.type})'
         ) from error
-    is_whole = one.type_ == Parameter.Type.INTEGER and one.name in _TABLE
-    if is_whole and isinstance(_TABLE[one.name].default, float):
-        return Parameter(one.name, Parameter.Type.DOUBLE, float(one.value))
-    return one
+    is_whole = given.type_ == Parameter.Type.INTEGER and given.name in _TABLE
+    if is_whole and isinstance(_TABLE[given.name].default, float):
+        return Parameter(given.name, Parameter.Type.DOUBLE, float(given.value))
+    return given
 
 
 def _refusal(reason: str) -> SetParametersResult:

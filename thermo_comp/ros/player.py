@@ -6,9 +6,9 @@ subscribers take it.
 
 Topics have the node's relative names, messages are unchanged and in the bag's order; ROS 1
 messages are rewritten in CDR. After `WINDOW` messages of a topic the player waits until every
-reliable subscriber has acknowledged them. Fast DDS requests that with every message only while the
-history is full, and otherwise every 3 s: therefore the histories are small, and transient-local
-durability keeps them full.
+reliable subscriber has acknowledged them. Fast DDS requests acknowledgements with every message
+only while the history is full, and otherwise every 3 s: therefore the histories are small, and
+transient-local durability keeps them full.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class Player:
     def unheard(self) -> list[str]:
         """Name the topics that have no subscriber."""
         return [
-            one.topic_name for one in self._publishers.values() if not one.get_subscription_count()
+            out.topic_name for out in self._publishers.values() if not out.get_subscription_count()
         ]
 
     def run(
@@ -183,7 +183,7 @@ class Player:
 def _in_order(block: Block) -> list[tuple[float, int, Role, bytes]]:
     """List a block's messages in the order of the bag: place, log time, role, bytes."""
     rows: list[tuple[float, int, Role, bytes]] = []
-    places: dict[Role, Any] = {role: one.after - 0.5 for role, one in block.temperatures.items()}
+    places: dict[Role, Any] = {role: part.after - 0.5 for role, part in block.temperatures.items()}
     places['accel'] = np.arange(len(block))
     for role, messages in block.raw.items():
         log_ns = block.log_ns[role].tolist()

@@ -4,7 +4,8 @@
 Owns the set-up of a process before its first node: handling of signals, Fast DDS profile.
 
 The middleware's signal handlers shut the context down while it is in use, which sometimes ends in
-a segmentation fault. Here a thread asks the loop to stop, which shuts everything down in order.
+a segmentation fault. With this module a thread asks the loop to stop, which shuts everything down
+in order.
 """
 
 from __future__ import annotations
@@ -25,14 +26,15 @@ PROFILE = Path(__file__).with_name('fastdds_profile.xml')
 
 def use_profile() -> None:
     """Set the node's profile for this process, unless a profile is set; before any context."""
-    # It saves a quarter of the CPU time with reliable subscribers (docs/benchmarks.md).
+    # The profile saves a quarter of the CPU time with reliable subscribers (docs/benchmarks.md).
     if VARIABLE not in os.environ and not Path(LOCAL_PROFILE).is_file():
         os.environ[VARIABLE] = str(PROFILE)
 
 
 class SignalWatch:
     """
-    Turns the first signal into a call; the second ends the process. For the main thread only.
+    Turns the first signal into a call; the second ends the process. The object must be used in the
+    main thread.
 
     If the process has not ended `ending_s` [s] after the call, it is ended.
     """

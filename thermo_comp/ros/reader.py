@@ -45,7 +45,7 @@ class LoadedCalibration:
 
 
 def read(name: str, directory: str = '') -> LoadedCalibration:
-    """Read and try a calibration; a CalibrationError quotes nothing of a file that is none."""
+    """Read and try a calibration; errors quote no content of a file that is no calibration."""
     if not name:
         raise CalibrationError(
             'parameter `calibration_file` is not set; start with '
@@ -55,7 +55,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
         path = Path(name).expanduser()
         root = Path(directory).expanduser().resolve() if directory else None
         try:
-            # After links are resolved; an unreadable folder gives the same error as one outside.
+            # Links are resolved first; an unreadable folder gives the error of a file outside.
             if root is not None and not path.resolve().is_relative_to(root):
                 raise PermissionError
             content = read_bounded(path, SIZE_LIMIT, root)
@@ -93,12 +93,12 @@ def read_within(name: str, directory: str, limit_s: float = LIMIT_S) -> LoadedCa
     # A daemon: if the file hangs, the end of the process does not wait for it.
     threading.Thread(target=answer, name='first reading', daemon=True).start()
     try:
-        found = answers.get(timeout=limit_s)
+        received = answers.get(timeout=limit_s)
     except Empty:
         raise _hanging(name, limit_s) from None
-    if isinstance(found, Exception):
-        raise found
-    return found
+    if isinstance(received, Exception):
+        raise received
+    return received
 
 
 def _hanging(name: str, limit_s: float) -> CalibrationError:
@@ -140,7 +140,8 @@ class Reader:
         if self._is_closed:
             raise EOFError
         self._pipe, theirs = Pipe()
-        # Same package path as here; Ctrl-C goes to the node only, which ends this process.
+        # The process has the package path of this process; Ctrl-C goes to the node only, which
+        # ends this process.
         code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve'
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603 - fixed interpreter and arguments
@@ -164,7 +165,7 @@ def serve(handle: int, parent: int) -> None:
     os.nice(NICENESS)
     pipe = Connection(handle)
     with suppress(AttributeError, OSError):
-        # Killed with the node, even while a file hangs.
+        # This process is killed with the node, even while a file hangs.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         return

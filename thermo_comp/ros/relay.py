@@ -30,8 +30,8 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, readings take effect once they are older than the newest by this [ns]: a sample
-#: that Fast DDS has to repeat can be 3 s late.
+#: Without samples, a reading takes effect when it is older than the newest reading by this time
+#: [ns]: a sample that Fast DDS has to repeat can be 3 s late.
 IDLE_NS = 1_000_000_000
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
@@ -75,8 +75,8 @@ class Relay:
         self._publish: Callable[[bytes], None] = imu.handle.publish_raw
         self._check_topics(imu.topic_name)
         self._flags = [
-            (loop.publisher(message_class(one.type), one.name, qos_of(one)).publish, pack)
-            for one, pack in FLAGS.items()
+            (loop.publisher(message_class(flag.type), flag.name, qos_of(flag)).publish, pack)
+            for flag, pack in FLAGS.items()
         ]
         self.rests = RestKeeper(config.rest_log) if config.rest_log else None
         #: Samples that the rest log has not summed yet; None without one.
@@ -92,8 +92,8 @@ class Relay:
     def _check_topics(self, output: str) -> None:
         """Refuse a topic shared by two thermometers, and an output equal to the input."""
         roles: dict[tuple[str, str], str] = {}
-        for name, one in self.thermometers.items():
-            topic = one.subscription.topic_name
+        for name, heard in self.thermometers.items():
+            topic = heard.subscription.topic_name
             twin = roles.setdefault((topic, split_field(self._topic(name))[1]), name)
             if twin != name:
                 raise ThermoCompError(TWINS.format(twin, name), key=topic)
@@ -103,8 +103,8 @@ class Relay:
 
     def look(self) -> None:
         """Subscribe again to thermometers whose messages have another type."""
-        for name, one in list(self.thermometers.items()):
-            if self._fields[name].kind is not Temperature or one.count_publishers():
+        for name, heard in list(self.thermometers.items()):
+            if self._fields[name].kind is not Temperature or heard.count_publishers():
                 continue
             try:
                 field = live_field(self._loop.node, self._topic(name))
@@ -114,9 +114,10 @@ class Relay:
                     self._loop.node.get_logger().error(str(error))
                 continue
             if field is not None:
-                topic = one.subscription.topic_name
+                topic = heard.subscription.topic_name
                 self._loop.unsubscribe(self.thermometers.pop(name))
-                # The middleware allows one type per topic: the loop must release the first before.
+                # The middleware allows one type per topic: the loop must release the old
+                # subscription first.
                 self._loop.call_soon(partial(self._hear, name, topic, field))
 
     def _hear(self, name: str, topic: str, field: LiveField) -> None:
@@ -201,7 +202,7 @@ class Relay:
         readings, self._readings = self._readings, []
         for received, reading in readings:
             if reading[1] == NO_STAMP_NS:
-                continue  # such a reading gets its time from a sample
+                continue  # a reading without a stamp gets its time from a sample
             if reading[1] <= horizon_ns:
                 compensator.push(*reading)
             else:
@@ -222,7 +223,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay up to the last reading received before the last sample; return the rest."""
+        """Relay up to the last reading received before the last sample; return later samples."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the rest log of the node: samples at rest become lines of a folder, beside the samples' way.
+Owns the rest log of the node: samples at rest become lines of files, without delaying the relay.
 
-The samples' way appends references of messages to a list. The sums are done in blocks of
-`BLOCK` messages, as arrays; a thread writes the lines, so a slow or hanging disk delays nothing.
-What cannot be kept is counted and named in the diagnostics.
+The relay appends references of messages to a list. The messages are summed in blocks of `BLOCK`,
+as arrays; a thread writes the lines, so a slow or hanging disk delays nothing. Rests that cannot
+be kept are counted and named in the diagnostics.
 """
 
 import os
@@ -91,8 +91,8 @@ class RestLog:
             self.n_rests = sum(counted_rests(file.read_bytes()) for file in files)
         except OSError as error:
             self.reason = error.strerror or str(error)
-        while (one := self._lines.get()) is not None:
-            self._try(*one)
+        while (line := self._lines.get()) is not None:
+            self._try(*line)
 
     def _try(self, day: str, start: bytes, rest: bytes) -> None:
         try:
@@ -134,7 +134,7 @@ class RestLog:
 
     def _bound_folder(self) -> None:
         while True:
-            sizes = {one.name: one.stat().st_size for one in self._folder.glob(f'*{SUFFIX}')}
+            sizes = {path.name: path.stat().st_size for path in self._folder.glob(f'*{SUFFIX}')}
             day = most_thinnable(sizes, FOLDER_BYTES, _FLOOR)
             if day is None:
                 return
@@ -157,13 +157,16 @@ class RestKeeper:
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
         """Sum messages that the compensator has corrected; queue the rests that end in them."""
-        # The sums refer to what is in use now; after a reload a second or two may be mixed.
+        # Sum with the calibration in use now: after a reload, samples of the last second or two
+        # may have been corrected by the calibration before.
         self._use(loaded, compensator)
         stamps, samples = samples_of(messages, is_imu=loaded.calibration.unit.input != 'counts')
         if not len(stamps):
             return
         if stamps[-1] < self._last_ns - _JUMP_NS:
-            self._last_ns = 0  # a new recording: what is out of order within it is left out
+            self._last_ns = (
+                0  # a new recording, in which only its own samples out of order are left out
+            )
         if stamps[0] <= self._last_ns or (np.diff(stamps) <= 0).any():
             before = np.maximum.accumulate(np.concatenate(([self._last_ns], stamps[:-1])))
             samples, stamps = samples[stamps > before], stamps[stamps > before]

@@ -3,8 +3,8 @@
 """
 Owns the loop around a node's wait sets, and everything that leaves rclpy's documented API.
 
-rclpy's executor costs ten times the compensation itself. Here messages stay serialized. While
-samples flow, a wake-up waits only for samples and empties their queue; services and ordinary
+rclpy's executor costs ten times the compensation itself. In this loop messages stay serialized.
+While samples flow, a wake-up waits only for samples and empties their queue; services and ordinary
 subscriptions are polled. Timers, clients and middleware events are not served by this loop.
 
 Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
@@ -221,10 +221,10 @@ class WaitLoop:
     def _serve(self, on_data: Callable[[], None]) -> None:
         """Wait and serve until the entities change or the loop stops."""
         node, self._is_stale = self.node, False
-        raw = [one.subscription for one in self._raw]
+        raw = [subscription.subscription for subscription in self._raw]
         others = {one: partial(_take_message, one) for one in node.subscriptions if one not in raw}
         others |= {service: partial(self._take_request, service) for service in node.services}
-        hot = next((one for one in self._raw if one.is_hot), None)
+        hot = next((subscription for subscription in self._raw if subscription.is_hot), None)
         rest_ns = 0
         # Only with best effort is a wake-up more expensive than a short sleep.
         if hot and hot.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
@@ -313,16 +313,16 @@ class _WaitSet:
         counts = types.count(Subscription), types.count(GuardCondition), 0, 0, types.count(Service)
         self._set = rclpy_implementation.WaitSet(*counts, 0, context.handle)
         self._content = [
-            (one, _KINDS[kind], getattr(self._set, f'add_{_KINDS[kind]}'), one.handle)
-            for one, kind in zip(entities, types, strict=True)
+            (entity, _KINDS[kind], getattr(self._set, f'add_{_KINDS[kind]}'), entity.handle)
+            for entity, kind in zip(entities, types, strict=True)
         ]
 
     def wait(self, timeout_ns: int) -> list[Any]:
         """Wait at most `timeout_ns`; return the entities that are ready."""
         self._set.clear_entities()
-        places = [(one, kind, add(handle)) for one, kind, add, handle in self._content]
+        places = [(entity, kind, add(handle)) for entity, kind, add, handle in self._content]
         self._set.wait(timeout_ns)
-        return [one for one, kind, place in places if self._set.is_ready(kind, place)]
+        return [entity for entity, kind, place in places if self._set.is_ready(kind, place)]
 
 
 def _opened(create: Callable[..., Any], message_type: Any, topic: str, qos: QoSProfile) -> Any:
@@ -351,7 +351,7 @@ def own_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
         try:
             yield node
         finally:
-            # Otherwise its publishers live until the next garbage collection.
+            # Otherwise the node's publishers live until the next garbage collection.
             node.destroy_node()
     finally:
         context.try_shutdown()
@@ -369,4 +369,4 @@ def wait_until(is_done: Callable[[], object], timeout_s: float, nap_s: float = 0
 
 def overrides(node: Node) -> dict[str, Any]:
     """Return the parameters that the user set at the start, known or not, by name."""
-    return {name: one.value for name, one in node._parameter_overrides.items()}  # noqa: SLF001
+    return {name: value.value for name, value in node._parameter_overrides.items()}  # noqa: SLF001

@@ -24,7 +24,7 @@ _PROGRAMS = {
     'paper': '20 60min, 35@0.5 90min, 20 60min, 5 90min, 20 60min, 35 60min',
     # Four hours, one bag of a calibration: the whole range, both directions, two ramp rates.
     'chamber': '20 20min, 35@0.75 35min, 5@0.6 45min, 20@0.75 35min, 8@1 23min',
-    # The shortest program with the whole range, both directions and some rest.
+    # The shortest program with the whole range, both directions and short soaks.
     'three-hours': '20 10min, 35@0.8 30min, 5@1.2 40min, 22@0.5 22.25min',
     # Nine and a half hours: slow and fast ramps in both directions, which bound all others.
     'long': '20 30min, 35@0.5 60min, 5@1 60min, 25@0.3 40min, 10@0.7 45min, 33@0.9 40min, '
@@ -41,7 +41,7 @@ _PROGRAMS = {
 }
 CYCLOGRAM_NAMES = tuple(_PROGRAMS)
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-# Edges of the cube: one per pair of axes with sum 0, their opposites, the rest.
+# Edges of the cube: one per pair of axes with sum 0, their opposites, the other edges.
 _EDGES = [
     *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
     *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
@@ -96,7 +96,7 @@ def parse_cyclogram(text: str) -> Cyclogram:
         if match is None or (match['rate'] and (is_first or float(match['rate']) == 0.0)):
             raise ValueError(
                 f"cyclogram step {number} '{raw}' must read TARGET[@RATE] [SOAK], "
-                "e.g. '35@0.5 90min' (the first one without a rate)"
+                "e.g. '35@0.5 90min' (the first step without a rate)"
             )
         target, rate = float(match['target']), float(match['rate'] or rate)
         if is_first:
@@ -119,13 +119,14 @@ def positions(n: int, seed: int = 0) -> Floats:
     """
     Return attitudes of a calibration test as unit vectors of the specific force, shape (n, 3).
 
-    Six are the faces of a cube, nine the corners of a three-capped prism, twelve those of an
+    Six are the faces of a cube, nine the corners of a three-capped prism, twelve the corners of an
     icosahedron: for their number the best sets to determine bias, scale and misalignment. Other
-    sets take the faces of a cube, then its edges, then its corners; beyond 26 a uniform spiral on
-    the sphere. 6, 9, 12, 18, 24 and 26 are balanced. `seed` tilts each by a small random angle.
+    sets take the faces of a cube, then its edges, then its corners; more than 26 follow a uniform
+    spiral on the sphere. The sets of 6, 9, 12, 18, 24 and 26 are balanced. `seed` tilts each
+    attitude by a small random angle.
     """
     if n == 9:
-        # Three on the equator, six between them at elevations of +-44 degrees.
+        # Three corners on the equator, six between them at elevations of +-44 degrees.
         third = np.arange(3) * 2.0 * math.pi / 3.0
         ring = np.stack([np.cos(third), np.sin(third)], axis=1)
         height, radius = 0.7, math.sqrt(1.0 - 0.7**2)
@@ -174,7 +175,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')
     rng = generator(seed, Stream.CYCLOGRAM, PLAN_NAMES.index(name))
     if name == 'held-out':
-        # Attitudes that no plan has: random directions without a vertical axis.
+        # Random attitudes without a vertical axis, which no other plan has.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(parse_cyclogram('held-out'), ups)
     if name in ('centrifuge', 'rate-table'):

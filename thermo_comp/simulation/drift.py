@@ -68,8 +68,8 @@ class Effect(ABC):
 @dataclass(frozen=True)
 class PartEffect(Effect):
     """
-    Tempco of a part, or stress or thermo-EMF between two parts: the deviation of `part` less that
-    of `cold` [K] and, for coefficients that change with temperature, the same of the squares.
+    Tempco of a part, or stress or thermo-EMF between two parts: deviation of `part` less that of
+    `cold` [K] and, for coefficients that change with temperature, the difference of the squares.
     """
 
     part: str

@@ -18,7 +18,7 @@ from scipy.optimize import root
 from ..typing import Floats
 
 AIR = 'air'
-_STEP_S = 1.0  # step of convection
+_STEP_S = 1.0  # time over which convection is held constant [s]
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class ThermalResponse:
         state = network.settled(air[0], drive[0])
         before = network.convection(state, air[0])
         for k, lasts in enumerate(length):
-            # Mean over the interval, extrapolated from the last two values (Adams-Bashforth).
+            # Mean convection of the interval, extrapolated from two values (Adams-Bashforth).
             now = network.convection(state, air[k])
             self._alpha[k] -= inverse @ (1.5 * now - 0.5 * before)
             self._amplitude[k] = unmix @ (state - self._alpha[k])

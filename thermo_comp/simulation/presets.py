@@ -79,7 +79,7 @@ class Specimen:
 
     def triad(self, network: ThermalNetwork, drift: Iterable[Effect], **others: Any) -> UnitModel:
         """Return a triad of bare heads on a board, with random constants."""
-        # With the converter's rounding at 4 Hz, 60 s means have a noise of 0.65 ug per axis.
+        # 3 ug/sqrt(Hz) and the converter's rounding at 4 Hz give 60 s means a noise of 0.65 ug.
         noise: dict[str, Any] = {'noise_density': (3.0, 3.0, 3.0), 'full_scale_g': 9.975}
         return self.unit(network, tuple(drift), bias_ug=1500.0, **noise, **others)
 
@@ -207,8 +207,8 @@ def tempcos(draw: Specimen) -> dict[str, Any]:
 
 def loads(draw: Specimen) -> list[Effect]:
     """
-    Draw the paper's effect: other offsets, slopes and curvatures while the ambient changes, as
-    with a heat pump at the limit of its supply.
+    Draw the paper's effect: while the ambient temperature changes, offsets, slopes and curvatures
+    are different, as with a heat pump at the limit of its supply.
     """
     knee, exponent = draw.between(0.4, 0.9), draw.between(1.5, 2.5)
     sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 5.0), (0.03, 0.1, 0.1))
@@ -225,7 +225,7 @@ _KINDS = {
     'thermostatted': (0, _thermostatted),
     'bare-quartz': (1, _bare_quartz),
     'mems': (2, _mems),
-    # The numbers between belong to the triads of benchmarks/triads.py.
+    # The missing numbers belong to the triads of benchmarks/triads.py.
     'demo': (13, _demo),
 }
 UNIT_NAMES = tuple(_KINDS)

@@ -59,7 +59,7 @@ class Truth:
 
     def on_cycles(self, grid: Floats) -> Floats:
         """Interpolate linearly from the grid to each cycle."""
-        # Written out: the rounding of np.interp depends on the number of points.
+        # No np.interp, whose rounding depends on the number of points.
         place = self.cycle_s / self.grid_s[1]
         left = np.minimum(place.astype(np.int64), len(self.grid_s) - 2)
         share = (place - left)[:, None]
@@ -123,8 +123,8 @@ def simulate_blocks(
     """
     Run a unit through a program in bounded memory; the result does not depend on the block size.
 
-    A reading is in the block with the cycles around it, or in the last. `up` is the direction of
-    the specific force, without `spin`; K in counts per cycle does not depend on `rate_hz`. `seed`
+    A reading is in the block of the cycles around it, or in the last block. `up` is the direction
+    of the specific force without `spin`; K [counts/cycle] does not depend on `rate_hz`. `seed`
     determines all random numbers of the run.
     """
     readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz

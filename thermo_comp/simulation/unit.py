@@ -22,7 +22,7 @@ from .spin import Bend
 
 _NS = 1_000_000_000
 REFERENCE_C = 20.0  # board temperature in a soak at which K and bias are stated
-_RANGE = -(1 << 15), (1 << 15) - 1  # of the output, counts
+_RANGE = -(1 << 15), (1 << 15) - 1  # range of the converter's output [counts]
 _FRACTION_BITS = 40
 _ONE = 1 << _FRACTION_BITS
 _ROWS = 1 << 20  # rows summed at a time: 2^20 fractions below 2^40 stay far below 2^63
@@ -78,7 +78,7 @@ def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
     counts = np.empty(charge.shape, dtype=np.int32)
     for first in range(0, len(charge), _ROWS):
         rows = charge[first : first + _ROWS]
-        # Eq. (1): whole counts; the fraction is carried on.
+        # Eq. (1): the output is whole counts, and the fraction is carried to the next cycle.
         whole = np.floor(rows)
         fraction = np.rint((rows - whole) * _ONE).astype(np.int64)
         total = np.cumsum(fraction, axis=0) + remainder
@@ -98,7 +98,7 @@ def rounded(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
 class ThermometerModel:
     """
     A thermometer on a part: ``reading = quantum * round((T + noise) / quantum)``, all in K; a
-    quantum of 0 means no rounding; `phase`, 0..1, is that of its first reading.
+    quantum of 0 means no rounding; `phase` is the time of the first reading in intervals, 0..1.
     """
 
     node: str
@@ -201,5 +201,5 @@ class UnitModel:
 
     def with_thermometers(self, **changes: Any) -> UnitModel:
         """Return the unit with other thermometers, the same changes on board and case."""
-        board, case = (replace(one, **changes) for one in (self.board, self.case))
+        board, case = (replace(sensor, **changes) for sensor in (self.board, self.case))
         return replace(self, board=board, case=case)
