@@ -23,11 +23,8 @@ MADE = (
     *('freezer.mcap', 'log.csv', 'tumble.txt', 'flight.ulg', 'flight.bin', 'bags/fleet'),
     *('bags/unit42', 'rests'),
 )
-_EXPORTS = {
-    'autopilot.params': 'px4',
-    'xsens_acc.calib': 'imu_tk',
-    'accel_calib.yaml': 'imu_calib',
-}
+_EXPORTS = {'autopilot.params': 'px4', 'xsens_acc.calib': 'imu_tk',
+            'accel_calib.yaml': 'imu_calib'}  # fmt: skip
 
 
 def write_fit_of_the_readme(path, cli):

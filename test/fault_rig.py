@@ -47,12 +47,8 @@ BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
 STATIC_RESIDUAL = 1.5e-4
 DYNAMIC_RESIDUAL = 3e-5
 
-CONFIG = CompensatorConfig(
-    transition_time_s=5.0,
-    temperature_timeout_s=20.0,
-    case_timeout_s=10.0,
-    gravity_tolerance_m_s2=0.02,
-)
+CONFIG = CompensatorConfig(transition_time_s=5.0, temperature_timeout_s=20.0, case_timeout_s=10.0,
+                           gravity_tolerance_m_s2=0.02)  # fmt: skip
 
 # A message: topic, stamp, value. A list of messages is in order of arrival.
 Event = tuple[str, int, Any]

@@ -111,11 +111,8 @@ def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
 
     stamp_ns = START_NS + STEP_NS * np.arange(N)
     accel = UP + 0.002 * rng.standard_normal(UP.shape)
-    time = {
-        'dates': stamp_ns.astype('datetime64[ns]'),
-        'text': times('pandas'),
-        'numbers': stamp_ns,
-    }[kind]
+    dates = stamp_ns.astype('datetime64[ns]')
+    time = {'dates': dates, 'text': times('pandas'), 'numbers': stamp_ns}[kind]
     columns = {'label': ['walk'] * N, 'timestamp': time, 'temperature': np.full(N, 20.5)}
     columns |= {f'acc_{axis}': accel[:, k] for k, axis in enumerate('xyz')}
     pq.write_table(pa.table(columns), tmp_path / 'log.parquet')

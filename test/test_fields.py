@@ -144,11 +144,8 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
     """Write 50 Imu messages, and PX4's and a bare Float64 between them; return PX4's."""
     celsius = []
     with Writer(path, version=9, storage_plugin=storage) as bag:
-        kinds = {
-            '/imu/data': 'sensor_msgs/msg/Imu',
-            '/fmu/out/sensor_accel': 'px4_msgs/msg/SensorAccel',
-            '/case': 'std_msgs/msg/Float64',
-        }
+        kinds = {'/imu/data': 'sensor_msgs/msg/Imu', '/case': 'std_msgs/msg/Float64',
+                 '/fmu/out/sensor_accel': 'px4_msgs/msg/SensorAccel'}  # fmt: skip
         links = {
             topic: bag.add_connection(topic, kind, typestore=store)
             for topic, kind in kinds.items()

@@ -62,12 +62,8 @@ def chosen_groups(found):
 
 @pytest.fixture(scope='module')
 def noisy():
-    truth = Truth(
-        sigma=np.array([1.0, 2.0, 3.0]) * MICRO,
-        noise=Noise(2.0, 1200.0),
-        offset_sd=20.0 * MICRO,
-        start_sd=0.3,
-    )
+    truth = Truth(sigma=np.array([1.0, 2.0, 3.0]) * MICRO, noise=Noise(2.0, 1200.0),
+                  offset_sd=20.0 * MICRO, start_sd=0.3)  # fmt: skip
     windows, up = table_of(truth, 18, np.random.default_rng(3), n_windows=60)
     return *selected_of(truth, windows, up), truth
 

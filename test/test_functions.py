@@ -21,12 +21,9 @@ from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.prediction import ramp_states, sd_of_states
 
 KNOTS = (-15.0, -6.0, 0.0, 4.0, 15.0)
-FUNCTIONS = [
-    Polynomial((1.0,)),
-    Polynomial((0.0, 2e-3, -3e-5, 4e-7, 1e-9)),
-    CubicSpline(KNOTS, (1.5, 0.4, 0.0, -0.2, 0.9)),
-    Exponential(-0.5, (0.2, 0.3), (12.0, -7.0)),
-]
+FUNCTIONS = [Polynomial((1.0,)), Polynomial((0.0, 2e-3, -3e-5, 4e-7, 1e-9)),
+             CubicSpline(KNOTS, (1.5, 0.4, 0.0, -0.2, 0.9)),
+             Exponential(-0.5, (0.2, 0.3), (12.0, -7.0))]  # fmt: skip
 temperatures = st.floats(-15.0, 15.0)
 
 

@@ -308,10 +308,8 @@ def test_further_thermometers_are_found_beside_the_board(tmp_path):
     path = written(tmp_path / 'bag', *topics, 'temperature/lid', counts='imu0/accel/counts')
     temperatures = read_recording(path).columns.temperatures
     assert {name: part.celsius.tolist() for name, part in temperatures.items()} == {
-        'board': [20.0],
-        'case': [21.0],
-        'lid': [22.0],
-    }
+        'board': [20.0], 'case': [21.0], 'lid': [22.0],
+    }  # fmt: skip
     assert temperatures['lid'].after.tolist() == [2]
 
 

@@ -33,12 +33,9 @@ from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig, Thermo
 from thermo_comp.thermal.thermometer import Thermometer
 
 UNKNOWN, STATIC, DYNAMIC = Regime.UNKNOWN, Regime.STATIC, Regime.DYNAMIC
-SENSORS = {
-    '1 mK': (0.001, 0.0),
-    '10 mK': (0.01, 0.0),
-    '1 mK, 62.5 mK steps': (0.001, 0.0625),
-    '10 mK, 62.5 mK steps': (0.01, 0.0625),
-}
+SENSORS = {'1 mK': (0.001, 0.0), '10 mK': (0.01, 0.0),
+           '1 mK, 62.5 mK steps': (0.001, 0.0625),
+           '10 mK, 62.5 mK steps': (0.01, 0.0625)}  # fmt: skip
 
 
 def case_and_board(t, corners, lag=LAG_S, start=20.0):
