@@ -53,9 +53,8 @@ class Cells:
     """
     Sufficient statistics of short runs of samples, shape (n,) and (n, 3).
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
-    Dropped are samples that are not finite or whose stamp does not rise. `quantum` is the step of
-    the samples, 0 if there is none; `middle` is 32768 for unsigned 16-bit words, else 0; rates are
-    in rad/s.
+    Dropped are samples that are not finite or whose stamp does not rise. `quantum` is the samples'
+    step or 0; `middle` is 32768 for unsigned 16-bit words, else 0; rates are in rad/s.
     `roughness` is half the mean square change from sample to sample: the variance of white noise;
     `seam` the change to a cell's first sample from the last sample of the cell right before it.
     """
