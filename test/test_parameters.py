@@ -141,7 +141,7 @@ def test_pages_hold_the_generated_table(root):
 def test_the_parameter_file_states_the_defaults(root):
     text = (root / 'config' / 'thermo_comp.params.yaml').read_text(encoding='utf-8')
     # The QoS section is commented out, as overrides of topics that are remapped have no effect.
-    before, overrides_text = text.split('    # These are the defaults:\n    #\n')
+    before, overrides_text = text.split('    # The defaults of the overrides:\n    #\n')
     stated = yaml.safe_load(before)['/**']['ros__parameters']
     expected = {entry.name: entry.default for entry in fields(NodeConfig)}
     del expected['calibration_file'], stated['calibration_file']

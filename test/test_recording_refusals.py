@@ -169,7 +169,7 @@ def test_two_topics_that_fit_are_ambiguous(tmp_path):
     with BagWriter(path) as bag:
         for unit in ('a', 'b'):
             bag.write_counts(f'{unit}/accel/counts', [1], np.zeros((1, 3)))
-    refused(path, r'several topics end in it: /a/.*, /b/.*--topic counts=')
+    refused(path, r'several topics end in this name: /a/.*, /b/.*--topic counts=')
     with open_recording(path, Topics(counts='b/accel/counts'), require=('accel',)) as reader:
         assert reader.topics == {'accel': '/b/accel/counts'}
 
