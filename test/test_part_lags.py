@@ -90,6 +90,8 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     # Another simulator: heads that lag the board, pendulums that lag the heads, and an error
     # proportional to the stress between board and pendulum.
     unit = second_simulator.unit_of('products', 2)
+    # Stages of the x axis that are equal are fitted as two of a ratio of 0.89.
+    unit.pendulum_s[0] = unit.head_s[0]
     _, program, *_, held = second_simulator.PLANS['mild']
     records = second_simulator.runs_of(unit, program, second_simulator.directions(9, 5), 5)
     tests = second_simulator.runs_of(unit, held[0], second_simulator.directions(2, 7), 7,
@@ -98,14 +100,12 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     least, _ = second_simulator.floor_of(tests)
     assert errors(result.specific_force, result.sd, tests).norm < 2.0 * least
     stages = {(one.tau_s, one.second_tau_s) for one in result.calibration.response if one.tau_s}
-    for head, pendulum in zip(unit.head_s, unit.pendulum_s, strict=True):
-        # The network is integrated in steps of 2 s, which adds a second to a time constant.
-        near = [
-            (tau, second)
-            for tau, second in stages
-            if tau == pytest.approx(head, rel=0.02) and second == pytest.approx(pendulum, rel=0.05)
-        ]
-        assert near, (head, pendulum, stages)
+    # The network is integrated in steps of 2 s, which adds a second to a time constant.
+    near = pytest.approx(2.0 * unit.head_s[0], rel=0.01)
+    assert any(tau + second == near for tau, second in stages)
+    for head, pendulum in zip(unit.head_s[1:], unit.pendulum_s[1:], strict=True):
+        taus, seconds = pytest.approx(head, rel=0.02), pytest.approx(pendulum, rel=0.05)
+        assert any(tau == taus and second == seconds for tau, second in stages)
 
 
 @pytest.mark.parametrize('case', [soaks, third_node])
