@@ -141,7 +141,7 @@ def test_an_odd_square_joins_only_where_it_is(rng):
 
 def test_a_radius_is_estimated(rng):
     truth, regression, state = table(rng, 1e-5, radius_sd=0.01, radius_error=0.004)
-    prior = prior_of(truth, (), nonlinear_sd=prior_sd(regression.forces, OPTIONS))
+    prior = prior_of(truth, (), nonlinear_sd=prior_sd(regression.forces.kinds, OPTIONS))
     solution = regression.solve(state, prior, n_steps=15)
     sd = math.sqrt(solution.variance[solution.layout.radius[0]])
     assert sd < 1e-5

@@ -42,11 +42,6 @@ from .windows import Sets, ThermalWindows
 
 Range = tuple[float, float]
 
-# Ratio of the valid range of rates and of linear columns to the range in the data. The response
-# to a heat flow is linear, so a ramp twice as fast has columns twice as large. Curves over
-# temperature have no such law and are valid only over the temperatures of the data.
-_LINEAR_RANGE = 2.0
-
 
 def build_calibration(
     fit: Fit,
@@ -113,7 +108,7 @@ def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[Regi
     """Return the static and the dynamic set with their ranges, all coefficients 0."""
     windows, prior = fit.windows, fit.posterior.prior
     temperatures = _temperature_range(windows)
-    rates = _range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, _LINEAR_RANGE)
+    rates = _range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, order=1)
     # The sd of mounting offset plus slow noise of each axis [m/s^2].
     slow = np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.ratio).tolist()
     lacks = lack_of_fit(fit, claim) if fit.regression.gravity else ((), ())
@@ -146,7 +141,7 @@ def _valid_columns(
         valid = column.range
         if column.term.bounds is None:
             order = column.term.order
-            valid = _range(windows.raw[:, k], 0.01, _LINEAR_RANGE**order)
+            valid = _range(windows.raw[:, k], 0.01, order)
             if not state.weights[:, :, n_curves + k].any():
                 # A column with zero weight contributes only to the covariance, which is valid at
                 # any value.
@@ -341,8 +336,13 @@ def union(ranges: Iterable[Range]) -> Range:
     return min(lower), max(upper)
 
 
-def _range(values: Floats, smallest_margin: float, ratio: float = 1.0) -> Range:
-    """Return the range of values with a margin, its edges outside 0 multiplied by a ratio."""
+def _range(values: Floats, smallest_margin: float, order: int = 0) -> Range:
+    """
+    Return the valid range of a quantity that is a power (`order`) of a heat flow: the range of its
+    values with a margin, extended to ramps twice as fast, since the response to a heat flow is
+    linear. Order 0: a temperature, valid only within the data.
+    """
+    ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))
     # 2 % of the span: thermometer noise shall not put the fitted data outside their own range.
     margin = max(0.02 * (upper - lower), smallest_margin)

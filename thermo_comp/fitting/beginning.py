@@ -35,8 +35,6 @@ from .windows import CURVE, ThermalWindows
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
-# Smallest typical slope of the bias [m/s^2 per K]: 0.1 ug/K, better than navigation grade.
-_FLATTEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -163,15 +161,16 @@ def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> floa
     """
     data = windows.data
     inner = data.inner
+    smallest = 1e-6  # [m/s^2]: 0.1 ug, better than navigation grade
     if not len(inner):
-        return _FLATTEST
+        return smallest
     sigma = float(np.median(white_noise_of(data, start.scale)))
     density = sigma * np.sqrt(float(np.median(np.diff(data.time)[inner])))
     # Bounds: 30 ug, as of sensors of navigation grade, and 0.5 mg, as of consumer MEMS; the tail
     # of the Student prior allows for more.
     least, most = 3e-4, 5e-3
     # Readings that never change have no noise; offsets of 1e6 times it have no posterior.
-    least = max(min(least, 100.0 * density), _FLATTEST)
+    least = max(min(least, 100.0 * density), smallest)
     return float(np.clip(3.0 * density, least, most))
 
 
@@ -202,7 +201,8 @@ def _candidates(
             off -= smooth @ np.linalg.lstsq(smooth, off, rcond=None)[0]
         drift = max(drift, float(np.std(off)))
     moved = float(np.std(windows.temperature)) or 1.0
-    slope = float(np.clip(drift / moved, _FLATTEST, STEEPEST[0] / 3.0))
+    # The smallest typical slope of the bias is 0.1 ug/K, better than navigation grade.
+    slope = float(np.clip(drift / moved, 1e-6, STEEPEST[0] / 3.0))
     slopes = np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])
     fixed = np.zeros(parts.shape, dtype=bool)
     if has_one_direction:

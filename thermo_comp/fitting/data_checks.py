@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_ADVISED = 6, 9, 18
+#: Smallest number of distinct attitudes that determine bias and scale factor, which are six
+#: constants, and the misalignment in addition, which has three more.
+POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT = 6, 9
 
 
 @dataclass(frozen=True)
@@ -263,10 +265,9 @@ def _judge_positions(up: Floats) -> Finding:
             f'{n} positions determine bias and scale; the misalignment keeps its prior: it needs '
             f'{POSITIONS_FOR_MISALIGNMENT} well spread positions',
         )
-    if n < POSITIONS_ADVISED:
-        return _advice(
-            'positions', f'{n} positions; {POSITIONS_ADVISED} would reduce the uncertainty'
-        )
+    advised = 18  # two per constant
+    if n < advised:
+        return _advice('positions', f'{n} positions; {advised} would reduce the uncertainty')
     return Finding('positions', 'good', f'{n} positions')
 
 

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..text import one_line
-from ..typing import Floats
+from ..typing import Bools, Floats
 from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
 from .beginning import initial_state
@@ -32,29 +32,30 @@ from .start import within_positions
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State, Windows
 from .windows import ThermalWindows, thermal_windows
 
-# A bag contradicts the others, or a prior, if the RMS of its drift exceeds the usual one by this
-# factor.
-_LEAST_RATIO = 5.0
+
+def _is_far_above(square: Floats | float, usual: float) -> Bools:
+    """Whether the mean square of a drift is that of five times the usual RMS, or more."""
+    return np.asarray(square > 5.0**2 * usual)
 
 
 def contradicting_bag(fit: Fit) -> int | None:
     """
-    Find the bag that may be of another environment; None if none is suspect.
+    Find the bag that may be of another environment; None if no bag is suspect.
 
-    It is the one whose left-out drift is far above the median of all bags, and the white noise of
-    a window. A bag whose drift the others do not determine is it if theirs is far above the noise.
+    A bag is suspect if its left-out drift is far above the median of all bags, and above the white
+    noise of a window. A single bag whose drift the others do not determine is suspect if their
+    median is far above the noise.
     """
     square = _square_of_bags(fit)
     known = np.isfinite(square)
     if known.sum() < 4:
         # A majority that one bag can contradict needs four bags.
         return None
-    usual = float(np.median(square[known]))
-    limit = _LEAST_RATIO**2 * float(np.mean(fit.posterior.prior.sigma**2))
-    if (~known).sum() == 1 and usual > limit:
+    usual, noise = float(np.median(square[known])), float(np.mean(fit.posterior.prior.sigma**2))
+    if (~known).sum() == 1 and _is_far_above(usual, noise):
         return int(np.argmin(known))
     worst = int(np.nanargmax(square))
-    return worst if square[worst] > max(_LEAST_RATIO**2 * usual, limit) else None
+    return worst if _is_far_above(square[worst], max(usual, noise)) else None
 
 
 def is_better_without(whole: Fit, rest: Fit, bag: int) -> bool:
@@ -107,7 +108,7 @@ def bags_contradicting_prior(
     lack = np.square(lacks).max(axis=0) if lacks else np.zeros(3)
     ratio = np.sum(drift**2, axis=1) / np.sum(claimed + prior.sigma**2 + lack, axis=1)
     mean = np.bincount(data.bag, ratio) / np.maximum(np.bincount(data.bag), 1)
-    contradicting: list[int] = np.flatnonzero(mean > _LEAST_RATIO**2).tolist()
+    contradicting: list[int] = np.flatnonzero(_is_far_above(mean, 1.0)).tolist()
     return contradicting
 
 

@@ -30,8 +30,6 @@ from .selection import TRIAL_GAIN, Selected
 from .unknowns import State
 from .windows import ThermalWindows
 
-# Prior sd of a coefficient's change per kelvin over that of the coefficient [1/K].
-_SLOPE_RATIO = 0.02
 # Effective parameters per coefficient from which the data determine it: 0.99 means that the
 # posterior sd is a tenth of the prior sd.
 _DETERMINED = 0.99
@@ -143,16 +141,19 @@ def is_beyond(windows: ThermalWindows) -> bool:
     return forces is not None and float(np.ptp(forces.sizes)) > 0.0
 
 
-def prior_sd(forces: Forces, options: FitOptions) -> Floats:
-    """Return the prior sd of the coefficients c, then of c' [per kelvin], shape (2 k,)."""
-    sd = np.array([options.nonlinear_sd(kind) for kind in forces.kinds])
-    return np.concatenate((sd, _SLOPE_RATIO * sd))
+def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
+    """
+    Return the prior sd of the coefficients of k terms, then of their changes per kelvin, which is
+    2 % of it, shape (2 k,).
+    """
+    sd = np.array([options.nonlinear_sd(kind) for kind in kinds])
+    return np.concatenate((sd, 0.02 * sd))
 
 
 def starting_sd(forces: Forces, options: FitOptions) -> Floats:
-    """Return the prior sd of the initial terms, square and cube; 0 for the other."""
-    begins = np.array([kind != 'odd_square' for kind in forces.kinds])
-    return np.asarray(prior_sd(forces, options) * np.tile(begins, 2))
+    """Return the prior sd of the initial terms, square and cube; 0 for the odd square."""
+    is_initial = np.array([kind != 'odd_square' for kind in forces.kinds])
+    return np.asarray(prior_sd(forces.kinds, options) * np.tile(is_initial, 2))
 
 
 class _TermFits:
@@ -207,7 +208,7 @@ def choose(
     forces = regression.forces
     if forces is None:
         return selected, ()
-    k, sd = len(forces.kinds), prior_sd(forces, options)
+    k, sd = len(forces.kinds), prior_sd(forces.kinds, options)
     fits = _TermFits(regression, selected, sd)
     odd = fits.term(forces.kinds.index('odd_square'))
     used = fits.thinned(frozenset(range(2 * k)) - odd)
@@ -276,15 +277,17 @@ def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
     posterior, at = calibration.posterior, parameter_layout(calibration).misalignment
     if calibration.nonlinearity is not None or posterior is None:
         return calibration
-    sd = [options.nonlinear_sd('square'), options.nonlinear_sd('cube')]
-    each = np.tile([*sd, *(_SLOPE_RATIO * value for value in sd)], 3)
-    factor = np.insert(posterior.matrix, [at] * len(each), 0.0, axis=0)
-    rest = np.insert(posterior.variances, [at] * len(each), each**2)
-    terms = (blank_term('square', sd[0]), blank_term('cube', sd[1]))
+    kinds: tuple[Kind, ...] = ('square', 'cube')
+    sd = np.tile(prior_sd(kinds, options), 3)
+    factor = np.insert(posterior.matrix, [at] * len(sd), 0.0, axis=0)
+    rest = np.insert(posterior.variances, [at] * len(sd), sd**2)
+    terms = tuple(blank_term(kind, options.nonlinear_sd(kind)) for kind in kinds)
     gravity = calibration.gravity_m_s2
     return replace(
         calibration,
-        nonlinearity=Nonlinearity((0.99 * gravity, 1.01 * gravity), sd[0], terms),
+        nonlinearity=Nonlinearity(
+            (0.99 * gravity, 1.01 * gravity), options.nonlinear_sd('square'), terms
+        ),
         posterior=FilePosterior.of(factor, rest),
     )
 

@@ -34,9 +34,8 @@ from .windows import Sets
 
 #: Largest code of the converter of the paper's unit: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0
-# Families of the curve over temperature: polynomials of order 1, 2 and 3, and others.
+# Families of curves over temperature that are polynomials, of order 1, 2 and 3.
 _POLYNOMIALS = ('linear', 'quadratic', 'cubic')
-_CURVES = (*_POLYNOMIALS, 'spline', 'exponential')
 #: Groups of columns that the fit selects: the curve, the difference of the two sets, the response.
 GROUPS = tuple(
     dict.fromkeys(
@@ -126,7 +125,9 @@ class FitOptions:
         allowed: dict[str, tuple[str, ...]] = {
             'input': ('counts', 'm/s^2'),
             'model': ('response', 'golovach'),
-            **dict.fromkeys(('static_curve', 'dynamic_curve'), _CURVES),
+            **dict.fromkeys(
+                ('static_curve', 'dynamic_curve'), (*_POLYNOMIALS, 'spline', 'exponential')
+            ),
             **dict.fromkeys(('groups', 'forced'), GROUPS),
             'allow': REFUSALS,
         }

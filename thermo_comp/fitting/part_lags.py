@@ -26,8 +26,6 @@ from .hyperparameters import undisturbed
 from .start import ConstantCalibration, position_means, white_noise_of
 from .windows import ThermalWindows
 
-# Time constants tried in addition to those of the columns, all of which are longer [s].
-_SHORT_TAUS = (15.0, 21.0, 30.0, 42.0)
 # Ratio of a time constant of the columns to the next smaller one: half an octave.
 _STEP = 2.0**0.5
 
@@ -103,6 +101,8 @@ class _PartCurves:
         self._first = data.edges[:-1]
         self._t = windows.temperature - windows.model.reference_temperature
         self._taus = np.array([windows.model.columns[k].tau_s for k in columns])
+        #: Time constants tried [s]: those of the columns, and shorter ones.
+        self._tried = np.array([15.0, 21.0, 30.0, 42.0, *self._taus])
         # The lag m at a time constant tau between those of the columns is interpolated: m / tau
         # is a smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
         ratios = np.column_stack((windows.rate, windows.raw[:, columns] / self._taus))
@@ -138,16 +138,15 @@ class _PartCurves:
 
     def _time_constant(self, axis: int) -> float:
         """Return the single time constant with the smallest RMS residual [s]; 0 for none."""
-        tried = np.array([*_SHORT_TAUS, *self._taus])
-        squares = [self._square((tau, 0.0), axis) for tau in tried]
-        best = float(tried[int(np.argmin(squares))])
-        found = minimize_scalar(
+        squares = [self._square((tau, 0.0), axis) for tau in self._tried]
+        best = float(self._tried[int(np.argmin(squares))])
+        minimum = minimize_scalar(
             lambda log_tau: float(np.log(self._square((float(np.exp(log_tau)), 0.0), axis))),
             bounds=(float(np.log(best / _STEP)), float(np.log(best * _STEP))),
             method='bounded',
             options={'xatol': 1e-3},
         )
-        tau = float(np.exp(found.x))
+        tau = float(np.exp(minimum.x))
         return tau if self._square((tau, 0.0), axis) < self._square((0.0, 0.0), axis) else 0.0
 
     def is_determined(self, lag: Stages, axis: int) -> bool:
@@ -155,7 +154,7 @@ class _PartCurves:
         tau, second = lag
         others = [(ratio * tau, ratio * second) for ratio in (1.0 / _STEP, _STEP)]
         if not tau:
-            others = [(_SHORT_TAUS[0] * _STEP, 0.0)]
+            others = [(float(self._tried[0]) * _STEP, 0.0)]
         limit = 1.05**2 * self._square(lag, axis)
         return all(self._square(other, axis) > limit for other in others)
 

@@ -38,8 +38,6 @@ from .windows import Model, Sets
 
 #: Smallest number of units of a population: fewer give no scatter.
 UNITS_NEEDED = 3
-# Candidates of the further uncorrelated variance, relative to each variance of the prior.
-_INFLATIONS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
@@ -116,31 +114,32 @@ def informative_priors(
         return result
 
     stated = options.ageing_bias, options.ageing_scale
-    tried = [(grown(*stated), more) for more in _INFLATIONS]
+    # Candidates of a further uncorrelated variance, relative to each variance of the prior.
+    tried = [(grown(*stated), share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
         # Candidates of the sd of ageing: of the biases in g; of the relative scale factors, as a
         # multiple (0, 0.01 or 1) of the number for the biases.
         tried += [
-            (grown(ageing * options.gravity, share * ageing), 0.0)
-            for share in (0.0, 0.01, 1.0)
+            (grown(ageing * options.gravity, multiple * ageing), 0.0)
+            for multiple in (0.0, 0.01, 1.0)
             for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
     # The first fit must be wide: under a narrow prior the noise would absorb the differences.
-    tried.append((tried[-1][0], _INFLATIONS[-1]))
+    tried.append((tried[-1][0], 1.0))
     layout = regression.layout(regression.windows.parts)
     kinds = regression.forces.kinds if regression.forces else ()
     used = range(len(calibration.response))
     to_file = file_parameters(regression, layout, state, sets, used, kinds)
     mean = as_vector(state, layout)[: layout.n_unit]
     result = []
-    for known, more in tried:
-        diagonal = np.diag(known)
+    for variances, share in tried:
+        diagonal = np.diag(variances)
         floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
         sd = np.sqrt(floor)
-        scaled, correlation = to_file / sd[:, None], known / np.outer(sd, sd)
+        scaled, correlation = to_file / sd[:, None], variances / np.outer(sd, sd)
         # A relative jitter of 1e-6 bounds the correlations of the file's float32 covariance. The
         # QR factor, not a product, keeps the precision of nearly equal parameters.
-        wider = correlation + (1e-6 + more) * np.eye(len(sd))
+        wider = correlation + (1e-6 + share) * np.eye(len(sd))
         whitened = solve_triangular(np.linalg.cholesky(wider), scaled, lower=True)
         root: Floats = np.asarray(np.linalg.qr(whitened, mode='r'))
         root = root * np.sign(np.diag(root))[:, None]

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -34,21 +34,16 @@ from .sources import FitSource, angular_velocity
 
 #: Default length of a window [s].
 WINDOW_S = 10.0
-# Candidates of the length of the shortest rest [s], the strictest first.
-_MIN_RESTS_S = (3.0, 2.0, 1.0)
 
 
 class Readings(NamedTuple):
-    """One thermometer's readings over a bag: rising stamps [ns] and temperatures, shape (n,)."""
+    """
+    One thermometer's readings over a bag: rising stamps [ns] and temperatures [degC], shape (n,);
+    without arguments those of a thermometer that was not recorded.
+    """
 
-    stamp_ns: Ints
-    value: Floats
-
-
-#: Readings of a thermometer that was not recorded.
-NO_READINGS = Readings(np.empty(0, np.int64), np.empty(0))
-#: Recording information of arrays, which have none.
-NO_RECORDING = RecordingInfo(Path(), '', {}, 0, 0)
+    stamp_ns: Ints = np.empty(0, np.int64)
+    value: Floats = np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -107,7 +102,7 @@ class ReducedBag:
     is_integer: bool
     middle: float = 0.0
     max_abs: float = 0.0
-    info: RecordingInfo = NO_RECORDING
+    info: RecordingInfo = field(default_factory=lambda: RecordingInfo(Path(), '', {}, 0, 0))
     since_s: float = 0.0
     restless: str = ''
     angular_rate: Literal['none', 'part', 'whole'] = 'none'
@@ -115,12 +110,12 @@ class ReducedBag:
     @property
     def board(self) -> Readings:
         """Readings of the board's thermometer."""
-        return self.temperatures.get('board', NO_READINGS)
+        return self.temperatures.get('board', Readings())
 
     @property
     def case(self) -> Readings:
         """Readings of the case's thermometer."""
-        return self.temperatures.get('case', NO_READINGS)
+        return self.temperatures.get('case', Readings())
 
 
 class _Pass:
@@ -145,7 +140,7 @@ class _Pass:
             accumulator.add(block.accel_stamp_ns, block.accel, rate)
             self.causes.add(block)
             for name, (reading_ns, celsius, _) in block.temperatures.items():
-                earlier = readings.setdefault(name, [NO_READINGS])
+                earlier = readings.setdefault(name, [Readings()])
                 n_impossible[name] += int(np.count_nonzero(np.abs(celsius) > HOTTEST))
                 new = _thinned(reading_ns, celsius, earlier[-1].stamp_ns[-1:])
                 if len(new.stamp_ns):
@@ -188,7 +183,7 @@ def reduce_source(
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
-        ranges = stillness.still_intervals(cells, min_rest_s or _MIN_RESTS_S[0], still_sd)
+        ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     if least == stillness.MIN_SAMPLES and cells.cell_s > 3.0:
         in_shorter_cells = partial(
             reduce_source,
@@ -222,8 +217,7 @@ def _bag(
     """Make the statistics of a bag from its cells and its rests, ranges of cells."""
     per_window = max(1, round(window_s / cells.cell_s)) if cells.cell_s else 1
     sizes = [min(per_window, max(1, (b - a) // fewest_windows)) for a, b in ranges]
-    reader = source.reader()
-    return ReducedBag(
+    bag = ReducedBag(
         source=source,
         start_ns=cells.start_ns,
         end_ns=cells.start_ns + (round(cells.time[-1] * 1e9) if len(cells.time) else 0),
@@ -243,11 +237,11 @@ def _bag(
         is_integer=cells.is_integer,
         middle=cells.middle,
         max_abs=_max_abs(cells),
-        info=reader.info if reader else NO_RECORDING,
-        since_s=reader.since_s if reader else 0.0,
         restless=restless,
         angular_rate='whole' if reading.has_rate else 'part' if cells.rate.any() else 'none',
     )
+    reader = source.reader()
+    return bag if reader is None else replace(bag, info=reader.info, since_s=reader.since_s)
 
 
 def _with_shorter_cells(
@@ -291,21 +285,23 @@ def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
 
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds at which they determine the triad best."""
-    found: list[list[tuple[int, int]]] = []
+    candidates: list[list[tuple[int, int]]] = []
     # Largest ratio of a rest's variance to the quietest one, the strictest first.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
-    for shortest in _MIN_RESTS_S if min_rest_s is None else (min_rest_s,):
+    # Smallest length of a rest [s], the strictest first.
+    for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):
         for runs in of_ratios:
-            ranges = stillness.long_enough(cells, runs, shortest)
-            if ranges not in found:
-                found.append(ranges)
+            ranges = stillness.long_enough(cells, runs, shortest_s)
+            if ranges not in candidates:
+                candidates.append(ranges)
     weighted = cells.mean * cells.count[:, None]
     means = [
         np.array([weighted[a:b].sum(axis=0) / cells.count[a:b].sum() for a, b in ranges])
-        for ranges in found
+        for ranges in candidates
     ]
-    return _joined(cells, found[best_rests([rests.reshape(-1, 3) for rests in means])], still_sd)
+    best = candidates[best_rests([rests.reshape(-1, 3) for rests in means])]
+    return _joined(cells, best, still_sd)
 
 
 def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> list[tuple[int, int]]:

@@ -19,12 +19,10 @@ import numpy as np
 from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, ThermometerSettings
 from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats
-from .reduction import NO_READINGS, Readings, ReducedBag
+from .reduction import Readings, ReducedBag
 
 # Interval of the grid of rates [s], and number of intervals on each side of a rate.
 _BIN_S, _BINS_PER_SIDE = 10.0, 6
-# Smallest rate of a ramp over the noise of the rates.
-_CLEAR = 5.0
 
 
 @dataclass(frozen=True)
@@ -37,9 +35,14 @@ class Course:
     @property
     def is_resting(self) -> Bools:
         """Grid points without a ramp for five minutes before and after."""
-        moving = np.abs(self.rate) > max(0.2 * self.fastest, _CLEAR * self.rate_sd)
+        moving = np.abs(self.rate) > max(0.2 * self.fastest, self.least_ramp)
         near = np.convolve(moving, np.ones(61))[30:-30] > 0.5
         return np.asarray(~near)
+
+    @property
+    def least_ramp(self) -> float:
+        """Smallest rate that counts as a ramp: 5 standard deviations of the noise [K/s]."""
+        return 5.0 * self.rate_sd
 
     @property
     def fastest(self) -> float:
@@ -75,14 +78,14 @@ def learn_thermometer(
     # At least 0.1 mK: below it the recursion would follow rounding errors.
     noise = max(_noise_of(long, quantum), 1e-4)
     courses = _courses(recorded, noise, quantum)
-    clear = [course for course in courses if course.fastest > _CLEAR * course.rate_sd]
-    if not clear:
+    with_ramps = [course for course in courses if course.fastest > course.least_ramp]
+    if not with_ramps:
         return replace(base, noise_sd_c=noise, quantum_c=quantum)
-    fastest = max(course.fastest for course in clear)
+    fastest = max(course.fastest for course in with_ramps)
     # At the beginning of a ramp the lagged temperature has the second derivative ramp / lag. It is
     # estimated from the difference of two rates one minute apart.
     lags = []
-    for course in clear:
+    for course in with_ramps:
         bend = np.abs(course.rate[_BINS_PER_SIDE:] - course.rate[:-_BINS_PER_SIDE])
         steepest = float(np.quantile(bend, 0.995)) / (_BIN_S * _BINS_PER_SIDE)
         if steepest > 0.0:
@@ -151,8 +154,8 @@ def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
     """Return 0.7 times the slowest ramp longer than 10 min, at least `RAMP_K_MIN` [K/min]."""
     slowest = usual / 0.7
     for course in courses:
-        clear = np.abs(course.rate) > max(_CLEAR * course.rate_sd, 0.1 / 60.0)
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], clear.astype(np.int8), [0]))))
+        is_ramp = np.abs(course.rate) > max(course.least_ramp, 0.1 / 60.0)
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], is_ramp.astype(np.int8), [0]))))
         for start, stop in zip(edges[::2], edges[1::2], strict=True):
             if (stop - start) * _BIN_S > 600.0:
                 middle = float(np.quantile(np.abs(course.rate[start:stop]), 0.9)) * 60.0
@@ -180,7 +183,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
     for name in sensors:
         rate, gradient = [np.zeros(0)], [np.zeros(0)]
         for bag in bags:
-            board, other = bag.board, bag.temperatures.get(name, NO_READINGS)
+            board, other = bag.board, bag.temperatures.get(name, Readings())
             if min(len(board.value), len(other.value)) < 30:
                 continue
             first = max(board.stamp_ns[0], other.stamp_ns[0])
@@ -234,7 +237,7 @@ def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str,
     """
     rows: list[tuple[str, int, float]] = []
     for name in inputs:
-        readings = bag.temperatures.get(name, NO_READINGS)
+        readings = bag.temperatures.get(name, Readings())
         rows += zip(
             repeat(name), readings.stamp_ns.tolist(), readings.value.tolist(), strict=False
         )

@@ -32,11 +32,6 @@ import numpy as np
 from ..typing import Bools, Floats, Ints
 from .unknowns import Noise, State, Windows
 
-# Candidate ratios of the Gauss-Markov variance to the white variance of a window.
-_RATIOS = 10.0 ** np.arange(-2.5, 3.6, 0.5)
-# Ratio of neighbouring candidates of the correlation time.
-_TIME_STEP = 10.0**0.5
-
 
 class Whitener:
     """Filters series of windows, in order of position and time, position by position."""
@@ -55,18 +50,21 @@ class Whitener:
             self._is_there[1:], time[self._row[1:]] - time[self._row[:-1]], 0.0
         )
         self._interval = interval
-        #: Candidate correlation times [s]: from 3 windows to a sixth of a position's length.
-        span = float(np.median(interval.sum(axis=0)))
-        typical = float(np.median(interval[1:][self._is_there[1:]])) if n_steps > 1 else 1.0
+        #: Candidate correlation times [s]: from 3 windows to a sixth of a position's length, in
+        #: steps of half a decade.
         self.times_s: list[float] = []
-        time_s = 3.0 * typical
-        while time_s <= span / 6.0:
+        span_s = float(np.median(interval.sum(axis=0)))
+        typical_s = float(np.median(interval[1:][self._is_there[1:]])) if n_steps > 1 else 1.0
+        time_s = 3.0 * typical_s
+        while time_s <= span_s / 6.0:
             self.times_s.append(time_s)
-            time_s *= _TIME_STEP
+            time_s *= 10.0**0.5
+        #: The next longer correlation time, up to which a search may go [s].
+        self._longest_s = time_s
 
     def shows(self, time_s: float) -> bool:
         """Whether a correlation time is within the range of the candidates."""
-        return bool(self.times_s) and self.times_s[0] <= time_s <= self.times_s[-1] * _TIME_STEP
+        return bool(self.times_s) and self.times_s[0] <= time_s <= self._longest_s
 
     def gains(self, weight: Floats, noise: Noise) -> tuple[Floats, Floats, Floats]:
         """Return decay, Kalman gain and sd of the innovation [sigma], (n_steps, n_positions)."""
@@ -114,7 +112,9 @@ class Whitener:
         The result is white noise unless twice the log likelihood gains 9.2, the 1 % point of a
         chi-square with two degrees of freedom.
         """
-        candidates = [Noise(float(r), t) for t in self.times_s for r in _RATIOS]
+        # Candidates of the ratio of the Gauss-Markov variance to the white variance of a window.
+        ratios = 10.0 ** np.arange(-2.5, 3.6, 0.5)
+        candidates = [Noise(float(ratio), time_s) for time_s in self.times_s for ratio in ratios]
         if not candidates:
             return Noise()
         white = float(self._deviances(residual, weight, [Noise()])[0])
@@ -122,10 +122,10 @@ class Whitener:
         best = int(np.argmin(deviances))
         if white - float(deviances[best]) < 9.2:
             return Noise()
-        at, on = divmod(best, len(_RATIOS))
-        table = deviances.reshape(-1, len(_RATIOS))
-        log_ratio = np.log10(_RATIOS[on]) + 0.5 * _vertex(table[at], on)
-        log_time = np.log10(self.times_s[at]) + 0.5 * _vertex(table[:, on], at)
+        row, column = divmod(best, len(ratios))
+        table = deviances.reshape(-1, len(ratios))
+        log_ratio = np.log10(ratios[column]) + 0.5 * _vertex(table[row], column)
+        log_time = np.log10(self.times_s[row]) + 0.5 * _vertex(table[:, column], row)
         return Noise(float(10.0**log_ratio), float(10.0**log_time))
 
     def _deviances(self, residual: Floats, weight: Floats, noises: Sequence[Noise]) -> Floats:

@@ -18,10 +18,6 @@ from ..errors import FitError
 from ..typing import Floats, Ints
 from .unknowns import Windows
 
-# Largest RMS distance from the ellipsoid over g: more than the drift of a cheap sensor over 60 K,
-# less than the error of a moving unit.
-_LARGEST_RMS = 0.05
-
 
 @dataclass(frozen=True)
 class ConstantCalibration:
@@ -49,12 +45,13 @@ def constant_calibration(
 
     `gravity`: |f| of all positions, or of each, shape (n,) [m/s^2]
     """
+    # Largest RMS distance from the ellipsoid [m/s^2]: 5 % of |f|, more than the drift of a cheap
+    # sensor over 60 K, and less than the error of a moving unit.
+    largest_rms = 0.05 * float(np.median(gravity))
     if isinstance(gravity, np.ndarray):
         scale = np.full(3, float(np.median(np.linalg.norm(means, axis=1) / gravity)))
         calibration, rms = _refine(means, gravity, np.zeros(3), scale, with_misalignment)
-        if not np.all(calibration.scale > 0.0) or not rms < _LARGEST_RMS * float(
-            np.median(gravity)
-        ):
+        if not np.all(calibration.scale > 0.0) or not rms < largest_rms:
             raise FitError('the readings contradict the stated |f|: are its values right?')
         return calibration
     bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
@@ -69,7 +66,7 @@ def constant_calibration(
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
     # The best ellipsoid of scattered points can be very large, with a remote centre: reject it.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
-    if not np.all(calibration.scale > 0.0) or not is_around or not rms < _LARGEST_RMS * gravity:
+    if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
         raise FitError(
             'the positions lie on no ellipsoid: is every one of them at rest, and is it an '
             'accelerometer, with one unit for three axes at right angles?'
