@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the documentation takes from the code: the schema and the two reference pages.
+Owns the files that are generated from the code: the JSON schema and the two reference pages.
 
-Run ``python docs/make_reference.py`` after changing a key or a parameter; a test compares.
-
+Run ``python docs/make_reference.py`` after a change of a key or a parameter. A test compares the
+files with the code.
 """
 
 from __future__ import annotations
@@ -85,14 +85,14 @@ the static set, free coefficients of its Fs, level of the dynamic set, free coef
 weights of the response in the order of the file); then the relative scale in the same order. The
 last three parameters are `M[1][0]`, `M[2][0]` and `M[2][1]`. The covariance is
 `factor @ factor.T + diag(rest)`. The posterior of a `gyroscope` has the bias only, in rad/s and in the
-same order; it uses the ranges, the reference temperature and the thermometers of the unit.
+same order; the `gyroscope` uses the ranges, the reference temperature and the thermometers of the unit.
 """
 
 BOUNDS = """\
 ## Bounds
 
-Each number in a calibration belongs to one of these quantities. The bounds are wider than any instrument needs; a file
-within them gives finite results and a positive definite covariance. Further bounds depend on the full scale of the unit.
+Each number in a calibration is one of these quantities. The bounds are wider than any instrument needs; a calibration
+within these bounds gives finite results and a positive definite covariance. Further bounds depend on the full scale of the unit.
 The bias including its curve must stay within twice the full scale over the whole temperature range. The largest
 contribution of a column, and of one standard deviation of a parameter, must stay within a million times this bound. The
 relative scale including the largest contributions of all columns must stay between 0.1 and 10.
@@ -113,11 +113,11 @@ stamps are carried through; the node never stamps with its own clock and needs n
 Each QoS policy can be overridden at start with the usual `qos_overrides./topic.subscription.reliability`
 parameters.
 
-With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, which has no ROS QoS setting:
-with the default of 0 s each sample for a reliable subscriber wakes a thread of the middleware about four times, a quarter
-of the node's CPU time. A lost sample is repeated up to 20 ms later than by default. Another profile
-(`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces it; repeat the
-setting there.
+With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, because this parameter has no
+ROS QoS setting. With the default of 0 s each sample for a reliable subscriber wakes a thread of the middleware about four
+times, which takes a quarter of the node's CPU time. A lost sample is repeated up to 20 ms later than by default. Another
+profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces the profile of
+the node; repeat the parameter in the other profile.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at this thermal
 state. Without angular rate or orientation in the input, the first element of their covariance is -1 (REP 145). If the
@@ -162,8 +162,8 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | no board temperature, and a calibration without temperature correction | the constants are applied, and the covariance allows for 10 K |
 | board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
 | case temperature older than `case_timeout` | the board decides the regime, WARN, larger covariance |
-| board temperature outside the calibrated range | curves go on along their tangent for a quarter of the range, then are held; larger covariance, WARN with how far |
-| gradient or rate outside the calibrated range | held at the edge, larger covariance, WARN with how far |
+| board temperature outside the calibrated range | curves continue along their tangent for a quarter of the range, and are constant beyond; larger covariance, WARN with the distance |
+| gradient or rate outside the calibrated range | constant beyond the edge, larger covariance, WARN with the distance |
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
 | a temperature that jumps faster than any part can | its readings are not used until they are plausible again or the sensor is lost |
 | a temperature that is constant while that of the other thermometer changes | its readings are not used: the last value is held, then the sensor counts as lost |
@@ -251,10 +251,7 @@ def _define(cls: Any, definitions: dict[str, Any]) -> None:
 
 
 def calibration_page() -> str:
-    """
-    Return the calibration file's reference.
-
-    """
+    """Return the page on the calibration file."""
     schema = calibration_schema()
     definitions = schema['$defs']
     parts = [CALIBRATION_HEAD, *_section('The top level', schema, definitions, heading=2)]
@@ -353,7 +350,7 @@ def _type(value: dict[str, Any]) -> str:
 
 
 def topics_table() -> str:
-    """Write the node's topics as the rows of a Markdown table."""
+    """Return the node's topics as the rows of a Markdown table."""
     directions = {'in': INPUTS.values(), 'out': (*OUTPUTS, STATUS)}
     return '\n'.join(
         f'| {direction} | `{topic.name}` | {topic.type.replace("/msg/", "/")}: {topic.meaning} '
@@ -364,10 +361,7 @@ def topics_table() -> str:
 
 
 def parameters_table() -> str:
-    """
-    Write the node's parameters as a Markdown table.
-
-    """
+    """Return the node's parameters as a Markdown table."""
     rows = ['| parameter | type | default | range | what it does |', '|---|---|---|---|---|']
     for field in dataclasses.fields(NodeConfig):
         is_text = isinstance(field.default, str)
@@ -386,10 +380,7 @@ def parameters_table() -> str:
 
 
 def pages() -> dict[Path, str]:
-    """
-    Return every generated file with its text.
-
-    """
+    """Return the text of each generated file."""
     return {
         ROOT / 'config' / 'calibration.schema.json': json.dumps(calibration_schema(), indent=2)
         + '\n',
