@@ -72,7 +72,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
     other = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves of the program limit the number of columns; both models have the same.
+    # Left-out halves of the program limit the number of columns; here both models have the same.
     return other if is_better(fit.selected.score, other.selected.score, by_halves=False) else fit
 
 
@@ -98,7 +98,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     Fit the windows with one lag per axis, or with a bank of time constants.
 
     The bank is fitted if no lag per axis is found, or if the lags leave more left-out drift than
-    noise explains; then it is taken if it is better on left-out data, see `is_better`.
+    noise explains. The bank then replaces the lags if it is better on left-out data.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -108,7 +108,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     model = model_of(bags, options, parts.stages)
     of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
     fit = regress(of_parts, problem)
-    # The noise of the fit contains what the lags of the parts do not explain.
+    # The noise estimated by the fit includes the error of the lags; `parts.noise` does not.
     if fit.selected.score.rms > 2.0 * parts.noise:
         with_bank = regress(windows, problem)
         if is_better(fit.selected.score, with_bank.selected.score):

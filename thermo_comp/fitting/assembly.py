@@ -98,8 +98,9 @@ def build_calibration(
 
 def _temperature_range(windows: ThermalWindows) -> Range:
     """
-    Return the valid range of temperatures. A test at one temperature is valid near it. Without a
-    thermometer the range is wide, and the covariance of the slope covers the unknown curve.
+    Return the valid range of temperatures. A test at one temperature is valid within 0.5 K of this
+    temperature. Without a thermometer the margin is 50 K, and the covariance of the slope covers
+    the unknown curve.
     """
     return _range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 

@@ -58,9 +58,9 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
     if options.model == 'golovach' or n_directions < POSITIONS_NEEDED:
-        # P attitudes show 3 P drifts. A unit has 6 of them (bias and scale of each axis), supports
-        # have 2 P, so below 6 attitudes a tilt cannot be distinguished from a drift of the unit.
-        # The paper's model has no tilts: they would take the errors that its two sets leave.
+        # P attitudes give 3 P drifts. The unit has 6 unknown drifts (bias and scale of each axis),
+        # the supports have 2 P. Below 6 attitudes a tilt cannot be distinguished from a drift of
+        # the unit. In the paper's model tilts would absorb the errors of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
@@ -79,11 +79,11 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     if n_directions < POSITIONS_NEEDED:
         narrow = _narrowed(prior, regression, state, options)
 
-    def tell(part: float) -> None:
+    def report(part: float) -> None:
         problem.progress(0.7 + 0.25 * part)
 
-    settling = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
-    selected = select(regression, state, narrow, settling, tell)
+    without_slow = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
+    selected = select(regression, state, narrow, without_slow, report)
     chosen = selected.posterior
     wide = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=wide))
@@ -127,15 +127,15 @@ def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOp
     """
     Return the prior of the constants during the selection of the columns.
 
-    Few attitudes do not determine all constants, and the errors of an incomplete model would move
-    them far. Therefore their sd is five times the largest error of a norm, at least 5 % and at
-    most 100 % of the prior's sd.
+    Few attitudes do not determine all constants, and an incomplete model would change the
+    undetermined constants by large amounts. The sd of the constants is therefore five times the
+    largest error of a norm, at least 5 % and at most 100 % of the prior's sd.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
-    off = 5.0 * float(np.abs(norms - regression.norms(state)).max())
+    limit = 5.0 * float(np.abs(norms - regression.norms(state)).max())
     bias, scale = (
         float(np.clip(ratio, 0.05, 1.0))
-        for ratio in (off / BIAS_SD, off / options.gravity / SCALE_SD)
+        for ratio in (limit / BIAS_SD, limit / options.gravity / SCALE_SD)
     )
     return replace(prior, bias_sd=bias * prior.bias_sd, scale_sd=scale * prior.scale_sd)
 
@@ -144,8 +144,8 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     """
     Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
 
-    They can hardly be told from the curve, and their end would be extrapolated. No model has them;
-    the covariance has those that are linear, see `claim`.
+    The effect of such a lag is nearly collinear with the curve, and its final value would be
+    extrapolated. No model has these columns; the covariance has the linear ones, see `claim`.
     """
     data = windows.data
     longest_s = float(data.age.max())
@@ -169,7 +169,8 @@ def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> floa
     # Bounds: 30 ug, as of sensors of navigation grade, and 0.5 mg, as of consumer MEMS; the tail
     # of the Student prior allows for more.
     least, most = 3e-4, 5e-3
-    # Readings that never change have no noise; offsets of 1e6 times it have no posterior.
+    # Readings with almost no noise have a smaller lower bound: an offset 1e6 times as large as the
+    # noise cannot be estimated in double precision.
     least = max(min(least, 100.0 * density), smallest)
     return float(np.clip(3.0 * density, least, most))
 
@@ -185,24 +186,24 @@ def _candidates(
     data = windows.data
     groups = np.array(data.groups)
     allowed = {*data.groups} if options.groups is None else {*options.groups, *options.forced}
-    may = np.isin(groups, list(allowed)) & (data.kelvins > 0.0)
-    may &= windows.has_temperature
-    parts = np.stack((may, may & data.in_scale))
+    is_candidate = np.isin(groups, list(allowed)) & (data.kelvins > 0.0)
+    is_candidate &= windows.has_temperature
+    parts = np.stack((is_candidate, is_candidate & data.in_scale))
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
     if data.n_positions >= POSITIONS_NEEDED:
         # Rests of one temperature each show the drift as differences between their norms.
         force = (position_means(data) - start.bias) / start.scale
         sizes = sizes_of(windows, options)
-        off = np.linalg.norm(force, axis=1) - sizes
+        errors = np.linalg.norm(force, axis=1) - sizes
         if np.ptp(sizes) > 0.0:
             # Nonlinearity over |f| is not a thermal drift: subtract a cubic of |f|.
-            smooth = np.vander(sizes / sizes.max(), 4)
-            off -= smooth @ np.linalg.lstsq(smooth, off, rcond=None)[0]
-        drift = max(drift, float(np.std(off)))
-    moved = float(np.std(windows.temperature)) or 1.0
+            powers = np.vander(sizes / sizes.max(), 4)
+            errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
+        drift = max(drift, float(np.std(errors)))
+    temperature_sd = float(np.std(windows.temperature)) or 1.0
     # The smallest typical slope of the bias is 0.1 ug/K, better than navigation grade.
-    slope = float(np.clip(drift / moved, 1e-6, STEEPEST[0] / 3.0))
+    slope = float(np.clip(drift / temperature_sd, 1e-6, STEEPEST[0] / 3.0))
     slopes = np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])
     fixed = np.zeros(parts.shape, dtype=bool)
     if has_one_direction:

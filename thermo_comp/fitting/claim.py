@@ -8,10 +8,10 @@ The standard deviation of mounting and turn-on offsets is marginalised: the cova
 mixture of fits on a grid of this standard deviation. The weight of each fit is its evidence times
 a half-Student prior. The standard deviation of gravity is a common error of the scale factors.
 
-The lack of fit per regime and temperature is the mean square of the left-out drift less its
-published variance. So a kink of the curve, a tilt of the support or a drift of the bias widens the
-uncertainty although no column describes it. Models within one standard error of the chosen model
-contribute half of their squared difference from it.
+The lack of fit per regime and temperature is the mean square of the left-out drift less the
+published variance of this drift. The lack of fit covers effects that no column describes, such as
+a kink of the curve, a tilt of the support or a drift of the bias. Models within one standard error
+of the chosen model contribute half of the squared difference between their drift and its drift.
 
 References
 ----------
@@ -71,12 +71,12 @@ def claim_of(
     if candidates is not None:
         wider = _with_unseen(regression, posterior, candidates)
         wide = regression.solve(posterior.state, wider, n_steps=0)
-        # The unseen columns are added at the mounting sd of the mode, the mixture's excess to it.
+        # The covariance with unseen columns is that at the mounting sd of the mode. Add the excess
+        # of the mixture's covariance over that of the mode.
         at = _places(posterior.layout, wide.layout)
-        where = np.ix_(at, at)
-        more = covariance - posterior.covariance
+        excess = covariance - posterior.covariance
         layout, covariance = wide.layout, wide.covariance.copy()
-        covariance[where] += more
+        covariance[np.ix_(at, at)] += excess
     if gravity_sd and regression.gravity:
         # An error of gravity is the same relative error of all three scale factors.
         along = np.zeros(len(covariance))
@@ -104,7 +104,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     An inactive column is consistent with 0, but the data bound it only to ``1 / sqrt(S)``, S being
     its information given the active columns. If this bound exceeds two standard deviations of a
     window's noise, the column enters the covariance with this sd and zero weight. A column that
-    hardly moved is judged as if it had moved as far as the temperature did.
+    was almost constant is judged as if it had changed as much as the temperature.
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     inactive = regression.inactive(posterior, np.isin(groups, LAGS) & typical.any(axis=0))
@@ -119,10 +119,10 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
         sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
     kelvins = regression.windows.kelvins
-    # A column is called still if it moved by less than 1 % of the change of temperature.
-    stood = kelvins < 0.01 * float(kelvins[0])
-    farther = np.where(stood, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
-    matters = (sd > 0.0) & (sd * farther > 2.0 * float(np.mean(prior.sigma)) * units)
+    # A column counts as constant if it changed by less than 1 % of the change of temperature.
+    is_constant = kelvins < 0.01 * float(kelvins[0])
+    ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
+    matters = (sd > 0.0) & (sd * ratio > 2.0 * float(np.mean(prior.sigma)) * units)
     return replace(prior, column_sd=np.where(matters, sd, prior.column_sd))
 
 
@@ -137,19 +137,19 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
         regression.solve(posterior.state, replace(prior, offset_sd=float(sd)), n_steps=1)
         for sd in tried
     ]
-    # Density per step of the logarithm: flat below the scale, with a Student's tail above it, and
-    # falling to 0 below a hundredth of the scale, which few mountings reach.
+    # Prior density per step of the logarithm: flat below the scale, a Student's tail above the
+    # scale, and falling to 0 below a hundredth of the scale, which few mountings reach.
     density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
     density += np.log(np.minimum(grid / 0.01, 1.0))
     weight = np.array([fit.log_evidence for fit in fits]) + density
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
-    here = as_vector(posterior.state, posterior.layout)[:n]
+    mode = as_vector(posterior.state, posterior.layout)[:n]
     covariance = np.zeros((n, n))
     for share, fit in zip(weight, fits, strict=True):
-        away = as_vector(fit.state, fit.layout)[:n] - here
-        covariance += share * (fit.covariance + np.outer(away, away))
+        difference = as_vector(fit.state, fit.layout)[:n] - mode
+        covariance += share * (fit.covariance + np.outer(difference, difference))
     return covariance, float(np.sqrt(weight @ tried**2))
 
 

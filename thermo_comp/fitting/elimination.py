@@ -35,14 +35,14 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     scaled = matrix / root[..., None, :]
     scaled /= root[..., :, None]
     every = np.arange(matrix.shape[-1])
-    jitters = 1e-13, 1e-11, 1e-9, 1e-7  # they add up
+    jitters = 1e-13, 1e-11, 1e-9, 1e-7  # tried in turn, each added to those before
     for jitter in jitters:
         scaled[..., every, every] += jitter
         try:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
             if matrix.ndim > 2:
-                # Only the matrices that need more jitter get it.
+                # Factor the matrices one by one: only some of them need more jitter.
                 return np.stack([factored(*pair) for pair in zip(matrix, square, strict=True)])
             if jitter == jitters[-1]:
                 raise

@@ -79,12 +79,12 @@ def bags_contradicting_prior(
 ) -> list[int]:
     """
     Find the bags whose drift contradicts a calibration of the same unit: with the unit's
-    parameters fixed, no start states and tilts of the bag explain it.
+    parameters fixed, no initial lag states of the bag explain the drift.
     """
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
     regression, state = _at_calibration(known, data, options.gravity)
     first = informative_priors(known, regression, state, windows.model.sets, options)[0]
-    # The noise of a window, as long as the calibration's typical ones.
+    # Length of a typical window [s], and the white noise of its mean [m/s^2].
     window_s = windows.typical_count * known.unit.cycle_time_s
     sigma = np.array(known.noise_density_m_s2_sqrt_hz) / np.sqrt(window_s)
     prior = Prior(
@@ -93,11 +93,10 @@ def bags_contradicting_prior(
         scale_sd=SCALE_SD,
         misalignment_sd=MISALIGNMENT_SD,
         column_sd=data.parts.astype(np.float64),
-        # The level may have moved by a turn-on or by ageing, of 1 mg or less [m/s^2]: only the
-        # drift is judged.
+        # Only the drift is judged: a turn-on or ageing may have changed the level, by up to 1 mg.
         offset_sd=1e-2,
         sigma=np.maximum(sigma, 1e-9),
-        # This factor keeps the parameters at the mean of the prior.
+        # The factor 1e4 fixes the parameters at the mean of the prior.
         informative=replace(first, root=1e4 * first.root),
     )
     fitted = regression.solve(state, prior, n_steps=4)
@@ -126,8 +125,8 @@ def with_excluded_error(
     calibration: Calibration, bags: Sequence[ReducedBag], others: str
 ) -> tuple[Calibration, Finding]:
     """
-    Add the error of the correction of bags that took no part to the lack of fit of both sets;
-    `others` says what the bags contradict.
+    Add the error of the correction of excluded bags to the lack of fit of both sets; `others`
+    names what the bags contradict.
     """
     windows = thermal_windows(bags, prior_model(calibration))
     regression, state = _at_calibration(calibration, windows.data, calibration.gravity_m_s2)

@@ -209,8 +209,8 @@ class Equations(Series):
         """
         Return series and factor of the active nonlinear coefficients.
 
-        The scale's change multiplies the terms at the reference; its product with their change per
-        kelvin is negligible.
+        The relative change of the scale factor multiplies the terms at the reference temperature.
+        Its product with the change of the terms per kelvin is negligible.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):

@@ -162,17 +162,17 @@ def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupE
             used = (names == group) & (prior.column_sd[k] > 0.0)
             if not used.any():
                 continue
-            added = regression.columns[:, used] @ state.weights[k][:, used].T
+            correction = regression.columns[:, used] @ state.weights[k][:, used].T
             if part == 'scale':
-                added = added * force
+                correction = correction * force
             places, sd = layout.weights[k][:, used].ravel(), prior.column_sd[k][used]
-            each = regression.weight_sd(prior)[k][:, used].ravel()
-            (gain,) = log_bayes_factors(mode, posterior.covariance, places[None], each[None])
+            weight_sd = regression.weight_sd(prior)[k][:, used].ravel()
+            (gain,) = log_bayes_factors(mode, posterior.covariance, places[None], weight_sd[None])
             result.append(
                 GroupEvidence(
                     group,
                     part,
-                    float(np.sqrt(np.mean(added**2))),
+                    float(np.sqrt(np.mean(correction**2))),
                     max(float(effective[k][used].sum()), 0.0),
                     float(gain),
                     tuple(sd.tolist()),

@@ -185,27 +185,28 @@ def _fit_one_environment(
     """Fit the bags, without those of another environment, see `environments`."""
     whole = _fit(bags, options, progress)
     known = options.prior
-    gone: list[int] = []
+    excluded: list[int] = []
     if known is None:
         bag = contradicting_bag(whole.fit)
-        gone = [] if bag is None else [bag]
+        excluded = [] if bag is None else [bag]
     elif known.unit.serial == whole.calibration.unit.serial and not whole.fit.windows.data.forces:
-        gone = bags_contradicting_prior(whole.fit.windows, known, options)
-    if not gone:
+        excluded = bags_contradicting_prior(whole.fit.windows, known, options)
+    if not excluded:
         return whole
-    kept = [bag for k, bag in enumerate(bags) if k not in gone]
+    kept = [bag for k, bag in enumerate(bags) if k not in excluded]
     rest = whole
     if kept:
         rest = _fit(kept, options, progress)
-        if known is None and not is_better_without(whole.fit, rest.fit, gone[0]):
+        if known is None and not is_better_without(whole.fit, rest.fit, excluded[0]):
             return whole
     elif known is not None:
-        # All bags contradict the prior, so none can update it.
+        # All bags contradict the prior, so no bag can update the prior.
         provenance = whole.calibration.provenance
         rest = replace(whole, calibration=replace(known, provenance=provenance))
     others = 'the other bags' if known is None else 'the prior'
-    excluded = [bags[k] for k in gone]
-    calibration, finding = with_excluded_error(rest.calibration, excluded, others)
+    calibration, finding = with_excluded_error(
+        rest.calibration, [bags[k] for k in excluded], others
+    )
     return replace(
         rest,
         calibration=with_notes(calibration, [finding]),

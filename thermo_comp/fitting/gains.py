@@ -20,7 +20,7 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# Grid of the square of a common factor of the columns' prior sd: the gain is that at the best one.
+# Squares of the candidates of a common factor of the columns' prior sd; the best one is taken.
 _SQUARES = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 
@@ -67,8 +67,8 @@ class Inactive:
         """
         Return the gain in log evidence by the `wanted` columns, shape (m,).
 
-        It is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, S and q in units of the columns' prior sd,
-        shape (2, m), at the best common factor of this sd.
+        The gain is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, S and q in units of the columns'
+        prior sd, shape (2, m), at the best common factor of this sd.
         """
         S, Q, _ = self._in_prior_sd(column_sd, wanted)
         S, along = np.linalg.eigh(S)
@@ -86,10 +86,10 @@ class Inactive:
         result = np.zeros_like(wanted)
         for _ in range(most if len(Q) else 0):
             s, q2 = _SQUARES * np.maximum(np.diag(S), 0.0), _SQUARES * Q**2
-            each = np.zeros((len(_SQUARES), len(wanted)))
-            np.add.at(each.T, column, 0.5 * (q2 / (1.0 + s) - np.log1p(s)).T)
-            factor, best = np.unravel_index(int(np.argmax(each)), each.shape)
-            if each[factor, best] < least:
+            gains = np.zeros((len(_SQUARES), len(wanted)))
+            np.add.at(gains.T, column, 0.5 * (q2 / (1.0 + s) - np.log1p(s)).T)
+            factor, best = np.unravel_index(int(np.argmax(gains)), gains.shape)
+            if gains[factor, best] < least:
                 break
             result[best] = True
             at = np.flatnonzero(column == best)

@@ -3,10 +3,10 @@
 """
 Owns the estimation of prior standard deviations and noises, without columns of too little gain.
 
-Each column has one prior standard deviation for the bias of all axes and one for the scale. They
-follow MacKay's fixed point with a log-normal hyperprior per kelvin: the mode of log evidence plus
-hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``. The sd of a
-column about which the data have no information stays at the centre of the hyperprior.
+Each column has one prior standard deviation for the bias of all axes and one for the scale. Both
+are found by MacKay's fixed point with a log-normal hyperprior per kelvin: the mode of log evidence
+plus hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``. The sd
+of a column about which the data have no information stays at the centre sd0 of the hyperprior.
 
 References
 ----------
@@ -99,7 +99,8 @@ def _updated(
         misalignment_sd = max(float(np.sqrt(np.sum(state.misalignment**2) / gamma)), 1e-5)
     start_share = prior.start_share
     if layout.start.size:
-        # The run-time prior has the weight of one state, so that one bag cannot make it small.
+        # The run-time prior has the weight of one state, so that one bag cannot make the share
+        # small.
         gamma = float(determined[layout.start].sum())
         start_share = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
         changes.append(float(np.abs(np.log(start_share / prior.start_share))) / 4.0)
@@ -215,7 +216,7 @@ def with_slow_noise(
 def pruned_fit(
     regression: Regression, posterior: Posterior, candidates: Candidates, rounds: int = 25
 ) -> Posterior:
-    """Drop columns with too little gain, as long as the log evidence of the new fit agrees."""
+    """Drop columns of small gain, as long as the log evidence falls by less than `LEAST_GAIN`."""
     while True:
         prior = _pruned(regression, posterior, candidates)
         if np.array_equal(prior.column_sd, posterior.prior.column_sd):
@@ -228,8 +229,8 @@ def pruned_fit(
 
 def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates) -> Prior:
     """
-    Drop columns with a log Bayes factor below `LEAST_GAIN`, one at a time, the smallest first; the
-    factors of the others are then those without it.
+    Drop columns with a log Bayes factor below `LEAST_GAIN`, one at a time, the smallest first;
+    after each the factors of the other columns are calculated again.
     """
     state, layout, prior = posterior.state, posterior.layout, posterior.prior
     covariance = posterior.covariance.copy()
@@ -248,17 +249,17 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
             break
         column_sd[tuple(droppable.pop(least))] = 0.0
         at = places[least]
-        gone = np.linalg.solve(covariance[np.ix_(at, at)], covariance[at])
-        mode = mode - gone.T @ mode[at]
-        covariance -= covariance[:, at] @ gone
+        gain = np.linalg.solve(covariance[np.ix_(at, at)], covariance[at])
+        mode = mode - gain.T @ mode[at]
+        covariance -= covariance[:, at] @ gain
     return replace(prior, column_sd=column_sd)
 
 
 def downweigh(regression: Regression, posterior: Posterior) -> None:
     """
-    Reduce the weight of windows more than 3 sd from the local median: short disturbances.
+    Reduce the weight of windows more than 3 sd from the local median, which are disturbed.
 
-    The weight is that at which the window would be 3 sd away.
+    The reduced weight is that at which the distance of the window is 3 sd.
     """
     windows = regression.windows
     if windows.undisturbed is None:

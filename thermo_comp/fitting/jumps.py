@@ -11,8 +11,8 @@ if there is one, shows no rotation.
 
 After a low-pass filter neighbouring samples have a correlation r, and their slow noise hides a
 step. The differences ``a_i - r a_(i-1)`` are white (generalised least squares for first-order
-noise), and a step within one sample is significant in them. So is a shock that decays; hence the
-mean levels of quiet samples on either side must differ, too.
+noise), and a step within one sample is significant in them. A shock that decays is significant,
+too; therefore the mean levels of the quiet samples before and after the step must also differ.
 """
 
 from __future__ import annotations
@@ -125,14 +125,14 @@ def _examine(
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
     # A shock decays; a step is also a difference between the quiet samples on both sides.
-    lasting, known, left = _step(time[beside], accel[beside], time[at])
-    lasting_sd = quiet_sd * known * _correlation(left, quiet_sd)
-    step, known, left = _step(time, accel, time[at], r)
+    lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
+    lasting_sd = quiet_sd * relative_sd * _correlation(residual, quiet_sd)
+    step, relative_sd, residual = _step(time, accel, time[at], r)
     # With correlated noise the scatter within a cell underestimates the noise of means.
-    sd = np.sqrt(np.mean(left**2, axis=0)) if r else quiet_sd
-    step_sd = sd * known * _correlation(left, sd)
+    sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
+    step_sd = sd * relative_sd * _correlation(residual, sd)
     if r:
-        # At least half of the step must last, with four standard deviations.
+        # At least half of the step must last, and must exceed four standard deviations.
         is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > 0.5)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -147,14 +147,13 @@ def _examine(
     along = float(np.linalg.norm(middle + 0.5 * step) - np.linalg.norm(middle - 0.5 * step))
     size = float(np.linalg.norm(step))
     along_sd = float(np.sqrt((middle / norm) ** 2 @ step_sd**2))
-    needed = float(np.sqrt(max(size**2 - along**2, 0.0))) / norm
-    seen = _turn(time, gyro, at)
+    needed_rad = float(np.sqrt(max(size**2 - along**2, 0.0))) / norm
     # The step is no rotation if the gyroscope measured less than a third of the angle needed, or
     # if |a| changed: a rotation by d changes |a| by at most 2 d times the sensor's error (10 %).
-    is_no_turn = seen < 0.33 * needed or (
+    is_no_turn = _turn(time, gyro, at) < 0.33 * needed_rad or (
         abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd
     )
-    # Twice the quiet noise: a hand on the unit makes far more.
+    # A hand on the unit causes far more than twice the quiet noise.
     if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
     warmed, warmed_sd = _temperature_step(bag, time[0], time[at], time[-1])
@@ -169,21 +168,21 @@ def _examine(
     )
 
 
-def _correlation(left: Floats, sd: Floats) -> Floats:
+def _correlation(residual: Floats, sd: Floats) -> Floats:
     """
     Return the sd of a mean over that for white noise of `sd`, per axis, at least 1.
 
-    It follows from the means of 40 pieces of the residuals `left`, shape (n, 3): from their
+    This ratio follows from the means of 40 pieces of the residuals, shape (n, 3): from their
     variance and their lag-1 correlation r, which multiplies the variance by (1 + r) / (1 - r).
     """
-    size = max(len(left) // 40, 1)
-    n = len(left) // size
-    means = left[: n * size].reshape(n, size, 3).mean(axis=1)
+    size = max(len(residual) // 40, 1)
+    n = len(residual) // size
+    means = residual[: n * size].reshape(n, size, 3).mean(axis=1)
     square = np.mean(means**2, axis=0)
-    follows = np.sum(means[1:] * means[:-1], axis=0) / np.maximum(n * square, 1e-300)
-    r = np.clip(follows, 0.0, 1.0 - 1.0 / n)
-    worse = size * square * (1.0 + r) / (1.0 - r)
-    return np.asarray(np.sqrt(np.maximum(worse / np.maximum(sd**2, 1e-300), 1.0)))
+    correlation = np.sum(means[1:] * means[:-1], axis=0) / np.maximum(n * square, 1e-300)
+    r = np.clip(correlation, 0.0, 1.0 - 1.0 / n)
+    variance = size * square * (1.0 + r) / (1.0 - r)
+    return np.asarray(np.sqrt(np.maximum(variance / np.maximum(sd**2, 1e-300), 1.0)))
 
 
 def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> tuple[float, float]:
@@ -193,23 +192,24 @@ def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> t
     time, value = time[use], bag.board.value[use]
     if min(np.sum(time < at), np.sum(time >= at)) < _FEWEST_SAMPLES:
         return np.nan, np.nan
-    (step,), known, left = _step(time, value[:, None], at)
-    spread = float(np.sum(left**2)) / max(len(value) - 3, 1)
-    return float(step), known * float(np.sqrt(spread))
+    (step,), relative_sd, residual = _step(time, value[:, None], at)
+    variance = float(np.sum(residual**2)) / max(len(value) - 3, 1)
+    return float(step), relative_sd * float(np.sqrt(variance))
 
 
 def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[int, float]:
     """
     Find the first sample after the step and the lag-1 correlation of the noise.
 
-    Each is estimated given the other, three times. A correlation below 0.4 counts as white; above
-    0.999 it could not be distinguished from a random walk.
+    Place and correlation are estimated in turn, three times. Noise with a correlation below 0.4
+    counts as white. The correlation is at most 0.999; above, it is that of a random walk.
     """
     at, r = _place_of_step(time, accel, quiet_sd, 0.0), 0.0
     for _ in range(3):
-        left = _step(time, accel, time[at])[2] / quiet_sd
-        follows = float(np.sum(left[1:] * left[:-1]) / max(np.sum(left**2), 1e-300))
-        r = min(follows, 0.999) if follows > 0.4 else 0.0
+        residual = _step(time, accel, time[at])[2] / quiet_sd
+        square = max(np.sum(residual**2), 1e-300)
+        correlation = float(np.sum(residual[1:] * residual[:-1]) / square)
+        r = min(correlation, 0.999) if correlation > 0.4 else 0.0
         if not r:
             break
         at = _place_of_step(time, accel, quiet_sd, r)
@@ -220,12 +220,13 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     """Find the first sample after the most likely step, about a linear drift."""
     n = len(time)
     trend = _trend(time, r)
-    left = whitened(accel, r)
-    left = left - trend @ (trend.T @ left)
+    residual = whitened(accel, r)
+    residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
-    # The whitened step H_k = (i >= k) is 1 at k and 1 - r after it. Its product with a residual is
-    # a sum from k on; its square without the trend follows from the sums of the trend.
-    tail = _sums_behind(left, r)[candidates]
+    # The whitened step H_k = (i >= k) is 1 at k and 1 - r after k. The product of H_k with a
+    # residual is a sum from k on; the square of H_k without the trend follows from such sums of
+    # the trend.
+    tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)
     gain = ((tail / quiet_sd) ** 2).sum(axis=1) / square

@@ -3,7 +3,7 @@
 """
 Owns the known |f| of a bag that is not at 1 g, from the user or from the bag's metadata.
 
-It is one value, a table of sections, or a rotation rate with a radius.
+|f| is given as one value, as a table of sections, or as a rotation rate with a radius.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ The errors are the drift (each axis less its mean over the position, which does 
 attitude) and ``|f| - g`` of the position, if the other positions determine it.
 
 A model is better if it reduces the error by more than the standard error over the folds, both for
-positions and for sections of the program. One that describes only one recording, or one program,
-fails one of the two tests.
+positions and for sections of the program. A model that describes only one recording, or only one
+program, fails one of the two tests.
 
 References
 ----------
@@ -81,7 +81,7 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         whole = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # One fold has no scatter.
+            # The scatter of one fold is unknown: its error is the smallest difference that counts.
             return whole, _EQUAL
         each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))
@@ -137,12 +137,12 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
     Return the gain of a model if it exceeds its standard errors, else 0.
 
-    It is the sum of the log gains of the drift. If the drifts are equal, the norms of left-out
-    positions decide with a gain of two standard errors.
+    The gain is the sum of the log gains of the drift. If the drifts are equal, it is the log gain
+    of the norms of left-out positions, which must exceed two standard errors.
     """
     positions, sections, norms = _gains(before, after)
     drift = [gain for gain in (positions, sections) if gain]
-    # The RMS error of halves may rise by a quarter, as two folds scatter by that.
+    # The RMS error of halves may rise by a quarter: that of two folds scatters by about as much.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
         return 0.0

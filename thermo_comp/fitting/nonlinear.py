@@ -108,8 +108,8 @@ def with_forces(
     """
     Add |f| of the positions and the nonlinear terms to the windows.
 
-    They stay unchanged if |f| is within 1e-3 of gravity in all positions, and neither the options
-    nor the prior have nonlinear terms.
+    The windows stay unchanged if |f| is within 1e-3 of gravity in all positions, and neither the
+    options nor the prior have nonlinear terms.
     """
     still, spin, sd = np.full((3, windows.data.n_positions), 0.0)
     still[:] = options.gravity
@@ -157,7 +157,7 @@ def starting_sd(forces: Forces, options: FitOptions) -> Floats:
 
 
 class _TermFits:
-    """Fits with some of the nonlinear coefficients, and what a coefficient adds to them."""
+    """Fits with some of the nonlinear coefficients, and the gain by a coefficient."""
 
     def __init__(self, regression: Regression, selected: Selected, sd: Floats) -> None:
         """Take the prior sd of the coefficients, shape (2 k,)."""
@@ -204,7 +204,7 @@ class _TermFits:
 def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
-    """Choose the nonlinear terms, and of each whether it changes with temperature."""
+    """Choose the nonlinear terms, and those of them whose coefficient depends on temperature."""
     forces = regression.forces
     if forces is None:
         return selected, ()
@@ -307,15 +307,15 @@ def judge_terms(calibration: Calibration) -> list[Finding]:
     nonlinearity = calibration.nonlinearity
     if nonlinearity is None:
         return []
-    open_ones = [
+    undetermined = [
         f'{term.kind} (effective parameters {term.effective_parameters:.1f} of 6)'
         for term in nonlinearity.terms
         if term.effective_parameters < 3.0 * _DETERMINED
     ]
-    if not open_ones:
+    if not undetermined:
         return []
     text = (
-        f'the positions do not determine the nonlinearity: {", ".join(open_ones)} stays near its '
-        'prior; positions at several |f| above 1 g determine it'
+        f'the positions do not determine the nonlinearity: {", ".join(undetermined)} stays near '
+        'its prior; positions at several |f| above 1 g determine it'
     )
     return [Finding('nonlinearity', 'advice', text)]

@@ -177,7 +177,7 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name == 'exponential':
         # The leakage of semiconductors doubles in about 10 K: an e-fold of 15 K, and of 30 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
-    # A spline of four pieces; a knot close to the reference is replaced by one at it.
+    # A spline of four pieces; a knot near the reference is replaced by a knot at the reference.
     knots = np.linspace(lower, upper, 5)
     step = max((upper - lower) / 4, 1.0)
     kept = sorted([0.0, *(float(k) for k in knots if abs(k) > 0.3 * step)])
@@ -188,7 +188,7 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     """
     Return the gravity of the WGS 84 ellipsoid (Somigliana) at a height above it.
 
-    Real gravity differs from it by up to 30 mGal (30 ug) in mountains. Raises ValueError for a
+    Real gravity differs from the result by up to 30 mGal (30 ug) in mountains. ValueError for a
     latitude outside -90..90 deg or a height outside -1000..10000 m.
     """
     if not -90.0 <= latitude_deg <= 90.0:

@@ -6,7 +6,7 @@ Owns the search for the thermal lag of each axis.
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
 temperature of one part of the unit: t is the board temperature less the reference temperature, and
 m = T - L(T) the difference between the board temperature T and its lag. The lag has one stage or,
-where a part hangs on another part, two stages in series. Their time constants minimise the RMS
+where a part hangs on another part, two stages in series. The time constants minimise the RMS
 residual of a spline of the bias and a cubic of the scale factor, both over x.
 """
 
@@ -71,8 +71,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         # An RMS residual of up to 1.5 times the white noise is attributed to noise.
         if (square <= (1.5 * noise) ** 2).all():
             return parts
-        # A larger one has another cause, e.g. slow noise: the lags are then accepted only if they
-        # reduce the RMS residual of each axis to an eighth or less of that without a lag.
+        # A larger residual has another cause, e.g. slow noise: the lags are then accepted only if
+        # they reduce the RMS residual of each axis to an eighth or less of that without a lag.
         if accepted is None and min(map(curves.reduction, lags, range(3))) >= 8.0:
             accepted = parts
     return accepted

@@ -3,10 +3,10 @@
 """
 Owns informative priors: an earlier calibration of the unit, or the population of its type.
 
-Both are calibrations: a mean and a covariance of all parameters. A population has the mean and the
-scatter over units of the parameters relative to the scale factors. The covariance of an earlier
-calibration of the unit is increased by its ageing. Either is the Gaussian prior of the regression,
-which then has the columns of that file.
+Such a prior is a calibration: a mean and a covariance of all parameters. A population has the mean
+and the scatter over units of the parameters relative to the scale factors. The covariance of an
+earlier calibration of the unit is increased by the ageing of the unit. The calibration is the
+Gaussian prior of the regression, and its columns are those of the regression.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from calibrations of at least three units.
 
-    Raises FitError if they are fewer, or differ in input, reference, sensors or curves.
+    Raises FitError if there are fewer, or if they differ in input, reference, sensors or curves.
     """
     if len(calibrations) < UNITS_NEEDED:
         raise FitError(f'{len(calibrations)} calibrations, need {UNITS_NEEDED} for a population')
@@ -267,12 +267,12 @@ def _relative_to(
             f'{calibration.unit.serial} has no covariance: an imported calibration cannot be part '
             'of a population'
         )
-    everything = [_alike(column) for column in prior_columns(like)]
-    own_columns = prior_columns(calibration)
-    terms = np.zeros((len(everything), len(own_columns)))
-    for k, column in enumerate(own_columns):
+    common_columns = [_alike(column) for column in prior_columns(like)]
+    unit_columns = prior_columns(calibration)
+    terms = np.zeros((len(common_columns), len(unit_columns)))
+    for k, column in enumerate(unit_columns):
         for common, share in _on_common_lags(column):
-            terms[everything.index(_alike(common)), k] += share
+            terms[common_columns.index(_alike(common)), k] += share
     scale = constants_of(calibration).scale
     values, factor = parameters_of(calibration), np.ones(calibration.posterior.n_parameters)
     layout, into = parameter_layout(calibration), parameter_layout(like)

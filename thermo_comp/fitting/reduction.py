@@ -248,10 +248,11 @@ def _with_shorter_cells(
     source: FitSource, share: float, reduced: Callable[..., ReducedBag]
 ) -> ReducedBag | None:
     """
-    Reduce a source of slow samples in shorter cells; None if the usual ones serve.
+    Reduce a source of slow samples in shorter cells; None if cells of the usual length suffice.
 
-    `share`: the part of the bag at rest in usual cells. A bias that changes within minutes looks
-    like a motion there, and short rests are lost.
+    `share`: the part of the bag at rest in cells of the usual length. Slow samples make these
+    cells so long that a bias which changes within minutes looks like a motion, and that short
+    rests are lost.
     """
     if share < 0.95 and source.force is None:
         # The rests are interrupted: shorter cells must add 5 % of the bag.
@@ -320,13 +321,13 @@ def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> lis
         time, mean = cells.time[around], cells.mean[around]
         variance = np.maximum(cells.variance[around], cells.quantum**2 / 12.0)
         root = np.sqrt(np.maximum(cells.count[around, None], 1) / np.maximum(variance, 1e-300))
-        is_one = is_calm[last:start].all() and np.all(np.diff(cells.index[around]) == 1)
-        for axis in range(3) if is_one else ():
-            line = np.vander((time - time[0]) / np.ptp(time), 3) * root[:, [axis]]
+        is_same = is_calm[last:start].all() and np.all(np.diff(cells.index[around]) == 1)
+        for axis in range(3) if is_same else ():
+            powers = np.vander((time - time[0]) / np.ptp(time), 3) * root[:, [axis]]
             value = mean[:, axis] * root[:, axis]
-            left = value - line @ np.linalg.lstsq(line, value, rcond=None)[0]
-            is_one = is_one and np.mean(left**2) < 4.0
-        if is_one:
+            residual = value - powers @ np.linalg.lstsq(powers, value, rcond=None)[0]
+            is_same = is_same and np.mean(residual**2) < 4.0
+        if is_same:
             result[-1] = first, stop
         else:
             result.append((start, stop))

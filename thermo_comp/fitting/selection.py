@@ -85,7 +85,7 @@ class Fit(NamedTuple):
 
 
 def _complete_rms(posterior: Posterior) -> float:
-    """Return the largest left-out drift of a model that lacks nothing [m/s^2]."""
+    """Return the largest left-out drift of a model that lacks no column [m/s^2]."""
     return 2.0 * float(posterior.prior.sigma.mean())
 
 
@@ -151,8 +151,8 @@ class Growth:
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self.regression.inactive(chosen.posterior, columns)
         if BEND in absent:
-            # Some of the many bend columns are tried, chosen by forward selection: at most 60, a
-            # score for each axis, as around a bump of its curve.
+            # At most 60 of the many bend columns are tried, chosen by forward selection: 20 for
+            # each axis, as many as a bump of its curve needs.
             is_bend = self._names == BEND
             knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
@@ -193,9 +193,9 @@ def better_beginning(fits: Sequence[Trial]) -> Trial:
     """
     Choose between fits begun with small and with large mountings: the one better on left-out data.
 
-    If neither is, the large mountings must be likelier by `TRIAL_GAIN`. Both explain the norms of
-    few positions, one by mountings, the other by misalignments; only the second predicts the norm
-    of another position.
+    If neither is better, the large mountings must be likelier by `TRIAL_GAIN`. Both fits explain
+    the norms of few positions, one by mounting offsets, the other by misalignments; only
+    misalignments predict the norm of another position.
     """
     small, *others = fits
     for large in others:
@@ -263,9 +263,9 @@ def _grown(
     trials += more
     is_without_bends = BEND in growth.free and BEND not in chosen.groups
     if is_without_bends and chosen.score.rms > _complete_rms(chosen.posterior):
-        # The slopes of a part that lags are seen only beside its lag, not beside a stand-in of
-        # products and squares. A model of bends is continued if its drift is less than three times
-        # that of the chosen model.
+        # A change of slope of a part is visible only in a model with the lag of this part, not in
+        # a model whose products and squares approximate the lag. A model of bends is continued if
+        # its drift is less than three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
             last, more = growth.added(with_bends[0], progress)

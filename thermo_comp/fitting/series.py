@@ -280,11 +280,11 @@ class Series:
 
     def products(self, used: Bools) -> Products:
         """Return the products of the active columns, shape (2, m), for the current noise."""
-        taken: Bools = np.any(used, axis=0)
-        if self._products and np.array_equal(self._products[0], taken):
+        is_active: Bools = np.any(used, axis=0)
+        if self._products and np.array_equal(self._products[0], is_active):
             return self._products[1]
         n_tilts = self.windows.tilt.shape[1]
-        base = Base.of(np.flatnonzero(taken), self.windows.lag, self._n_t, n_tilts)
+        base = Base.of(np.flatnonzero(is_active), self.windows.lag, self._n_t, n_tilts)
         series = self.of(base)
         filtered = self.whitener.filter(series, self._gains)
         result = Products(
@@ -294,7 +294,7 @@ class Series:
             np.searchsorted(self._cells, self._first),
             self.windows.section[self._cells],
         )
-        self._products = taken, result
+        self._products = is_active, result
         return result
 
     def products_of(self, columns: Ints, base: Base) -> tuple[Floats, Floats]:
@@ -335,6 +335,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Replace the columns alike in products of the base, (n_positions, n_base, n_base)."""
+        """Do the same in products of the base series, shape (n_positions, n_base, n_base)."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

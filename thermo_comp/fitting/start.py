@@ -3,8 +3,8 @@
 """
 Owns the initial triad: constant bias, scale and misalignment from the means of the positions.
 
-These means lie on an ellipsoid. It is fitted without temperature by least squares on ``|f| - g``,
-from the box around the means.
+The means of the positions lie on an ellipsoid, which is fitted without temperature by least
+squares on ``|f| - g``. The initial values follow from the extremes of the means on each axis.
 """
 
 from __future__ import annotations

@@ -109,7 +109,7 @@ class Windows:
 
     @property
     def inner(self) -> Ints:
-        """Windows that two others of their position follow."""
+        """Windows that are followed by two further windows of their position."""
         return np.flatnonzero(self.position[2:] == self.position[:-2])
 
     @property

@@ -207,7 +207,7 @@ def thermal_windows(
         for interval in bag.intervals:
             use = np.interp(interval.time, grid, track.is_known, left=0.0) == 1.0
             if use.any():
-                at = np.array([np.interp(interval.time[use], grid, number) for number in states.T])
+                at = np.array([np.interp(interval.time[use], grid, series) for series in states.T])
                 parts.append(_rows(interval, has_rate, use, at, grid[0], model, table))
                 rests.append((bag, interval))
                 numbers.append(number)
@@ -298,7 +298,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         mean=rows.mean,
         columns=rows.columns,
         groups=(*groups, *(column.group for column in columns)),
-        lag=np.array([-1] * n_curves + [lags.get(one.source, -1) for one in columns], np.int64),
+        lag=np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64),
         kelvins=_kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient),
         start=np.hstack((np.zeros((len(t), n_curves)), rows.start)),
         start_covariance=start_covariance(spec.lags),
