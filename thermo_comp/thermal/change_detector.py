@@ -53,8 +53,9 @@ class ChangeDetector:
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
         self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
-        # Each memory (1 / tracking frequency) detects its acceleration soonest at 1 Hz; the
-        # spectral density of the filter's acceleration follows from it, for any reading rate.
+        # Memory (1 / tracking frequency) of each filter [s]: the one that detects the filter's
+        # acceleration soonest at readings of 1 Hz. The spectral density of the acceleration
+        # follows from this memory, and is used for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
         onset = smallest_rate / sensor.lag_s
         memories = [
@@ -79,7 +80,7 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        self._doubt = self.swing  # of the baseline, which may begin at a crest of the ripple
+        self._doubt = self.swing  # error of the baseline, which may begin at a crest of the ripple
         self._trend = 0.0
         self._is_above = False
         self._turned_s = 0.0
@@ -124,7 +125,7 @@ class ChangeDetector:
         self._age_s += dt
         if not 0.95 * self._dt < dt < 1.05 * self._dt:
             self._tune(dt)
-        # A rate that returns towards 0 is no departure: the band spans the baseline and 0.
+        # A rate between the baseline and 0 is no departure.
         baseline, swing = self._baseline, self.swing + self._doubt
         high = baseline + swing if baseline > 0.0 else swing
         low = baseline - swing if baseline < 0.0 else -swing
@@ -239,7 +240,7 @@ class ChangeDetector:
         self._doubt = doubt - share * doubt
 
     def _learn_swing(self, dt: float) -> None:
-        """Learn how far the rate swings about its trend, from two quick half swings in a row."""
+        """Update the swing, the largest distance of the rate from its trend in half periods."""
         rate = self.rate
         trend = self._trend
         self._trend = trend = trend + dt / (dt + self._baseline_s) * (rate - trend)

@@ -81,7 +81,7 @@ class _Play(NamedTuple):
 class Play(_Play, Quantity):
     """
     A play of half-width `width_k` less its input, a lag of the board (0 s: the board itself) [K].
-    It has no variance: an error of its input moves the play along.
+    A play has no variance: an error of its input shifts the play by the same amount.
     """
 
     input = BOARD_INPUT
@@ -130,7 +130,7 @@ def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
 
     The unseen input is modelled as a random walk that ends at the first reading, so that ``P_kl =
     D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0 for lags of different
-    inputs. From then on it decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
+    inputs. After the first reading the covariance decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
     """
     every = [Lag(*lag) for lag in lags]
     single = _single(every)
@@ -154,7 +154,8 @@ class LagBank:
     """
     The lags of one input; `start_ns` is the first stamp since the last `forget`.
 
-    The state are single lags of the time constants `taus`; a lag of two stages is a sum of two.
+    The state consists of single lags with the time constants `taus`; a lag of two stages is a
+    weighted sum of two single lags.
     """
 
     def __init__(self, taus: tuple[float, ...], second_taus: tuple[float, ...] = ()) -> None:

@@ -4,9 +4,9 @@
 Owns the plausibility checks of temperature readings, applied before they reach an estimator.
 
 A board has a heat capacity, so its temperature takes no step. A thermometer has noise, so its
-readings do not stand still, least of all while the other thermometer moves. The case is nearer to
-the surroundings than the board, so it leads in a ramp. If a sensor breaks such a rule, its
-readings are left out, or their variance grows by the error that they may have.
+readings are not constant, least of all while the temperature of the other thermometer changes. The
+case is nearer to the surroundings than the board, so the case leads in a ramp. Readings that break
+such a rule are left out, or their variance is increased by the square of their possible error.
 """
 
 from enum import Enum

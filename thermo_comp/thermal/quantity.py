@@ -15,10 +15,10 @@ class Quantity:
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
-    #: Whether it belongs to one part of the unit, which has its own time constants.
+    #: Whether the quantity belongs to one part of the unit, with the time constants of this part.
     is_of_part: ClassVar[bool] = True
 
     @property
     def by_board(self) -> float:
-        """Derivative by the board temperature; readings of the others and lags are given."""
+        """Derivative by the board temperature, at given lags and other thermometers' readings."""
         return float(self.input == 'board')

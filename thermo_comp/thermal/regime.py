@@ -5,11 +5,11 @@ Owns the causal static/dynamic decision with its memory; its only clock is the s
 
 The dynamic state *opens* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`: the integral of the second derivative against ripple and noise), or when the
-rate of any sensor is clearly that of a ramp. It is *held* while any sensor's rate, now or half a
-lag ahead, may exceed the relaxed rate: through the ramp, where the second derivative is 0, and
-after it until the board has relaxed. With `closes` = 'case' (the paper's rule) it ends with the
-change of the case, and the board counts only while the case is lost. The derivation is in
-docs/regime.md.
+rate of any sensor is clearly that of a ramp. The dynamic state is *held* while any sensor's rate,
+now or half a lag ahead, may exceed the relaxed rate: during the ramp, where the second derivative
+is 0, and after the ramp until the board has relaxed. With `closes` = 'case' (the paper's rule) the
+dynamic state ends with the change of the case temperature, and the board counts only while the
+case is lost. The derivation is in docs/regime.md.
 
 References
 ----------

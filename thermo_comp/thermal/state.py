@@ -61,10 +61,14 @@ class Layout:
         sensors: list[Quantity] = [*map(Gradient, spec.sensors), *map(Rate, spec.rates)]
         self.lags: dict[Quantity, int] = {lag: k for k, lag in enumerate(spec.lags)}
         quantities = [*sensors, *self.lags]
-        self.pairs = {one: k for k, one in enumerate(quantities)}
+        self.pairs = {quantity: k for k, quantity in enumerate(quantities)}
         self.lag_pairs = slice(len(sensors), len(self.pairs))
         self.variances = slice(VAR_GRADIENT, GRADIENT + 2 * len(self.pairs), 2)
-        numbers = [number for one in quantities for number in (one, (one, 'variance'))]
+        numbers = [
+            number for quantity in quantities for number in (quantity, (quantity, 'variance'))
+        ]
         self.numbers = (Board(), VAR_BOARD, Rate(), WEIGHT, UNKNOWN, *numbers, *spec.plays)
         self.width = len(self.numbers)
-        self.places = {one: k for k, one in enumerate(self.numbers) if isinstance(one, Quantity)}
+        self.places = {
+            number: k for k, number in enumerate(self.numbers) if isinstance(number, Quantity)
+        }

@@ -4,11 +4,11 @@
 Owns the recursive estimate of T, dT/dt, d2T/dt2 and their variances from stamped readings.
 
 Two Kalman filters of (temperature, rate, acceleration) interact [1]_: *quiet*, in which the
-acceleration hardly moves (a soak, the middle of a ramp), and *bending*, in which it moves as ramps
-through a thermal lag make it move [2]_ (an onset, an end). The estimate is their mixture,
-and its variance contains their disagreement. A sensor whose quantum exceeds its noise is read
-through its cells: a changed reading measures the edge between two cells sharply, an unchanged
-reading only bounds the temperature by its cell.
+acceleration is almost constant (a soak, the middle of a ramp), and *bending*, in which the
+acceleration changes as at the onset and end of a ramp behind a thermal lag [2]_. The estimate is
+the mixture of both filters, and its variance includes their difference. A sensor whose quantum
+exceeds its noise is read through its cells: a changed reading is a precise measurement of the edge
+between two cells, an unchanged reading only bounds the temperature by its cell.
 
 References
 ----------

@@ -130,7 +130,7 @@ class ThermalTracker:
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
-            # A sensor that stays long enough after an impossible step starts again.
+            # A sensor whose readings stay at the new value for long enough starts again.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             is_board = sensor is self.board
             patience_s = self.config.temperature_timeout_s if is_board else self._case_timeout_s
@@ -160,7 +160,7 @@ class ThermalTracker:
         board = self.board if self.board.stamp_ns is not None else None
         decided_ns, self._decided_ns = self._decided_ns, stamp_ns
         if decided_ns is not None and (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s:
-            # A ramp may have begun or ended unseen.
+            # A ramp may have begun or ended between the readings.
             self._begin_watch()
         regime = self.detector.update(stamp_ns, case, board)
         target = 1.0 if regime is Regime.DYNAMIC else 0.0
@@ -207,7 +207,7 @@ class ThermalTracker:
         for name in self.spec.rates:
             sensor = self.thermometers[name]
             is_live = self.is_live(stamp_ns, sensor)
-            # The rate of a lost sensor is that of the board, and as uncertain as it is large.
+            # The rate of a lost sensor is taken to be that of the board, with an sd of 100 %.
             pairs += [sensor.rate, sensor.var_rate] if is_live else [rate, rate * rate]
         var_board += self.checks[BOARD_INPUT].doubt(stamp_ns)
         # If the lead is reversed, the topics of case and board may be swapped.
@@ -221,7 +221,7 @@ class ThermalTracker:
         """Estimate a gradient from the board's rate, while its sensor is lost."""
         lag = self._board_lag_s
         gradient = lag * rate
-        # Movement of the case since the last board reading, which no sensor has seen.
+        # Largest change of the case temperature since the last board reading [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (
             (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2
@@ -231,7 +231,7 @@ class ThermalTracker:
         return gradient, variance
 
     def is_settled(self, stamp_ns: int) -> bool:
-        """Whether the start, which was not seen, no longer matters to the memory."""
+        """Whether the unknown temperatures before the start no longer affect the memory."""
         layout = Layout(self.spec)
         extra = self.sample(stamp_ns)[layout.variances][layout.lag_pairs]
         start = start_covariance(self.spec.lags).diagonal().tolist()

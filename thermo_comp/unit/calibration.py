@@ -100,7 +100,7 @@ class Axes:
     z: AxisReference
 
     def __iter__(self) -> Iterator[AxisReference]:
-        """Give the three axes in order."""
+        """Iterate over the three axes in order."""
         return iter((self.x, self.y, self.z))
 
 
@@ -131,8 +131,8 @@ class LackOfFit:
 @dataclass(frozen=True)
 class RegimeSet:
     """
-    The set of one regime. Outside `temperature_range_c` its curves go on along their tangents for
-    a quarter of the span and are held from there on; the covariance grows.
+    The set of one regime. Outside `temperature_range_c` its curves continue along their tangents
+    for a quarter of the span and are constant beyond; the covariance increases.
     """
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Board temperature [degC].']
@@ -300,7 +300,7 @@ class Calibration:
 
     @property
     def has_uncertainty(self) -> bool:
-        """Whether it holds any uncertainty; without it no uncertainty can be stated."""
+        """Whether the calibration states any uncertainty of its parameters."""
         return (
             self.posterior is not None
             or any(self.misalignment_sd)
@@ -333,7 +333,7 @@ def rate_triad(calibration: Calibration) -> Calibration:
             AxisSet(curve.bias_function, Polynomial((1.0,)), curve.delta, sd)
             for curve, sd in zip(curves.axes(), gyroscope.residual_sd_rad_s, strict=True)
         )
-        # Its lack of fit is that of the specific force.
+        # The lack of fit of the unit is an error of the specific force, not of the angular rate.
         return replace(shared, x=x, y=y, z=z, lack_of_fit=())
 
     triad = replace(

@@ -5,9 +5,10 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u the value of its kind (`unit.terms`), t the
 board temperature from the reference, and w the weight of the dynamic regime; u is held at the
-edges of the column's range and t at those of the calibrated temperatures. Curves go on along their
-tangent beyond them, the powers of t do not: with power p the tangent of a product would be
-u p t^(p - 1), and no recording tells how a coefficient that changes with temperature goes on.
+edges of the column's range and t at those of the calibrated temperatures. Beyond these
+temperatures the curves continue along their tangents, but the powers of t are constant: with power
+p the tangent of a product would be u p t^(p - 1), and no recording determines how a coefficient
+that changes with temperature continues.
 
 The groups of the bank are its kinds. *product* contains board, and *gradient_x_temperature*
 contains gradient and gradient_lag, times a power of temperature: coefficients that change with
@@ -211,11 +212,11 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
     """Return the memory that columns need of a tracker; ValueError if a sensor is missing."""
     sources: set[Quantity] = set()
     for column in columns:
-        sources.add(source := column.source)
-        if source.input not in (BOARD_INPUT, *sensors):
+        sources.add(column.source)
+        if column.source.input not in (BOARD_INPUT, *sensors):
             raise ValueError(f'`sensor` must be one of {tuple(sensors)}, got {column.sensor}')
-    plays = [one for one in sources if isinstance(one, Play)]
-    lags = {one for one in sources if isinstance(one, Lag)}
+    plays = [source for source in sources if isinstance(source, Play)]
+    lags = {source for source in sources if isinstance(source, Lag)}
     lags |= {play.lag for play in plays if play.lag}
     order = (BOARD_INPUT, *sensors)
     return MemorySpec(
@@ -254,8 +255,7 @@ class ColumnTable:
         self.differs = bool(self._during.any())
         # Columns that differ only in power, range or regime share one evaluation.
         of = [
-            (layout.places[one.source], one.term, one.term.centre(one), one.term.width(one))
-            for one in columns
+            (layout.places[c.source], c.term, c.term.centre(c), c.term.width(c)) for c in columns
         ]
         sources = list(dict.fromkeys(of))
         self._source = np.array([sources.index(source) for source in of], np.int64)

@@ -66,7 +66,7 @@ class Correction:
 
     def __init__(self, calibration: Calibration, memory: MemorySpec | None = None) -> None:
         self.curves = Curves(calibration)
-        edges = [edge for one in calibration.regime_sets() for edge in one.temperature_range_c]
+        edges = [edge for part in calibration.regime_sets() for edge in part.temperature_range_c]
         self._span = min(edges), max(edges)
         K = [axis.scale_factor for axis in calibration.axes]
         self.K = np.array(K)[:, np.newaxis]
@@ -96,8 +96,8 @@ class Correction:
         M, variances = calibration.misalignment, [sd**2 for sd in calibration.misalignment_sd]
         posterior = calibration.posterior
         if posterior is not None:
-            own = (posterior.matrix[-3:] ** 2).sum(axis=1) + posterior.variances[-3:]
-            variances = own.tolist()
+            of_elements = (posterior.matrix[-3:] ** 2).sum(axis=1) + posterior.variances[-3:]
+            variances = of_elements.tolist()
         self.misalignment: tuple[float, ...] = (M[1][0], M[2][0], M[2][1], *variances)
         #: The nonlinearity over specific force; None without.
         self.of_force: ForceCorrection | None = None
@@ -110,12 +110,13 @@ class Correction:
     def _find_felt(self) -> None:
         """Find the columns that depend on each quantity with a variance, to propagate it."""
         self.layout = layout = Layout(self.memory)
-        pair = np.array([layout.pairs.get(one.source, -1) for one in self.table.columns], np.int64)
+        pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
         self._felt_columns = columns[pair[columns] >= 0]
         self._felt, self._felt_starts = np.unique(pair[self._felt_columns], return_index=True)
-        self._signs = np.array([one.by_board for one in layout.pairs])[:, np.newaxis, np.newaxis]
-        self._lagged = [layout.places[one] for one in layout.lags if one.input == BOARD_INPUT]
+        by_board = np.array([quantity.by_board for quantity in layout.pairs])
+        self._signs = by_board[:, np.newaxis, np.newaxis]
+        self._lagged = [layout.places[lag] for lag in layout.lags if lag.input == BOARD_INPUT]
 
     def bias_scale(self, states: Floats) -> Floats:
         """Evaluate bias and scale of the three axes, shape (2, 3, n)."""
@@ -152,13 +153,13 @@ class Correction:
     def excess(self, state: Sequence[float], *, is_dynamic: bool) -> Excess:
         """Return the distance of a state outside the calibrated ranges."""
         states = np.array(state)[:, np.newaxis]
-        over, too_fast, relative = (one[:, 0].tolist() for one in self.curves.excess(states))
+        over, too_fast, relative = (row[:, 0].tolist() for row in self.curves.excess(states))
         weight = state[WEIGHT]
         curves = (1.0 - weight) * relative[0] + weight * relative[1]
         raw = self.table.raw(states)
         beyond = (raw - self.table.held(raw))[:, 0].tolist()
         columns = zip(beyond, self.table.columns, strict=True)
-        gradients = [0.0, *(one for one, column in columns if column.is_gradient)]
+        gradients = [0.0, *(excess for excess, column in columns if column.is_gradient)]
         of_columns = float(self.table.excess(raw).max(initial=0.0))
         return Excess(
             over[is_dynamic], too_fast[is_dynamic], max(gradients, key=abs), curves + of_columns
@@ -275,7 +276,7 @@ class Correction:
             return v
         if self.table.differs:
             of_static, of_dynamic = (
-                self.table.factors(board, np.full_like(weight, of))[0] for of in (0.0, 1.0)
+                self.table.factors(board, np.full_like(weight, w))[0] for w in (0.0, 1.0)
             )
             gap = self._weigh(held * (of_dynamic - of_static), gap)
         held_back = self._weigh(over * factors[0], np.zeros_like(gap))

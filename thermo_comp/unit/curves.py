@@ -29,13 +29,13 @@ class Curves:
     def __init__(self, calibration: Calibration) -> None:
         self._reference = calibration.reference_temperature_c
         sets = calibration.regime_sets()
-        edges = np.array([(one.temperature_range_c, one.rate_range_k_min) for one in sets])
+        edges = np.array([(part.temperature_range_c, part.rate_range_k_min) for part in sets])
         # Edges of each set, shape (2, 2, 1): the lower ones, then the upper ones.
         self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
         self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
         rows = [
-            [one.bias_function for one in axes] + [one.scale_function for one in axes]
-            for axes in (one.axes() for one in sets)
+            [axis.bias_function for axis in axes] + [axis.scale_function for axis in axes]
+            for axes in (part.axes() for part in sets)
         ]
         self._functions, self._others = Functions(rows), Functions(rows[::-1])
         # Which set's tangent a set follows at the lower and at the upper end, shape (2, 2).
@@ -44,19 +44,19 @@ class Curves:
         self._ends = lower.min(), upper.max()
         self._reaches = TANGENT_SPANS * (upper - lower)[self._leads][:, :, np.newaxis]
         biases = [axis.bias for axis in calibration.axes]
-        deltas = [[axis.delta for axis in one.axes()] for one in sets]
+        deltas = [[axis.delta for axis in part.axes()] for part in sets]
         self._levels = np.add(biases, deltas)[:, :, np.newaxis]
         self._residuals = np.array(
-            [[[axis.residual_sd_m_s2**2] for axis in one.axes()] for one in sets]
+            [[[axis.residual_sd_m_s2**2] for axis in part.axes()] for part in sets]
         )
         self._lacks = [
             (
-                np.array([point.temperature_c for point in one.lack_of_fit]),
-                np.array([point.sd_m_s2 for point in one.lack_of_fit]).T ** 2,
+                np.array([point.temperature_c for point in part.lack_of_fit]),
+                np.array([point.sd_m_s2 for point in part.lack_of_fit]).T ** 2,
             )
-            for one in sets
+            for part in sets
         ]
-        self._has_lacks = any(one.lack_of_fit for one in sets)
+        self._has_lacks = any(part.lack_of_fit for part in sets)
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats]:
         """Return distances outside, (2, n): temperature [K], rate [K/s], sum in half ranges."""
@@ -64,8 +64,8 @@ class Curves:
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         if not (over.any() or too_fast.any()):
             return over, too_fast, np.zeros_like(over)
-        half, half_rate = (one[1] - one[0] for one in (self._t_range, self._rate_range))
-        relative = np.abs(over) / (half / 2.0) + np.abs(too_fast) / (half_rate / 2.0)
+        span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
+        relative = np.abs(over) / (span / 2.0) + np.abs(too_fast) / (rate_span / 2.0)
         return over, too_fast, relative
 
     def values(self, board: Floats) -> Floats:
@@ -75,7 +75,7 @@ class Curves:
         result = self._functions.evaluate(held)
         result[:, :3] += self._levels
         if (held != t).any():
-            here, edge = (hold(one, *self._t_range[:, ::-1]) for one in (t, held))
+            here, edge = (hold(at, *self._t_range[:, ::-1]) for at in (t, held))
             result += self._others.evaluate(here) - self._others.evaluate(edge)
             for slopes, beyond in zip(self._tangents, self._beyond(t), strict=True):
                 result += slopes * beyond[:, np.newaxis]
@@ -92,7 +92,7 @@ class Curves:
         """Derivatives of the slope of each function, at both ends, by its free coefficients."""
         rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
         return [
-            [[np.reshape(basis_slopes(one, end), (-1, 1)) for end in ends] for one in row]
+            [[np.reshape(basis_slopes(curve, end), (-1, 1)) for end in ends] for curve in row]
             for row, ends in rows
         ]
 
@@ -129,25 +129,26 @@ class Curves:
         is_outside = bool((held != t).any())
         result = []
         for place, functions in enumerate(zip(*self._functions.rows, strict=True)):
-            found = []
+            derivatives = []
             for regime, function in enumerate(functions):
                 basis = shares[regime] * np.reshape(function.basis(held[regime]), (-1, len(t)))
                 if is_outside:
                     basis += self._followed(regime, place, t, shares)
-                found += [shares[regime], *basis]
-            result.append(np.array([*found, *phi]))
+                derivatives += [shares[regime], *basis]
+            result.append(np.array([*derivatives, *phi]))
         return result
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
-        Differentiate the continuations by the free coefficients of one function, (n_free, n): its
-        tangent in each set that takes it, and its curve beyond the range of the other set.
+        Differentiate the continuations by the free coefficients of one function, (n_free, n): the
+        tangent of the function in each set that follows this tangent, and its curve beyond the
+        range of the other set.
         """
         function = self._functions.rows[regime][place]
         span, other = (edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]])
         here, edge = (
-            np.reshape(function.basis(hold(one, *span)), (-1, len(t)))
-            for one in (t, hold(t, *other))
+            np.reshape(function.basis(hold(at, *span)), (-1, len(t)))
+            for at in (t, hold(t, *other))
         )
         result = shares[1 - regime] * (here - edge)
         ends = zip(self._basis_slopes[regime][place], self._leads, self._beyond(t), strict=True)

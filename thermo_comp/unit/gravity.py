@@ -32,8 +32,8 @@ def spoken(acceleration: float) -> str:
 
 def parse_acceleration(text: str) -> float:
     """Parse a positive acceleration with unit, like ``100ug``, ``0.5 mg`` or ``1e-3 m/s^2``."""
-    found = re.fullmatch(r'\s*(\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)\s*(\S+)\s*', text)
-    value = float(found[1]) * _UNITS.get(found[2].replace('\u03bc', 'µ'), 0.0) if found else 0.0
+    match = re.fullmatch(r'\s*(\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)\s*(\S+)\s*', text)
+    value = float(match[1]) * _UNITS.get(match[2].replace('\u03bc', 'µ'), 0.0) if match else 0.0
     if not 0.0 < value < math.inf:
         raise ValueError(
             f'expected a positive number with its unit, like 100ug or 1e-3m/s^2, got {text!r}'

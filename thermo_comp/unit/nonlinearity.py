@@ -4,7 +4,7 @@
 Owns the nonlinearity of the axes over specific force: terms, correction and variance.
 
 x is the reading of an axis less bias, divided by the scale factor; f is the specific force along
-the sensitivity axis. Both are in g, as in IEEE Std 1293::
+the sensitivity axis. With x and f in g, as in IEEE Std 1293::
 
     x = f + K2 f^2 + Kq |f| f + K3 f^3,    K(t) = coefficient + per_kelvin t
 
@@ -106,9 +106,9 @@ def unit_of(kind: Kind) -> float:
 
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
-    Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. Its
-    error is (k2^2 + k3) times the cube of the correction: at 10 g 1e-14 g with 100 ug/g^2, 1e-11 g
-    with 10 ug/g^3.
+    Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
+    error of the result is (k2^2 + k3) times the cube of the correction: at 10 g 1e-14 g with 100
+    ug/g^2, 1e-11 g with 10 ug/g^3.
     """
     r = k3 * x * x
     s = k2 * x + kq * abs(x) + r

@@ -134,10 +134,10 @@ def nonlinear_coefficients(calibration: Calibration) -> list[Coefficients]:
         variance = (posterior.matrix[rows] ** 2).sum(axis=1) + posterior.variances[rows]
         sd = np.sqrt(variance).reshape(sd.shape)
     names = {'square': ('K2', 'µg/g²'), 'odd_square': ('Kq', 'µg/g²'), 'cube': ('K3', 'µg/g³')}
-    found = []
+    result = []
     for k, term in enumerate(terms):
         name, unit = names[term.kind]
-        found += [
+        result += [
             Coefficients(name, unit, 1e6 * np.array(term.coefficient), 1e6 * sd[:, 0, k]),
             Coefficients(
                 f'{name} per kelvin',
@@ -146,7 +146,7 @@ def nonlinear_coefficients(calibration: Calibration) -> list[Coefficients]:
                 1e6 * sd[:, 1, k],
             ),
         ]
-    return found
+    return result
 
 
 def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
@@ -181,14 +181,14 @@ def ramp_states(
     states = np.zeros((len(temperature), layout.width))
     states[:, BOARD], states[:, WEIGHT] = temperature, float(rate != 0.0)
     gradient = calibration.board_lag_s * rate
-    for one, place in layout.places.items():
-        if isinstance(one, Rate | Gradient):
-            states[:, place] = rate if isinstance(one, Rate) else gradient
-        elif isinstance(one, Lag):
-            for tau, share in zip(one[1:], one.shares, strict=True):
-                end = tau * rate if one.input == BOARD_INPUT else gradient
+    for quantity, place in layout.places.items():
+        if isinstance(quantity, Rate | Gradient):
+            states[:, place] = rate if isinstance(quantity, Rate) else gradient
+        elif isinstance(quantity, Lag):
+            for tau, share in zip(quantity[1:], quantity.shares, strict=True):
+                end = tau * rate if quantity.input == BOARD_INPUT else gradient
                 reached = 1.0 - np.exp(-np.asarray(lasted_s) / tau) if tau else 1.0
                 states[:, place] += share * end * reached
-        elif isinstance(one, Play):
-            states[:, place] = -np.sign(rate) * one.width_k
+        elif isinstance(quantity, Play):
+            states[:, place] = -np.sign(rate) * quantity.width_k
     return states

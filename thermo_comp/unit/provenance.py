@@ -48,7 +48,7 @@ class ResidualSummary:
     rms_m_s2: _Error
     max_m_s2: _Error
     left_out_rms_m_s2: Annotated[
-        _Error | None, 'On each position by a fit to the others (leave one out); null if unknown.'
+        _Error | None, 'RMS error of positions that the fit leaves out in turn; null if unknown.'
     ] = None
 
 

@@ -7,7 +7,8 @@ The value is ``u = form.value(x)``, ``x = (n - centre) / width``. The number n i
 thermal state, the `source`; with `is_temperature` it is ``t - source``, the temperature of a part
 that lags the board. Here ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s,
 and ``q_s = g_s - rest``: rest is 0, or the gradient at rest, where self-heating makes the board
-warmer than the case. Values of q_s are the same for heating and cooling.
+warmer than the case. Even functions of q_s have the same value for heating and for cooling at the
+same rate.
 """
 
 from __future__ import annotations
