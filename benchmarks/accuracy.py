@@ -6,9 +6,9 @@ Owns the accuracy figures of docs/accuracy.md: the fit against the simulator's t
 Run ``python benchmarks/accuracy.py`` for everything, or a part with fewer units:
 ``python benchmarks/accuracy.py kinds --kinds own-lags,paper --seeds 1``.
 
-Every fit sees a whole test in unknown attitudes and is applied by the compensator to the plan
-'held-out' (other ramps, other soaks, other attitudes); errors are those of 60 s means, in
-micro-g, against the simulated truth. The floor is what the true model leaves on the same noise.
+Every fit uses a whole test in unknown attitudes. The compensator then corrects the plan 'held-out'
+(other ramps, other soaks, other attitudes). Errors are those of 60 s means, in micro-g, against
+the simulated truth. The floor is the error of the true model with the same noise.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from thermo_comp.typing import Floats
 from thermo_comp.unit.calibration import Calibration, parameter_layout
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
-WINDOW_S = 60.0
-N_SIBLINGS = 10
+WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
+N_SIBLINGS = 10  # units whose calibrations make the prior
 
 
 @dataclass(frozen=True)
@@ -141,12 +141,12 @@ def fit_and_correct(
         sds.append(np.sqrt(np.maximum(mean[:, 3:] - white, 0.0) + density**2 / WINDOW_S))
     axes = (calibration.axes.x, calibration.axes.y, calibration.axes.z)
     layout = parameter_layout(calibration)
-    known = np.sqrt(np.diag(calibration.posterior.covariance()))
+    parameter_sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     return Corrected(
         forces,
         sds,
         np.array([[a.bias for a in axes], np.log([a.scale_factor for a in axes])]),
-        known[[[one.static for one in part] for part in (layout.bias, layout.scale)]],
+        parameter_sd[[[block.static for block in part] for part in (layout.bias, layout.scale)]],
         took,
         calibration,
     )
@@ -162,10 +162,12 @@ class Errors:
     claimed: float
 
 
-def errors(found: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[SimulatedRun]) -> Errors:
-    """Compare with the truth."""
-    vector = [one - record.truth.specific_force for one, record in zip(found, tests, strict=True)]
-    norm = np.concatenate([np.linalg.norm(force, axis=1) for force in found]) - STANDARD_GRAVITY
+def errors(means: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[SimulatedRun]) -> Errors:
+    """Compare corrected means with the truth."""
+    vector = [
+        mean - record.truth.specific_force for mean, record in zip(means, tests, strict=True)
+    ]
+    norm = np.concatenate([np.linalg.norm(force, axis=1) for force in means]) - STANDARD_GRAVITY
     ratio = np.concatenate([e / s for e, s in zip(vector, sd, strict=True)])
     return Errors(
         _rms(norm) / MICRO_G,
@@ -198,13 +200,13 @@ def floor(tests: Sequence[SimulatedRun]) -> Errors:
     return errors(forces, [np.ones_like(force) for force in forces], tests)
 
 
-def judged(found: Errors, goal: Goal | None, least: Errors) -> str:
+def judged(result: Errors, goal: Goal | None, least: Errors) -> str:
     """Return RMS of |g| and of the vector as a cell, marked if they exceed the limits."""
-    cell = f'{found.norm:.2f} / {found.vector:.2f}'
+    cell = f'{result.norm:.2f} / {result.vector:.2f}'
     if goal is None:
         return cell
     norm, vector = (least.norm, least.vector) if goal.is_relative else (1.0, 1.0)
-    is_reached = found.norm <= goal.norm * norm and found.vector <= goal.vector * vector
+    is_reached = result.norm <= goal.norm * norm and result.vector <= goal.vector * vector
     return cell if is_reached else f'{cell} (!)'
 
 
@@ -213,7 +215,7 @@ def _rms(values: Floats) -> float:
 
 
 def part_kinds(options: argparse.Namespace) -> None:
-    """Units of every kind of physics, on a test that was not used by the fit."""
+    """Print the errors of units of every kind of physics on held-out runs."""
     print(
         '| unit | seed | floor: norm / vector | golovach | fit | peak | error / claimed sd '
         '| fit s |'
@@ -241,7 +243,7 @@ def part_kinds(options: argparse.Namespace) -> None:
 
 
 def part_plans(options: argparse.Namespace) -> None:
-    """Little time in the chamber, alone and with the prior of ten siblings."""
+    """Print the errors of short chamber tests, without a prior and with that of ten siblings."""
     print('| test | unit | seed | floor | alone | with siblings | error / claimed sd, both |')
     print('|---|---|---|---|---|---|---|')
     for kind in options.kinds or ('own-lags', 'between', 'products'):
@@ -264,9 +266,9 @@ def part_plans(options: argparse.Namespace) -> None:
                 cells, claimed = [], []
                 for goal, prior in zip(goals, (None, siblings), strict=True):
                     ours = fit_and_correct(records, tests, prior=prior)
-                    found = errors(ours.specific_force, ours.sd, tests)
-                    cells.append(judged(found, goal, least))
-                    claimed.append(f'{found.claimed:.2f}')
+                    result = errors(ours.specific_force, ours.sd, tests)
+                    cells.append(judged(result, goal, least))
+                    claimed.append(f'{result.claimed:.2f}')
                 print(
                     f'| {name} | {kind} | {seed} | {least.norm:.2f} / {least.vector:.2f} '
                     f'| {cells[0]} | {cells[1]} | {" / ".join(claimed)} |',

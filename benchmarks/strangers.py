@@ -1,19 +1,20 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the accuracy on bags that strangers bring: the fit beside curves drawn by hand.
+Owns the accuracy on bags of units that the package has not modelled, beside that of curves fitted
+by scipy.
 
 Run ``python benchmarks/strangers.py`` for every case (many hours), or a part with fewer units:
-``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A case may
-name one of its studies: ``--cases 'turn-on:9 at 30 ug'``.
+``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A colon
+selects one study of a case: ``--cases 'turn-on:9 at 30 ug'``.
 
 Units and recordings come from `strangers_units.py` and `strangers_cases.py`, which share no code
 with the package; the package is used only through its fit and its correction of arrays. Every row
 is measured on recordings that were not fitted, unless the row states otherwise. Errors are RMS of
 means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
 is the RMS of error over claimed sd. Figures are RMS over the units. MISS marks a limit of
-`strangers_limits.py` that a row misses; the exit code is then 1. Most of the time goes into the
-baselines by the package; ``--baselines strangers.json`` takes them from an earlier run.
+`strangers_limits.py` that a row exceeds; the exit code is then 1. The baselines fitted by the
+package take most of the time; ``--baselines strangers.json`` reads them from an earlier run.
 """
 
 from __future__ import annotations
@@ -46,10 +47,10 @@ PACKAGE: dict[str, dict[str, Any]] = {
     'sets': {'groups': ('curve', 'set')},
 }
 BASELINES = ('constants', 'cubic', 'golovach', 'sets')
-#: Smallest share of the minutes that a correction must publish as a whole: the node waits for its
-#: first reading.
+#: Smallest share of the minutes in which a correction must publish all samples; below 1, because
+#: the node publishes nothing before the first reading of a thermometer.
 LEAST_PUBLISHED = 0.98
-#: Cases of recordings, which have one unit.
+#: Cases of recorded bags, which have one unit.
 RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
 
 
@@ -78,7 +79,7 @@ def fitted(
     study: Study, prior: thermo_comp.Calibration | None = None, **model: Any
 ) -> thermo_comp.Calibration:
     """Fit a study's bags; `model` holds further options."""
-    # The sd of gravity can be given only to a fit that has this option.
+    # The option `gravity_sd` of a study is left out for a version of the package without it.
     known = {option.name for option in fields(FitOptions)}
     options = {name: value for name, value in study.options.items() if name in known}
     if prior is not None:
@@ -106,8 +107,8 @@ def corrected(
     out = calibration.correct(bag.time_s, bag.samples, config=config, **given)
     first, size = slots(bag)
     force, claim = means(out.specific_force, first, size), means(out.covariance, first, size)
-    # The published covariance is that of one sample. Its white noise and the rounding of the
-    # converter average down over a minute; the rest is common to all samples of a minute.
+    # The published covariance is that of one sample. White noise and the rounding of the converter
+    # average down over a minute; the other errors are common to all samples of a minute.
     density = np.square(calibration.noise_density_m_s2_sqrt_hz)
     scale = np.array([axis.scale_factor for axis in calibration.axes])
     rounding = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0
@@ -136,11 +137,11 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
     forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
-        # The constants of a pose cancel in its drift. Their variance is the smallest of the pose:
-        # that at the middle of the data, where the curve over temperature adds nothing.
-        own = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
+        # The constants of a pose cancel in its drift. The variance of these constants is taken to
+        # be the smallest variance in the pose, where the curve over temperature adds nothing.
+        variances = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
         sd = np.sqrt(np.concatenate(
-            [one - one.min(axis=0) + out.white for one, out in zip(own, outs, strict=True)]
+            [v - v.min(axis=0) + out.white for v, out in zip(variances, outs, strict=True)]
         ))  # fmt: skip
         return Score(np.nan, plain.vector, np.nan, rms(_drift(forces, bags) / sd), rms(sd) / UG)
     force, claim = np.concatenate(forces), np.concatenate([out.claim for out in outs])
@@ -158,7 +159,7 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
 
 
 def error_of(forces: Sequence[Floats], bags: Sequence[Minutes], *, is_drift: bool) -> Score:
-    """Compare forces, which claim nothing, with the truth."""
+    """Compare forces without a claimed sd with the truth."""
     if is_drift:
         return Score(vector=rms(_drift(forces, bags)) / UG)
     force, truth = np.concatenate(forces), np.concatenate([bag.force for bag in bags])
@@ -167,7 +168,7 @@ def error_of(forces: Sequence[Floats], bags: Sequence[Minutes], *, is_drift: boo
 
 
 def _drift(forces: Sequence[Floats], bags: Sequence[Minutes]) -> Floats:
-    """Give the error of each axis less its mean over the bag, shape (w, 3)."""
+    """Return the error of each axis less the mean of this error over the bag, shape (w, 3)."""
     errors = [force - bag.force for force, bag in zip(forces, bags, strict=True)]
     return np.concatenate([error - error.mean(axis=0) for error in errors])
 
@@ -177,29 +178,29 @@ def by_hand(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
     bags = [minutes(bag) for bag in study.by_hand or study.bags]
     orders = {'constants': 0, 'cubic': 3}
     if study.is_drift:
-        # In one pose the scale is that of the norm.
+        # One pose does not determine the scale factors: take the norm of the samples over gravity.
         scale = rms(np.linalg.norm(bags[0].samples, axis=1)) / GRAVITY
         return {name: by_drift(bags, scale, order=order) for name, order in orders.items()}
     return {name: by_norm(bags, study.gravity, order=order) for name, order in orders.items()}
 
 
 def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
-    """Correct an hour at the reference temperature without a force: the rest is the error."""
+    """Correct an hour at the reference temperature and zero force: the result is the error."""
     assert study.bound is not None
     unit, cycle_s = study.bound.unit, calibration.unit.cycle_time_s
     time_s = cycle_s * np.arange(1.0, 3600.0 / cycle_s)
     zero = np.broadcast_to(unit.counts * study.bound.bias, (len(time_s), 3))
-    # Readings without noise would be those of a thermometer that is stuck.
+    # Readings without noise would be taken for those of a broken thermometer.
     rng, read_s = rng_of('rest'), np.arange(0.0, 3600.0, 5.0)
     rest = {'board': REFERENCE_C, 'case': REFERENCE_C - unit.heat_k}
     temperatures = {
         key: (read_s, celsius + unit.reading_sd * rng.standard_normal(len(read_s)))
         for key, celsius in rest.items()
     }
-    # No force is none of gravity, and such samples stand still: the node would doubt both.
+    # Switch off two checks of the node: these samples are constant, and |f| is not gravity.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     out = corrected(calibration, Bag('zero', time_s, zero, temperatures), config)
-    # The samples have no noise, so that neither has the claim.
+    # The samples have no noise, so the white noise is subtracted from the claimed variance.
     error = out.force[len(out.force) // 2 :].mean(axis=0)
     sd = np.sqrt(np.maximum(np.diag(out.claim[-1]) - out.white, 0.0))
     return Score(
@@ -269,21 +270,21 @@ def run(
         if model == 'fit':
             fit_s = time.process_time() - began
             chosen, done[study.label] = chosen_by(calibration), calibration
-        for test, found in scored(study, calibration, tests).items():
-            scores[test][model] = found
+        for test, result in scored(study, calibration, tests).items():
+            scores[test][model] = result
     if has_baselines and not all(known.values()):
         for model, correct in by_hand(study).items():
             for test, bags in tests.items():
                 forces = [correct(bag) for bag in bags]
                 scores[test][model] = error_of(forces, bags, is_drift=study.is_drift)
     return [
-        Result(titles[test], unit, {**found, **known[test]}, chosen, fit_s, refused)
-        for test, found in scores.items()
+        Result(titles[test], unit, {**by_model, **known[test]}, chosen, fit_s, refused)
+        for test, by_model in scores.items()
     ]
 
 
 def studies_of(case: str, unit: int, path: Path | None) -> Iterator[Study]:
-    """Give the studies of one unit of a case."""
+    """Return the studies of one unit of a case."""
     if case != 'cats':
         return samples(case) if case in RECORDED else CASES[case][0](unit)
     assert path is not None
@@ -297,7 +298,7 @@ def run_case(
     path: Path | None,
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
-    """Run a case, or the studies of it that have the label."""
+    """Run all studies of a case, or those with the label."""
     results = []
     for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
         done: dict[str, thermo_comp.Calibration] = {}
@@ -306,7 +307,7 @@ def run_case(
         seen = Counter[str]()
         for study in studies:
             if not label or study.label == label or study.label in needed:
-                # Recordings that are left out in turn are numbered as units are.
+                # Studies of one label, each with another bag left out, are numbered like units.
                 number = unit + seen[study.label]
                 seen[study.label] += 1
                 print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)
@@ -316,12 +317,12 @@ def run_case(
 
 def baselines_in(path: Path) -> dict[tuple[str, int], dict[str, Score]]:
     """Read the scores of the baselines from the figures of an earlier run."""
-    found: dict[tuple[str, int], dict[str, Score]] = {}
+    scores: dict[tuple[str, int], dict[str, Score]] = {}
     for unit in json.loads(path.read_text(encoding='utf-8'))['units']:
-        found[unit['title'], unit['unit']] = {
+        scores[unit['title'], unit['unit']] = {
             model: Score(**score) for model, score in unit['scores'].items() if model in BASELINES
         }
-    return found
+    return scores
 
 
 HEAD = (
@@ -333,11 +334,11 @@ HEAD = (
 )
 
 
-def pair(found: Score | None) -> str:
+def pair(score: Score | None) -> str:
     """Format the two errors of a model."""
-    if found is None:
+    if score is None:
         return '-'
-    return ' / '.join('-' if np.isnan(x) else f'{x:.3g}' for x in (found.norm, found.vector))
+    return ' / '.join('-' if np.isnan(x) else f'{x:.3g}' for x in (score.norm, score.vector))
 
 
 def line_of(row: Row, missed: Sequence[str]) -> str:
@@ -355,7 +356,7 @@ def line_of(row: Row, missed: Sequence[str]) -> str:
 
 
 def main() -> int:
-    """Run the cases that are asked for."""
+    """Run the selected cases."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -378,28 +379,28 @@ def main() -> int:
     if options.cats is None and any(case == 'cats' for case, _ in wanted):
         parser.error('--cases: cats needs --cats FILE')
     earlier = baselines_in(options.baselines) if options.baselines else {}
-    results, told = [], []
+    results, printed = [], []
     print(HEAD, flush=True)
     for case, label in wanted:
-        found = run_case(case, label, options.units, options.cats, earlier)
-        if not found:
+        of_case = run_case(case, label, options.units, options.cats, earlier)
+        if not of_case:
             parser.error(f'--cases: {case} has no study {label!r}')
-        rows = rows_of(found)
+        rows = rows_of(of_case)
         for row in rows:
             missed = misses(row, rows)
             print(line_of(row, missed), flush=True)
-            told.append({**asdict(row), 'missed': missed})
-        results += found
+            printed.append({**asdict(row), 'missed': missed})
+        results += of_case
         if options.json:
             # After each case: a run of all cases takes hours.
             figures = {
                 'version': thermo_comp.__version__,
-                'rows': told,
+                'rows': printed,
                 'units': [asdict(result) for result in results],
             }
             options.json.write_text(json.dumps(figures, indent=1), encoding='utf-8')
-    n_missed = sum(bool(row['missed']) for row in told)
-    print(f'\n{n_missed} of {len(told)} rows miss a limit')
+    n_missed = sum(bool(row['missed']) for row in printed)
+    print(f'\n{n_missed} of {len(printed)} rows miss a limit')
     return int(n_missed > 0)
 
 

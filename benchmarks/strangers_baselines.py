@@ -3,8 +3,9 @@
 """
 Owns the means of a minute and the curves by scipy of the benchmark `strangers.py`.
 
-Constants are nine numbers: bias, scale and misalignment; a cubic adds a cubic of the bias per axis
-in board temperature and a line of the scale. Both are scipy's least squares on ``|f| - g``.
+Constants are nine numbers: bias, scale and misalignment. A cubic has in addition, for each axis, a
+cubic of the bias and a line of the scale over board temperature. Constants and cubic are fitted by
+scipy's least squares on ``|f| - g``.
 """
 
 from __future__ import annotations
@@ -19,11 +20,13 @@ from strangers_units import GRAVITY, REFERENCE_C, Bag, Floats
 
 Ints = npt.NDArray[np.int64]
 
-WINDOW_S = 60.0  # length of the means that are judged [s]
-#: Largest bias [g], error of the scale and misalignment of a plausible unit. Without this bound a
-#: few attitudes are fitted best by a scale that makes one force of all of them.
+WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
+#: Largest bias [g], error of the scale and misalignment of a plausible unit. Without this bound
+#: the best fit to few attitudes has scale factors that make the forces of all attitudes equal.
 LARGEST = 0.2
-SPAN_K = 15.0  # temperatures of a cubic are in this unit, which keeps its powers alike [K]
+SPAN_K = (
+    15.0  # unit of the temperatures of a cubic, so that its powers have similar magnitudes [K]
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Minutes:
 
 
 def slots(bag: Bag) -> tuple[Ints, Ints]:
-    """Give the first rows of whole windows, and how many rows each has."""
+    """Return the first row of each whole window, and the number of rows of each window."""
     number = np.floor((bag.time_s - bag.time_s[0]) / WINDOW_S)
     first = np.flatnonzero(np.diff(number, prepend=-1.0))
     size = np.diff(first, append=len(number))
@@ -98,14 +101,14 @@ def by_norm(
 def by_drift(
     bags: Sequence[Minutes], scale: float, *, order: int = 0
 ) -> Callable[[Minutes], Floats]:
-    """Fit a polynomial in board temperature to each axis of one pose; `scale` per m/s^2."""
+    """Fit a polynomial in board temperature to each axis in one pose; `scale`: units per m/s^2."""
     t = np.concatenate([bag.board for bag in bags])
     y = np.concatenate([bag.samples for bag in bags]) / scale
     powers = np.vander((t - REFERENCE_C) / SPAN_K, order + 1, increasing=True)
-    found = np.linalg.lstsq(powers, y, rcond=None)[0]
+    coefficients = np.linalg.lstsq(powers, y, rcond=None)[0]
 
     def corrected(bag: Minutes) -> Floats:
-        own = np.vander((bag.board - REFERENCE_C) / SPAN_K, order + 1, increasing=True)
-        return np.asarray(bag.samples / scale - own[:, 1:] @ found[1:])
+        of_bag = np.vander((bag.board - REFERENCE_C) / SPAN_K, order + 1, increasing=True)
+        return np.asarray(bag.samples / scale - of_bag[:, 1:] @ coefficients[1:])
 
     return corrected

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the drawn cases of the benchmark `strangers.py`: which unit, which bags, what is held out.
+Owns the simulated cases of the benchmark `strangers.py`: units, bags of the fit, held-out bags.
 
-Each case draws a unit by its number and gives studies: bags for a fit, and held-out bags.
+Each case draws a random unit, seeded by its number, and yields studies: bags for a fit, and
+held-out bags.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ WARM_HELD = (program(15, 15, (40, 0.8, 40)), program(40, 15, (18, 1.2, 40)))
 @dataclass(frozen=True)
 class Study:
     """
-    Bags for one fit, and bags that it has not seen.
+    Bags for one fit, and held-out bags.
 
     Parameters
     ----------
@@ -68,15 +69,16 @@ class Study:
     options : dict
         Options of the fit.
     gravity : float
-        Gravity that the fit is given [m/s^2].
+        The fit's option `gravity` [m/s^2].
     prior_of : str
         Label of an earlier study whose calibration is the prior; empty without a prior.
     is_drift : bool
-        Whether the error of each axis less its mean over the bag is judged, as for one pose.
+        Whether the evaluated error is that of each axis less its mean over the bag, as for one
+        pose.
     by_hand : tuple of Bag
-        Bags at rest for the curves by scipy; the bags of the fit where empty.
+        Bags at rest for the curves by scipy; if empty, these are the bags of the fit.
     bound : Bound or None
-        Cramer-Rao bound of the bias, for studies that judge the bias instead of the force.
+        Cramer-Rao bound of the bias, for studies that evaluate the bias instead of the force.
 
     """
 
@@ -104,7 +106,7 @@ FULL_SCALE = {'full_scale': 8388607.0}
 
 
 def navigation(rng: np.random.Generator, **given: Any) -> Unit:
-    """Draw a unit of navigation grade whose parts lag the board, each by its own time."""
+    """Draw a unit of navigation grade whose parts lag the board with different time constants."""
     drawn = {
         'bias': 1500.0 * rng.standard_normal(3),
         'gain': 0.01 * rng.standard_normal(3),
@@ -120,7 +122,7 @@ def navigation(rng: np.random.Generator, **given: Any) -> Unit:
 
 
 def cheap(rng: np.random.Generator) -> Unit:
-    """Draw a MEMS unit, whose one thermometer stands on the die."""
+    """Draw a MEMS unit with one thermometer, on the die."""
     return Unit(
         bias=2e4 * rng.standard_normal(3),
         gain=0.01 * rng.standard_normal(3),
@@ -148,7 +150,7 @@ def positions(
     shifts: Floats | float = 0.0,
     **given: Any,
 ) -> tuple[Bag, ...]:
-    """Record a bag in each attitude, shape (n, 3); programs of a sequence take turns."""
+    """Record a bag in each attitude, shape (n, 3); the programs of a tuple are used in turn."""
     shifts = np.broadcast_to(shifts, (len(up), 3))
     programs = corners if isinstance(corners, tuple) else (corners,)
     return tuple(
@@ -159,12 +161,12 @@ def positions(
 
 
 def one_test(bags: tuple[Bag, ...]) -> dict[str, tuple[Bag, ...]]:
-    """Name bags that are judged together."""
+    """Return held-out bags that are evaluated together."""
     return {'': bags}
 
 
 def plain(number: int) -> Iterator[Study]:
-    """Record a long test in a chamber with two thermometers: nothing is strange."""
+    """Record a long test in a chamber with two thermometers: the usual case."""
     rng = rng_of('plain', number)
     unit = navigation(rng)
     fit = positions(unit, LONG, spread(18, rng), rng)
@@ -176,9 +178,9 @@ def one_pose(number: int) -> Iterator[Study]:
     rng = rng_of('one-pose', number)
     unit = navigation(rng)
     up = spread(1, rng)
-    own = positions(unit, POSE, up, rng)
-    tests = {'own bag': own, 'other program': positions(unit, OTHER, up, rng)}
-    yield Study('', own, tests, FULL_SCALE, is_drift=True)
+    fit = positions(unit, POSE, up, rng)
+    tests = {'own bag': fit, 'other program': positions(unit, OTHER, up, rng)}
+    yield Study('', fit, tests, FULL_SCALE, is_drift=True)
 
 
 def soaks(number: int) -> Iterator[Study]:
@@ -188,7 +190,7 @@ def soaks(number: int) -> Iterator[Study]:
     faces = np.concatenate((np.eye(3), -np.eye(3)))
     bags: tuple[Bag, ...] = ()
     for celsius in (20.0, 35.0, 5.0):
-        # A face is level to 2 degrees in the RMS: exact faces would tell nothing of misalignment.
+        # The faces are level to 2 degrees RMS: exact faces would not determine the misalignment.
         up = faces + 0.035 * rng.standard_normal((6, 3))
         up /= np.linalg.norm(up, axis=1)[:, None]
         bags += positions(unit, program(celsius, 20), up, rng)
@@ -256,7 +258,7 @@ def bump(number: int) -> Iterator[Study]:
 
 
 def carry(number: int) -> Iterator[Study]:
-    """Step the bias by 50 to 150 ug half-way through the bags, as if the unit was carried."""
+    """Step the bias by 50 to 150 ug after half of the bags, as if the unit was carried."""
     rng = rng_of('carry', number)
     unit = navigation(rng)
     step = signed(rng, 50, 150)
@@ -266,7 +268,7 @@ def carry(number: int) -> Iterator[Study]:
 
 
 def support(number: int) -> Iterator[Study]:
-    """Tilt the support with the square of temperature; the held-out bags have a firm one."""
+    """Tilt the support with the square of temperature; in held-out bags the support is rigid."""
     rng = rng_of('support', number)
     unit = navigation(rng)
     up = spread(12, rng)
@@ -274,14 +276,14 @@ def support(number: int) -> Iterator[Study]:
     level = np.cross(up, rng.standard_normal((12, 3)))
     level *= 1.0e-6 / np.linalg.norm(level, axis=1)[:, None]
     fit = tuple(
-        record(unit, HALF, one, rng, name=f'p{k + 1:02d}', tilt=axis)
-        for k, (one, axis) in enumerate(zip(up, level, strict=True))
+        record(unit, HALF, attitude, rng, name=f'p{k + 1:02d}', tilt=axis)
+        for k, (attitude, axis) in enumerate(zip(up, level, strict=True))
     )
     yield Study('', fit, one_test(positions(unit, HELD, spread(3, rng), rng)), FULL_SCALE)
 
 
 def gravity(number: int) -> Iterator[Study]:
-    """Give the fit a gravity that is wrong by one stated sd, 50 ug."""
+    """State a gravity for the fit that is wrong by its stated sd, 50 ug."""
     rng = rng_of('gravity', number)
     unit = navigation(rng)
     fit = positions(unit, HALF, spread(12, rng), rng)
@@ -292,7 +294,7 @@ def gravity(number: int) -> Iterator[Study]:
 
 
 def cold_start(number: int) -> Iterator[Study]:
-    """Hold out bags that begin at a cold switch-on, as no bag of the fit does."""
+    """Hold out bags that begin with a cold switch-on; the bags of the fit begin warm."""
     rng = rng_of('cold-start', number)
     unit = navigation(rng)
     fit = positions(unit, HALF, spread(12, rng), rng)
@@ -301,24 +303,24 @@ def cold_start(number: int) -> Iterator[Study]:
 
 
 def third_node(number: int) -> Iterator[Study]:
-    """Add a node without a thermometer, and one bag in still air: jointly, and by a prior."""
+    """Add a node without a thermometer, and a bag in still air, fitted jointly or with a prior."""
     rng = rng_of('third-node', number)
     unit = navigation(rng, hidden_bias=signed(rng, 20, 60), hidden_s=rng.uniform(900, 2500))
     fit = positions(unit, HALF, spread(12, rng), rng)
     up = spread(3, rng)
 
-    def still(one: Floats, corners: Any, environment: Environment = STILL_AIR) -> tuple[Bag, ...]:
-        return positions(unit, corners, one, rng, environment=environment)
+    def bags_in(environment: Environment, attitudes: Floats, corners: Any) -> tuple[Bag, ...]:
+        return positions(unit, corners, attitudes, rng, environment=environment)
 
-    more = tuple(replace(bag, name='still') for bag in still(up[:1], WHOLE))
+    still = tuple(replace(bag, name='still') for bag in bags_in(STILL_AIR, up[:1], WHOLE))
     tests = {
-        'chamber': still(up[1:], HELD, CHAMBER),
-        'still air': still(up[1:], HELD),
-        'its attitude': still(up[:1], HELD[0]),
+        'chamber': bags_in(CHAMBER, up[1:], HELD),
+        'still air': bags_in(STILL_AIR, up[1:], HELD),
+        'its attitude': bags_in(STILL_AIR, up[:1], HELD[0]),
     }
     yield Study('alone', fit, tests, FULL_SCALE)
-    yield Study('joint', (*fit, *more), tests, FULL_SCALE)
-    yield Study('prior', more, tests, FULL_SCALE, prior_of='alone')
+    yield Study('joint', (*fit, *still), tests, FULL_SCALE)
+    yield Study('prior', still, tests, FULL_SCALE, prior_of='alone')
 
 
 def bench3(number: int) -> Iterator[Study]:
@@ -344,21 +346,21 @@ def quadratic(number: int) -> Iterator[Study]:
 
 def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60.0) -> Floats:
     """
-    Give the Cramer-Rao bound of the bias at the reference temperature, shape (3,), for a unit
+    Return the Cramer-Rao bound of the bias at the reference temperature, shape (3,), for a unit
     whose bias and scale factor are parabolas.
 
-    The unknowns are the constants, both parabolas, and the direction of each position; data are
-    the three axes in windows that are short against the program.
+    The unknowns are the constants, both parabolas, and the direction of each position. The data
+    are the means of the three axes over windows that are short compared with the program.
     """
     n = len(up)
-    tangents = np.array([np.linalg.svd(one[None])[2][1:] for one in up])
+    tangents = np.array([np.linalg.svd(attitude[None])[2][1:] for attitude in up])
     temperatures = []
     for bag in bags:
         time_s, board = bag.temperatures['board']
         rows = (time_s // window_s).astype(int)
         temperatures.append(np.bincount(rows, board) / np.bincount(rows) - REFERENCE_C)
     x = np.concatenate(temperatures)[:, None]
-    position = np.repeat(np.arange(n), [len(one) for one in temperatures])
+    position = np.repeat(np.arange(n), [len(celsius) for celsius in temperatures])
     p = np.concatenate((
         1e-6 * unit.bias, unit.gain, unit.skew, 1e-6 * unit.bias_curve.ravel(),
         1e-6 * unit.scale_curve.ravel(), np.zeros(2 * n),
@@ -388,7 +390,7 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     return np.asarray(GRAVITY * sd[:3])
 
 
-#: Each case's studies of a unit by its number, and how many units it is asked for.
+#: The studies of each case for a unit with a number, and the default number of units.
 CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
     'plain': (plain, 3),
     'one-pose': (one_pose, 3),

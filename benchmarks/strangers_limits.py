@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the limits of the benchmark `strangers.py`: rows over several units, and what each row misses.
+Owns the limits of the benchmark `strangers.py`: rows over several units, and the limits that each
+row exceeds.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from strangers_units import Floats
 @dataclass(frozen=True)
 class Score:
     """
-    RMS figures of one unit, one model and one set of held-out bags; NaN where there is none.
+    RMS figures of one unit, one model and one set of held-out bags; NaN where undefined.
 
     Parameters
     ----------
@@ -42,7 +43,7 @@ class Score:
 @dataclass(frozen=True)
 class Result:
     """
-    One unit, one study and one set of held-out bags.
+    The scores of one unit, one study and one set of held-out bags.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ class Result:
     fit_s : float
         CPU time of the fit [s].
     refused : str
-        The error message of the fit, where there was one.
+        The error message of the fit; empty without an error.
 
     """
 
@@ -72,7 +73,7 @@ class Result:
 @dataclass(frozen=True)
 class Limit:
     """
-    What a row must reach; the defaults ask for the simple models and for an honest claim.
+    The limits of a row; the defaults limit the error by that of the baselines, and the ratio.
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ class Limit:
 _ONE_THERMOMETER = Limit(norm=25.0, low=0.7, high=1.4)
 _REAL_UNIT = Limit(norm=560.0, low=0.7, high=1.4)
 _TURN_ON = Limit(low=0.7, high=1.4, unit=2.0)
-#: By the beginning of a row's title; the longest beginning counts.
+#: Limits by the beginning of a row's title; the longest beginning applies.
 LIMITS = {
     'sample-bags': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'no-case': _ONE_THERMOMETER,
@@ -127,10 +128,11 @@ LIMITS = {
     'bump': Limit(norm=60.0),
     'carry': Limit(),
     'support': Limit(vector=60.0),
-    # A wrong gravity is in the baselines, too, and no fit can find it: only the claim is judged.
+    # The data do not show a wrong gravity, which the baselines have, too: limit only the ratio.
     'gravity': Limit(best=np.inf),
     'cold-start': Limit(),
-    # One bag of another environment more must not hurt, beyond the noise of the fit (2 %).
+    # A further bag of another environment must not increase the error by more than the noise of
+    # the fit, 2 %.
     'third-node alone': Limit(),
     'third-node joint: chamber': Limit(than='alone: chamber', times=1.02),
     'third-node joint: still air': Limit(than='alone: still air', times=1.02),
@@ -159,7 +161,7 @@ class Row:
     fit_s : float
         Mean CPU time of a fit [s].
     chosen : str
-        What the fit chose for the last unit.
+        Groups that the fit chose for the last unit.
     refused : str
         The error message of a fit that refused its bags.
 
@@ -179,12 +181,12 @@ def rms(values: Floats | Sequence[float]) -> float:
 
 
 def judged_ratio(score: Score) -> float:
-    """Give the ratio that a limit holds: over three axes, or along the norm without a truth."""
+    """Return the ratio that is limited: over three axes, or along the norm without a truth."""
     return score.norm_ratio if np.isnan(score.ratio) else score.ratio
 
 
 def rows_of(results: Sequence[Result]) -> list[Row]:
-    """Join the units of each row, in the order in which the rows came first."""
+    """Average over the units of each row; the rows are in the order of the results."""
     titles = list(dict.fromkeys(result.title for result in results))
     return [_row([result for result in results if result.title == title]) for title in titles]
 
@@ -215,16 +217,16 @@ def limit_of(title: str) -> Limit:
 
 
 def best_baseline(row: Row, name: str) -> float:
-    """Give the smallest error of the baselines, infinite where there is none."""
+    """Return the smallest error of the baselines; infinite without a baseline."""
     errors = [getattr(score, name) for model, score in row.scores.items() if model != 'fit']
     return min((error for error in errors if np.isfinite(error)), default=np.inf)
 
 
 def misses(row: Row, others: Sequence[Row]) -> list[str]:
-    """Say which limits a row misses; `others` are the rows of its case."""
-    found = ['refused'] if row.refused else []
+    """Describe the limits that a row exceeds; `others` are the rows of its case."""
+    exceeded = ['refused'] if row.refused else []
     if 'fit' not in row.scores:
-        return found
+        return exceeded
     limit, fit, ratio = limit_of(row.title), row.scores['fit'], judged_ratio(row.scores['fit'])
     checks = [
         ('norm', fit.norm, limit.norm),
@@ -242,8 +244,8 @@ def misses(row: Row, others: Sequence[Row]) -> list[str]:
             if limit.than and other.title.endswith(limit.than) and 'fit' in other.scores:
                 share = getattr(fit, name) / getattr(other.scores['fit'], name)
                 checks.append((f'{name} / {limit.than}', share, limit.times))
-    # A figure that does not exist, such as the vector without a truth, is NaN and misses nothing.
-    found += [f'{name} {value:.3g} > {most:g}' for name, value, most in checks if value > most]
+    # A figure that is not defined, such as the vector without a truth, is NaN: no limit applies.
+    exceeded += [f'{name} {value:.3g} > {most:g}' for name, value, most in checks if value > most]
     if ratio < limit.low:
-        found.append(f'ratio {ratio:.2g} < {limit.low:g}')
-    return found
+        exceeded.append(f'ratio {ratio:.2g} < {limit.low:g}')
+    return exceeded

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the recorded cases of the benchmark `strangers.py`: sample bags with a thermometer less, and a
-real unit's recording that is part of a package of others and never of this one.
+Owns the recorded cases of the benchmark `strangers.py`: sample bags, without the case thermometer,
+and the recording of a real unit, which is distributed with another package and not with this one.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ import thermo_comp
 from thermo_comp.recording.reader import read_recording
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Length of the blocks of the real unit's recording, and of the means that find its rests [s].
+#: Length of the blocks into which the recording of the real unit is cut, and of the means by which
+#: its rests are found [s].
 BLOCK_S, MINUTE_S = 10800.0, 60
-#: Largest change of the mean from one minute to the next at rest [m/s^2]. Carried from one room to
-#: another, the real unit's bias changed by 0.1 m/s^2 in a minute.
+#: Largest change of the mean from one minute to the next at rest [m/s^2]. When the real unit was
+#: carried from one room to another its bias changed by 0.1 m/s^2 in a minute.
 STEP = 0.15
-#: Shortest rest; a shorter stay in one attitude is handling [min].
+#: Length of the shortest rest [min]; a shorter stay in one attitude counts as handling.
 LEAST_MINUTES = 4
 
 
@@ -39,7 +40,7 @@ def sample_bag(path: Path) -> Bag:
 
 
 def samples(which: str) -> Iterator[Study]:
-    """Give the sample bags with both thermometers, without the case, or with the board on both."""
+    """Return the sample bags: with board and case, with the board, or with the board as both."""
     bags = [sample_bag(path) for path in sorted((ROOT / 'bags/fit').glob('*.mcap'))]
     bags.append(sample_bag(ROOT / 'bags/held_out.mcap'))
     if which != 'sample-bags':
@@ -59,18 +60,18 @@ def real_unit(path: Path) -> Bag:
     with h5py.File(path) as file:
         force = file['acceleration'][:]
         celsius = file['temperature'][:]
-    # Times say whole seconds, and count from the first sample.
+    # The times of the file are whole seconds since the first sample: use the sample's number.
     time_s = np.arange(1.0, len(force) + 1.0)
     return Bag('cats', time_s, force, {'board': (time_s, celsius)})
 
 
 def rests_of(bag: Bag) -> list[slice]:
-    """Find the rows of each long stay in one attitude, whole minutes."""
+    """Return the rows of each rest: a long stay in one attitude, in whole minutes."""
     n = len(bag.time_s) // MINUTE_S
     mean = bag.samples[: n * MINUTE_S].reshape(n, MINUTE_S, 3).mean(axis=1)
     is_step = np.abs(np.diff(mean, axis=0)).max(axis=1) > STEP
     edges = np.concatenate(([0], np.flatnonzero(is_step) + 1, [n]))
-    # The minutes at both ends hold the carrying.
+    # Leave out the first and the last minute, in which the unit is carried.
     return [
         slice((first + 1) * MINUTE_S, (last - 1) * MINUTE_S)
         for first, last in pairwise(edges)
@@ -105,10 +106,10 @@ def cats(path: Path) -> Iterator[Study]:
             still[number % 2].append(bag)
     blocks = blocks_of(whole, 'block')
     options = {'input': 'm/s^2'}
-    for own, name in enumerate(('even to odd', 'odd to even')):
-        tests = {'': tuple(still[1 - own])}
-        bags = tuple(bag for number, bag in blocks.items() if number % 2 == own)
-        yield Study(name, bags, tests, options, by_hand=tuple(still[own]))
+    for parity, name in enumerate(('even to odd', 'odd to even')):
+        tests = {'': tuple(still[1 - parity])}
+        bags = tuple(bag for number, bag in blocks.items() if number % 2 == parity)
+        yield Study(name, bags, tests, options, by_hand=tuple(still[parity]))
     for k, rest in enumerate(rests):
         others = tuple(rests[:k] + rests[k + 1 :])
         yield Study('rests left out', others, {'': (rest,)}, options)

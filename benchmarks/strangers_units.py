@@ -4,9 +4,10 @@
 Owns the units and recordings of the benchmark `strangers.py`: physics by numpy and scipy alone.
 
 Case, board, the part of each axis and one hidden node are nodes of a linear thermal network. The
-chamber's air drives the network; between two steps the air is a straight line, so the state of
-each step is exact. Bias and scale are functions of the temperature of an axis's part. This module
-shares no code with the package: whatever the fit assumes, it cannot have been assumed here, too.
+input of the network is the air temperature of the chamber, which is linear in time between two
+steps, so the state at each step is exact. Bias and scale are functions of the temperature of an
+axis's part. This module shares no code with the package, so an error of the package is not an
+error of the simulated truth.
 """
 
 from __future__ import annotations
@@ -24,14 +25,17 @@ Floats = npt.NDArray[np.float64]
 GRAVITY = 9.80665  # standard gravity [m/s^2]
 UG = 1e-6 * GRAVITY  # one micro-g [m/s^2]
 REFERENCE_C = 20.0  # curves of bias and scale are zero here [degC]
-STEP_S = 5.0  # the network's step, through which the air is a straight line [s]
-SOAK_S = 5400.0  # how long a unit has been in the chamber before a recording [s]
+STEP_S = 5.0  # step of the network, over which the air temperature is linear in time [s]
+SOAK_S = 5400.0  # time of the unit in the chamber before a recording [s]
 CASE, BOARD, PARTS, HIDDEN = 0, 1, slice(2, 5), 5
 
 
 @dataclass(frozen=True)
 class Environment:
-    """How well heat flows, relative to a chamber with a fan: air to case, case to hidden node."""
+    """
+    Thermal conductances relative to a chamber with a fan: air to case (`film`), case to hidden
+    node (`path`).
+    """
 
     film: float = 1.0
     path: float = 1.0
@@ -65,7 +69,7 @@ class Unit:
     case_s, board_s, part_s, hidden_s : float or ndarray, shape (3,)
         Time constants [s]; a part that lags by 0 s is the board itself.
     heat_k : float
-        By how much its own heat makes the board warmer than the case at rest [K].
+        Temperature of the board above that of the case at rest, by self-heating [K].
     counts : float
         Counts per m/s^2; 0 for samples in m/s^2.
     carries : bool
@@ -132,13 +136,13 @@ class Bag:
     Parameters
     ----------
     name : str
-        What messages call it.
+        Name in messages.
     time_s, samples : ndarray, shapes (n,), (n, 3)
         Times of the samples [s], and counts or m/s^2.
     temperatures : dict of str to (ndarray, ndarray)
         Times [s] and readings [degC] of each thermometer.
     force : ndarray, shape (3,) or (n, 3), or None
-        The true specific force [m/s^2], where it is known.
+        The true specific force [m/s^2]; None if unknown.
 
     """
 
@@ -160,7 +164,7 @@ def signed(rng: np.random.Generator, low: float, high: float) -> Floats:
 
 
 def spread(n: int, rng: np.random.Generator) -> Floats:
-    """Choose attitudes, shape (n, 3): each far from those before it, in a frame turned at will."""
+    """Choose attitudes, shape (n, 3): each far from the earlier ones, in a random frame."""
     many = rng.standard_normal((2000, 3))
     many /= np.linalg.norm(many, axis=1)[:, None]
     chosen = [many[0], -many[0]][:n]
@@ -170,9 +174,9 @@ def spread(n: int, rng: np.random.Generator) -> Floats:
 
 
 def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Floats, Floats]:
-    """Give A, b and h of ``x' = A x + b air + h``, x of case, board, parts and hidden node."""
+    """Return A, b, h of ``x' = A x + b air + h``; x: case, board, parts, hidden node [degC]."""
     A, b, h = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-    # The case is heavier than the board: heat from the board warms it a tenth as fast.
+    # The case is heavier than the board: heat from the board warms the case a tenth as fast.
     A[CASE, CASE] = -environment.film - 0.1
     A[CASE, BOARD] = 0.1
     b[CASE] = environment.film
@@ -189,9 +193,9 @@ def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Flo
 
 
 def integrate(A: Floats, b: Floats, h: Floats, air: Floats, step_s: float, x: Floats) -> Floats:
-    """Integrate the network from the state `x`, exactly for air that is straight between steps."""
+    """Integrate the network from the state `x`, exactly for air that is linear between steps."""
     n = len(b)
-    # States, the air, its slope, and 1 for the heat.
+    # Extended state: the nodes, the air, the slope of the air, and 1 for the self-heating.
     whole = np.zeros((n + 3, n + 3))
     whole[:n, :n], whole[:n, n], whole[:n, n + 2] = A, b, h
     whole[n, n + 1] = 1.0
@@ -208,7 +212,10 @@ def integrate(A: Floats, b: Floats, h: Floats, air: Floats, step_s: float, x: Fl
 
 
 def program(start_c: float, soak_min: float, *ramps: tuple[float, float, float]) -> Floats:
-    """Give the corners of a program, shape (n, 2) [s, degC]: target, rate [K/min], soak [min]."""
+    """
+    Return the corners of a program, shape (n, 2) [s, degC]; `ramps`: target [degC], rate [K/min],
+    soak [min].
+    """
     corners = [(0.0, start_c), (60.0 * soak_min, start_c)]
     for target_c, rate, rest_min in ramps:
         at, before = corners[-1]
@@ -237,25 +244,26 @@ def record(
     Parameters
     ----------
     unit : Unit
-        What is recorded.
+        The unit.
     corners : ndarray, shape (n, 2)
         The chamber's program [s, degC].
     up : ndarray, shape (3,)
         Direction of the specific force in the unit's frame.
     rng : Generator
-        Of the chamber and of the noise.
+        Random numbers of the chamber and of the noise.
     name : str
-        The bag's.
+        Name of the bag.
     rate_hz : float
         Samples per second.
     environment : Environment
-        How heat flows.
+        Thermal conductances.
     shift : ndarray, shape (3,)
-        Bias of this bag alone [ug].
+        Additional bias of this bag [ug].
     tilt : ndarray, shape (3,) or None
         Rotation of the support per square of the case's temperature about the reference [rad/K^2].
     is_cold : bool
-        Whether the unit is switched on as the recording begins, as cold as the air.
+        Whether the unit is switched on at the start of the recording, at the temperature of the
+        air.
 
     Returns
     -------
@@ -266,12 +274,13 @@ def record(
     lasts_s = float(corners[-1, 0])
     grid = np.arange(-SOAK_S, lasts_s + STEP_S, STEP_S)
     A, b, h = network(unit, environment)
-    # The chamber comes from a temperature nearby, is never where it is told, and hunts.
+    # The air has a constant error of control and a control ripple, and begins at a temperature up
+    # to 5 K from that of the program.
     first_c = corners[0, 1]
     air = np.interp(grid, *corners.T) + 0.2 * rng.standard_normal()
     air += 0.03 * np.sin(2.0 * np.pi * grid / rng.uniform(200, 300) + rng.uniform(0, 2 * np.pi))
-    came = rng.uniform(-5.0, 5.0)
-    air += np.sign(came) * np.maximum(abs(came) - (grid + SOAK_S) / 30.0, 0.0)
+    away_k = rng.uniform(-5.0, 5.0)
+    air += np.sign(away_k) * np.maximum(abs(away_k) - (grid + SOAK_S) / 30.0, 0.0)
     if is_cold:
         grid = np.arange(0.0, lasts_s + STEP_S, STEP_S)
         air, x = air[-len(grid) :], np.full(6, first_c)
@@ -280,17 +289,17 @@ def record(
     states = integrate(A, b, h, air, STEP_S, x)
     n = int(lasts_s * rate_hz)
     stamps = (np.arange(n) + 1.0) / rate_hz
-    # A sample is the mean of its cycle, and stamped at the cycle's end.
+    # A sample is the mean over its cycle, and has the stamp of the cycle's end.
     middle = stamps - 0.5 / rate_hz
-    seen = np.array([np.interp(middle, grid, one) for one in states.T]).T
-    parts = np.where(unit.part_s > 0.0, seen[:, PARTS], seen[:, [BOARD]])
+    nodes = np.array([np.interp(middle, grid, node) for node in states.T]).T
+    parts = np.where(unit.part_s > 0.0, nodes[:, PARTS], nodes[:, [BOARD]])
     force = GRAVITY * np.asarray(up)
     if tilt is not None:
-        angle = np.outer((seen[:, CASE] - REFERENCE_C) ** 2, tilt)
+        angle = np.outer((nodes[:, CASE] - REFERENCE_C) ** 2, tilt)
         force = force + np.cross(angle, force)
         force *= GRAVITY / np.linalg.norm(force, axis=1, keepdims=True)
     ideal = unit.sensed(np.atleast_2d(force)) * unit.scale_at(parts)
-    bias = unit.bias_at(parts, (seen[:, HIDDEN] - seen[:, BOARD])[:, None])
+    bias = unit.bias_at(parts, (nodes[:, HIDDEN] - nodes[:, BOARD])[:, None])
     noise = unit.density * np.sqrt(rate_hz) * rng.standard_normal((n, 3))
     samples = ideal + UG * (bias + shift + noise)
     if unit.counts:
@@ -305,7 +314,7 @@ def record(
 
 
 def quantised(words: Floats, carries: bool) -> Floats:
-    """Round to whole counts; a converter that carries its remainder loses no part of a sum."""
+    """Round to whole counts; with `carries` the remainder is added to the next sample."""
     if not carries:
         return np.asarray(np.rint(words))
     return np.diff(np.rint(np.cumsum(words, axis=0)), axis=0, prepend=0.0)
