@@ -210,7 +210,7 @@ def turn_on(number: int) -> Iterator[Study]:
 
 
 def mems(number: int) -> Iterator[Study]:
-    """Record a cheap sensor: coarse words, noise, one thermometer, turn-on of 0.1 to 1 mg."""
+    """Record a MEMS sensor: large quanta and noise, one thermometer, turn-on of 0.1 to 1 mg."""
     for n in (9, 12, 18):
         for sd in (100, 300, 1000):
             rng = rng_of('mems', n, sd, number)

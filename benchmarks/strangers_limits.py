@@ -80,7 +80,7 @@ class Limit:
     norm, vector : float
         Largest errors [ug].
     best : float
-        Largest error over the smallest error of the baselines, for norm and vector alike.
+        Largest error over the smallest error of the baselines, both for norm and for vector.
     low, high : float
         Smallest and largest ratio over all units.
     unit : float

@@ -30,7 +30,7 @@ def model_of(
     parts: tuple[Stages, Stages, Stages] | None = None,
 ) -> Model:
     """
-    Return the model of the prior, or else one with all columns that the bags can determine.
+    Return the model of the prior, or else a model with all columns that the bags can determine.
 
     `parts`: time constants of each axis, see `Model`; None for the bank of time constants
     """

@@ -4,8 +4,9 @@
 Owns the design of positions: their directions, the covariance that they give, the next direction.
 
 At rest |f| = g is known, so each position gives one equation for the nine constants of a triad:
-bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. Linearised about
-an ideal triad, and with the fit's prior, their covariance follows from the directions alone.
+bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. With equations
+linearised about an ideal triad, and with the prior of the fit, the covariance of the constants
+follows from the directions alone.
 """
 
 from __future__ import annotations
@@ -180,8 +181,10 @@ class LeastKnown:
     """
     The attitude with the largest sd of |f|, at rest and at the reference temperature.
 
-    away_deg: its angle to the nearest position [deg]
-    sd_m_s2, seen_sd_m_s2: sd of |f| in this attitude, and its median over the positions [m/s^2]
+    up: direction of the specific force, in the frame of the unit
+    away_deg: angle between this attitude and the nearest position [deg]
+    sd_m_s2: sd of |f| in this attitude [m/s^2]
+    seen_sd_m_s2: median over the positions of the sd of |f| [m/s^2]
     """
 
     up: tuple[float, float, float]

@@ -67,7 +67,7 @@ def enforce(findings: Iterable[Finding], options: FitOptions) -> list[Finding]:
 
 
 def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
-    """Refuse a prior made for another unit: its small uncertainties do not apply to this one."""
+    """Refuse the prior of another unit: its small uncertainties do not apply to this unit."""
     if prior is None or prior.provenance.model == POPULATION:
         return
     if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:

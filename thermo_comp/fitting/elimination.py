@@ -53,7 +53,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
 
 
 def solved(factor: Floats, right: Floats) -> Floats:
-    """Solve equations, given the lower Cholesky factor of their matrix; `cho_solve` is slower."""
+    """Solve equations, given the lower Cholesky factor of their matrix, without `cho_solve`."""
     return np.asarray(dpotrs(factor.T, right)[0])
 
 
@@ -81,7 +81,7 @@ class Blocks:
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
         """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        # `numpy.linalg.inv` of all factors at once does not use that they are triangular.
+        # `numpy.linalg.inv` of all factors at once is slower: it does not use their zeros.
         root = np.stack([dtrtri(factor.T)[0].T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)
 

@@ -50,9 +50,9 @@ def add_gyroscope(
     options: FitOptions,
 ) -> tuple[Calibration, tuple[RateRow, ...]]:
     """
-    Add a gyroscope to a calibration: that of the prior, or else one fitted to the bags.
+    Add a gyroscope to a calibration: that of the prior, or else a gyroscope fitted to the bags.
 
-    Without a prior the bags must have angular rates and temperatures, else none is added.
+    Without a prior, and without angular rates or temperatures, no gyroscope is added.
     """
     if options.prior is not None:
         known = options.prior.gyroscope

@@ -74,7 +74,7 @@ def _updated(
     moves = (sd > 0.0) & ~candidates.fixed
     safe, centre = np.where(moves, sd, 1.0), np.where(moves, candidates.typical, 1.0)
     effective = posterior.effective_parameters
-    # Hyperprior variance of the logarithm of a column's prior sd: a factor of ten.
+    # Variance of the log-normal hyperprior of a column's prior sd: its sd is a factor of ten.
     log_variance = float(np.log(10.0)) ** 2
     slope = np.log(safe / centre) / log_variance
     step = _toward(effective, np.sum(state.weights**2, axis=1), safe, slope, 1.0 / log_variance)
@@ -168,7 +168,7 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
-    # The bound of 1e-8 m/s^2 is below any sensor's noise; constant samples would give 0.
+    # At least 1e-8 m/s^2, below any sensor's noise: the estimate for constant samples is 0.
     return np.asarray(np.maximum(sigma, 1e-8))
 
 

@@ -6,8 +6,8 @@ Owns the detection of jumps: steps in the reading of a sensor at rest.
 The reading of a sensor can step within one sample, if a die relaxes or a part slips. The
 temperature does not step, so no function of temperature describes a jump, and a fit across it
 distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit: the noise
-beside it is normal; the norm of the reading changes, which a rotation hardly does; the gyroscope,
-if there is one, shows no rotation.
+beside the jump is normal; the norm of the reading changes, which is almost constant in a rotation;
+the gyroscope, if there is one, shows no rotation.
 
 After a low-pass filter neighbouring samples have a correlation r, and their slow noise hides a
 step. The differences ``a_i - r a_(i-1)`` are white (generalised least squares for first-order

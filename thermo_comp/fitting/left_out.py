@@ -5,7 +5,7 @@ Owns the score of a model on data that took no part in the fit, and the comparis
 
 Each position is left out in turn, and so is each section and each half of the program, in all
 positions at once. Left-out halves detect columns that interpolate between the sections of one
-program and fail in another one. The left-out windows are corrected as the node would correct them:
+program and fail in another. The left-out windows are corrected as the node would correct them:
 with the unit's parameters alone, initial lag states at their run-time mean, no mounting offsets
 and no tilts of the support.
 The errors are the drift (each axis less its mean over the position, which does not depend on the
@@ -36,9 +36,6 @@ from .elimination import inverse_root
 from .regression import Point, Posterior, Regression
 from .unknowns import State
 
-# Largest ratio of the variance of a position's norm or drift without this position in the fit to
-# that with it, mounting offset and noise included. Above it the position is not scored.
-_VARIANCE_RATIO = 10.0
 # Smallest number of windows of a position from which its drift is scored.
 _FEWEST_WINDOWS = 8
 # Logarithms of mean squares that differ by less than this count as equal: 5 % of an RMS.
@@ -72,7 +69,7 @@ class Folds:
 
         There are two estimates: the mean over folds of their log ratios, which is robust to a few
         large folds, and the log ratio of the sums with its jackknife error, which is robust to
-        small folds. If their signs agree the more significant one is returned, else the gain is 0.
+        small folds. If their signs agree the more significant estimate is returned, else 0.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
@@ -227,6 +224,14 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
     return point.moved(whole).state, inverse_root(factor)
 
 
+def _is_determined(by_others: float, by_all: float) -> bool:
+    """
+    Whether the variance of a position's norm or drift by a fit without this position is below ten
+    times the variance by the fit of all, mounting offset and noise included.
+    """
+    return by_others < 10.0 * by_all
+
+
 def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows: slice) -> bool:
     """Whether a fit without this position, with this root, determines its drift."""
     regression, layout, sigma = point.regression, point.layout, point.prior.sigma
@@ -245,7 +250,7 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
         by_others += float(np.sum((along @ root[at]) ** 2))
         by_all += float(np.sum((along @ posterior.root[at]) ** 2))
     noise = float(np.sum(sigma**2)) * len(some)
-    return by_others < _VARIANCE_RATIO * (by_all + noise)
+    return _is_determined(by_others, by_all + noise)
 
 
 def _is_norm_determined(
@@ -264,7 +269,7 @@ def _is_norm_determined(
         places = layout.unit[axis, :-1]
         along[places] += on_axes[axis] * means[axis, -1 - len(places) : -1]
     by_all = float(np.sum((along @ posterior.root) ** 2)) + point.prior.offset_sd**2
-    return float(np.sum((along @ root) ** 2)) < _VARIANCE_RATIO * by_all
+    return _is_determined(float(np.sum((along @ root) ** 2)), by_all)
 
 
 def _by_sections(

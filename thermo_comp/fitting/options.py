@@ -53,7 +53,7 @@ REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compens
 @dataclass(frozen=True)
 class FitOptions:
     """
-    Options of a fit; ValueError if one is outside its range.
+    Options of a fit; ValueError if an option is outside its range.
 
     gravity: local gravity [m/s^2]; FitError if it does not occur on Earth
     model: 'response' selects from all columns; 'golovach' is the paper's model: a linear static

@@ -134,9 +134,9 @@ class Point:
     @property
     def _common_variance(self) -> float:
         """
-        Prior variance of the sum over the bags of an initial lag state. The sd of their mean is
-        0.1 of that of one bag: a non-zero mean is a response of the unit, which other initial
-        states would show as well.
+        Prior variance of the sum over the bags of an initial lag state. The sd of the mean over
+        the bags is 0.1 of the sd of one bag: a non-zero mean is a response of the unit, which
+        other initial states would show as well.
         """
         return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_share
 
@@ -209,7 +209,7 @@ class Point:
         If the step increases the energy, fractions of it are tried in the nonlinear unknowns,
         which enter as products, and the linear unknowns are solved again for each fraction.
         """
-        # The energy of this point comes first: the regression keeps only its last linearisation.
+        # Compute the energy of this point first: the regression keeps only the last linearisation.
         energy, (step, _) = self.energy, self.solution
         result = self.moved(step)
         if result.energy <= energy:

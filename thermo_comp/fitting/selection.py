@@ -137,7 +137,7 @@ class Growth:
             chosen = simplest_of_the_best(chosen, better)
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit a model with further groups, and then with the bends that it lacks."""
+        """Fit a model with further groups, and then the same model with bends."""
         more = tuple(group for group in groups if group in self.free)
         typical = self._typical(before, more, self._candidates.typical)
         smooth = self.extended(before, more, typical)

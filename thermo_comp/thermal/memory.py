@@ -3,13 +3,13 @@
 """
 Owns the thermal memory: lags of the board, lags of the gradients, play operators.
 
-A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The state stored is ``m = u - L``; with u
-linear between two readings (first-order hold) its exact step over dt is
+A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The state stored is ``m = u - L``. With u
+linear between two readings (first-order hold) the exact step of m over dt is
 ``m' = m e + (u' - u) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
 
-A part may hang on another part that lags the board: the lag then has two stages in series, of time
-constants ``tau_1 > tau_2``. By partial fractions its ``m`` is a sum of those of two single lags,
-``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
+A part may exchange heat with another part that lags the board: the lag then has two stages in
+series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighted sum of the m of
+two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 """
 
 import math
@@ -180,7 +180,7 @@ class LagBank:
         self.input = 0.0
         self.lagging: list[float] = self._nil
         self.extra: list[float] = self._nil
-        #: Whether the lags have a variance `extra` besides that of their start.
+        #: Whether the lags have a variance `extra` in addition to that of their initial states.
         self.has_extra = False
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
@@ -288,7 +288,7 @@ class ThermalMemory:
         self._held: list[float] = []
 
     def forget(self) -> None:
-        """Forget everything; each play begins anew in its middle."""
+        """Forget all inputs; each play starts again in the middle of its width."""
         for bank in self.banks.values():
             bank.forget()
         self._held = []

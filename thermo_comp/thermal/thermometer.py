@@ -177,7 +177,7 @@ class Thermometer:
         self._quiet = quiet
         self._bent = bent
         self.bending = bending
-        # The mixture; its acceleration is computed only when read.
+        # The mixture of both modes, without the acceleration, see `acceleration`.
         t, v, _, p00, p01, _, p11, _, _ = quiet
         apart, dv = bent[0] - t, bent[1] - v
         both = bending * (1.0 - bending)
@@ -210,7 +210,7 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # Beyond the horizon the rate may not hold, and an unseen ramp may begin.
+            # Beyond the horizon the rate may change, and a ramp may begin without a reading.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)

@@ -184,8 +184,9 @@ class ThermalTracker:
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
         """
         Thermal state at a stamp as a flat tuple, in the order of `state.Layout`; the board must
-        have at least one reading. The variance of a gradient is that from the sensor's side, the
-        variance of a lag is that beyond the variance of its start.
+        have at least one reading. The variance of a gradient is that of the sensor, without the
+        variance of the board temperature; the variance of a lag does not include that of its
+        unknown initial state.
         """
         board, rate, var_board = self.board.at(stamp_ns)
         decided_ns = self._decided_ns

@@ -36,9 +36,9 @@ from .terms import GROUPS, LINE, TERMS, Term
 
 #: A column range that limits no value.
 UNBOUNDED: Final = (-1e9, 1e9)
-#: Time constants of the bank [s], in ratios of sqrt(2), from a few readings to the longest memory
-#: that bags show. Linear lags use all of them, so that a part of 100 ug/K with a time constant
-#: between two of them is matched; products and powers, which are smaller, use every other.
+#: Time constants of the bank [s], in ratios of sqrt(2), from a few readings to the longest lag
+#: that bags determine. Linear lags use all of them, so that sums of lags approximate any time
+#: constant in between; products and powers, whose effects are smaller, use every other.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
 #: Widths of the even columns [K], half-widths of the plays [K], and the lags that they follow [s].

@@ -5,9 +5,9 @@ Owns the arithmetic of the correction: thermal states in, bias, scale and error 
 
 States are columns, shape (width, n), of the numbers that `thermal.state` lays out; one state is
 n = 1. Sums run in a fixed order and each state is evaluated alone, so a stream and a batch get the
-same bits. Results for three axes stand in rows: the bias of x, y, z, then their scale. Notation as
-in `calibration`; x is an axis' specific force before the misalignment, its error variance is
-``v(x) = a + b x + c x^2`` [m^2/s^4].
+same bits. Results for three axes stand in rows: the bias of x, y, z, then their scale. The
+notation is that of `calibration`; x is the specific force of an axis before the misalignment, and
+the error variance of x is ``v(x) = a + b x + c x^2`` [m^2/s^4].
 """
 
 from collections.abc import Sequence

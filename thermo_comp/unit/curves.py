@@ -22,8 +22,8 @@ class Curves:
 
     Beyond the range of one set, within that of the other, the difference of the two is held.
     Beyond both ranges the curves continue along their tangent at the edge for `TANGENT_SPANS` of
-    the span, and are constant from there on; a set whose range ended earlier takes the other's
-    tangent.
+    the span, and are constant from there on; a set whose range ends earlier than that of the other
+    set follows the tangent of the other set.
     """
 
     def __init__(self, calibration: Calibration) -> None:

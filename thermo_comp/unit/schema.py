@@ -193,7 +193,7 @@ def _joined(key: str, name: str) -> str:
 
 
 def _shown_name(name: str) -> str:
-    # An invalid name may be any text, even pages of it.
+    # An invalid name may be any text of any length.
     shown = name if name.isprintable() and len(name) < _LONGEST_NAME else repr(name)
     return shown[:_LONGEST_NAME]
 
