@@ -392,7 +392,7 @@ def main() -> int:
             printed.append({**asdict(row), 'missed': missed})
         results += of_case
         if options.json:
-            # After each case: a run of all cases takes hours.
+            # Write the figures after each case: a run of all cases takes hours.
             figures = {
                 'version': thermo_comp.__version__,
                 'rows': printed,

@@ -11,7 +11,8 @@ a half-Student prior. The standard deviation of gravity is a common error of the
 The lack of fit per regime and temperature is the mean square of the left-out drift less the
 published variance of this drift. The lack of fit covers effects that no column describes, such as
 a kink of the curve, a tilt of the support or a drift of the bias. Models within one standard error
-of the chosen model contribute half of the squared difference between their drift and its drift.
+of the chosen model contribute half of the squared difference of their drift to that of the chosen
+model.
 
 References
 ----------

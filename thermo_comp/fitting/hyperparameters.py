@@ -257,7 +257,7 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
 
 def downweigh(regression: Regression, posterior: Posterior) -> None:
     """
-    Reduce the weight of windows more than 3 sd from the local median, which are disturbed.
+    Reduce the weight of disturbed windows: those more than 3 sd from the local median.
 
     The reduced weight is that at which the distance of the window is 3 sd.
     """

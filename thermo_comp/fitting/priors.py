@@ -41,7 +41,7 @@ UNITS_NEEDED = 3
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
-    """Return the response as columns; FitError if one acts in one regime only (version 1)."""
+    """Return the response as columns; FitError if a term acts in one regime only (version 1)."""
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
@@ -117,8 +117,8 @@ def informative_priors(
     # Candidates of a further uncorrelated variance, relative to each variance of the prior.
     tried = [(grown(*stated), share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
-        # Candidates of the sd of ageing: of the biases in g; of the relative scale factors, as a
-        # multiple (0, 0.01 or 1) of the number for the biases.
+        # Candidates of the sd of ageing: of the biases [g], and of the relative scale factors,
+        # which is 0, 0.01 or 1 times the number for the biases.
         tried += [
             (grown(ageing * options.gravity, multiple * ageing), 0.0)
             for multiple in (0.0, 0.01, 1.0)

@@ -10,10 +10,11 @@ temperatures the curves continue along their tangents, but the powers of t are c
 p the tangent of a product would be u p t^(p - 1), and no recording determines how a coefficient
 that changes with temperature continues.
 
-The groups of the bank are its kinds. *product* contains board, and *gradient_x_temperature*
-contains gradient and gradient_lag, times a power of temperature: coefficients that change with
-temperature. *gradient_even* contains also size and square, and *gradient_even_about_rest* the same
-about the gradient at rest.
+Each group of the bank has the columns of the kind with the same name, except these groups:
+*product* has the kind board, and *gradient_x_temperature* the kinds gradient and gradient_lag,
+times a power of temperature, for coefficients that change with temperature. *square* also has the
+kind cube, and *gradient_even* the kinds size and square. *gradient_even_about_rest* has the
+columns of *gradient_even* as functions of the gradient less its value at rest.
 
 Tracker, fit, correction, covariance and file use this table.
 """

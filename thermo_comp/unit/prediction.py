@@ -115,7 +115,7 @@ def in_a_soak(
 
 
 class Coefficients(NamedTuple):
-    """A nonlinear coefficient of the axes with its sd, shapes (3,), in a unit for people."""
+    """A nonlinear coefficient of the three axes and its sd, shapes (3,), with their unit."""
 
     name: str
     unit: str
