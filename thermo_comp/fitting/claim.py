@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the published uncertainty: the covariance of the fit, widened by what the data do not
-determine, and the lack of fit, the excess of the left-out errors over it.
+determine, and the lack of fit, the excess of the left-out errors over this covariance.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. The weight of each fit is its evidence times

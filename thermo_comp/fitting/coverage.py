@@ -97,7 +97,7 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """Return unit vectors of mean readings (n, 3) about a centre; NaN for a reading at it."""
+    """Return unit vectors of mean readings (n, 3) about a centre; NaN at the centre."""
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 

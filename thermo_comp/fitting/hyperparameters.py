@@ -175,7 +175,7 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
 def with_slow_noise(
     regression: Regression, posterior: Posterior, candidates: Candidates
 ) -> Posterior:
-    """Estimate the slow noise from the residuals, then by log evidence, and settle with it."""
+    """Estimate the slow noise from the residuals, then by log evidence; settle with this noise."""
     prior = posterior.prior
     residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
     estimated = regression.whitener.estimate(residual, regression.weight)
@@ -189,8 +189,9 @@ def with_slow_noise(
             trial = replace(trial, sigma=white_noise(regression, fitted))
         return replace(fitted, prior=trial)
 
-    # The parameters absorb a part of the noise, so residuals underestimate it; the log evidence
-    # does not. Search ratio and time in steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
+    # The parameters absorb a part of the noise, so residuals underestimate the noise; the log
+    # evidence does not. Search ratio and time in steps of a factor of 3, then of 3^(1/2) and
+    # 3^(1/4).
     best = with_noise(estimated)
     step = 3.0
     while step > 3.0**0.2:

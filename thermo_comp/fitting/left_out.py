@@ -96,10 +96,10 @@ class Score:
 
     positions, sections: drift of left-out positions, and of left-out sections of the program
     norms: ``|f| - g`` of left-out positions whose norm the others determine
-    force: windows of each position corrected by a fit without it, NaN if its norm is not scored,
-        shape (n, 3)
-    drift: drift of each window by a fit without its position or, if that does not determine it,
-        without its section, shape (n, 3)
+    force: each window corrected by a fit without its position, NaN if the norm of this position is
+        not scored, shape (n, 3)
+    drift: drift of each window by a fit without its position or, if that fit does not determine
+        the drift, without its section, shape (n, 3)
     halves: drift of left-out halves of the program, at temperatures that occur in the other half
     """
 

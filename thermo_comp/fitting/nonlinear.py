@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns |f| that is not 1 g in all positions, and the choice of the nonlinear terms over it.
+Owns |f| that is not 1 g in all positions, and the choice of the nonlinear terms over |f|.
 
 A term that the data determine is removed if it lowers the log evidence, or if it does not improve
 the left-out norms. A term that the data do not determine stays near its prior, with the prior sd.
@@ -30,8 +30,8 @@ from .selection import TRIAL_GAIN, Selected
 from .unknowns import State
 from .windows import ThermalWindows
 
-# Effective parameters per coefficient from which the data determine it: 0.99 means that the
-# posterior sd is a tenth of the prior sd.
+# Smallest effective parameters per coefficient of a term that the data determine: 0.99 means that
+# the posterior sd is a tenth of the prior sd.
 _DETERMINED = 0.99
 
 _Active = frozenset[int]  # places of the coefficients in use
@@ -143,8 +143,8 @@ def is_beyond(windows: ThermalWindows) -> bool:
 
 def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
     """
-    Return the prior sd of the coefficients of k terms, then of their changes per kelvin, which is
-    2 % of it, shape (2 k,).
+    Return the prior sd of the coefficients of k terms, then that of their changes per kelvin, 2 %
+    of the former, shape (2 k,).
     """
     sd = np.array([options.nonlinear_sd(kind) for kind in kinds])
     return np.concatenate((sd, 0.02 * sd))

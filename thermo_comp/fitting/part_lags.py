@@ -205,7 +205,7 @@ class _PartCurves:
 
 
 def _in_order(tau_s: float, second_tau_s: float) -> Stages:
-    """Return two time constants, the longer first, the shorter at most 0.89 of it."""
+    """Return two time constants, the longer first, the shorter at most 0.89 of the longer."""
     # Columns accept ratios up to 0.9; both time constants are rounded to 0.1 s before.
     longer, shorter = max(tau_s, second_tau_s), min(tau_s, second_tau_s)
     return float(longer), float(min(shorter, 0.89 * longer))

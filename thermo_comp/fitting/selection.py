@@ -121,7 +121,7 @@ class Growth:
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 
     def added(self, chosen: Trial, progress: Callable[[float], None]) -> tuple[Trial, list[Trial]]:
-        """Add groups as long as left-out data confirm it; return the last model and all tried."""
+        """Add groups as long as left-out data improve; return the last model and all tried."""
         trials: list[Trial] = []
         part = 1.0
         while True:
@@ -224,7 +224,7 @@ def select(
 ) -> Selected:
     """Choose the groups of columns by left-out data, and fit them."""
     growth = Growth(regression, candidates)
-    # Without a curve the drift is attributed to mountings or to noise: begin from both.
+    # Without a curve the drift is attributed to mountings or to noise: begin from both priors.
     priors = [prior]
     if prior.offset_scale > 0.0:
         priors.append(replace(prior, offset_sd=float(prior.sigma.mean())))

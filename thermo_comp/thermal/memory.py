@@ -35,7 +35,7 @@ BOARD_START_SD: Final = 3.0
 GRADIENT_START_SD: Final = 1.0
 #: Interval between readings / time constant beyond which the input between them counts as unseen.
 SPARSE_SHARE: Final = 0.1
-#: Weight of an old input below which `_recursion` drops it: beneath double precision.
+#: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
 _FADED: Final = 1e-18
 
 

@@ -3,7 +3,7 @@
 """
 Owns the settings of thermometers, detector and tracker.
 
-Calibrations hold them, and a fleet's workers receive them.
+Calibrations hold these settings, and the workers of a fleet receive them.
 """
 
 from dataclasses import dataclass, field

@@ -254,7 +254,7 @@ class Thermometer:
         noise = self._noise
         if variance < 4.0 * noise:
             # The prior is narrower than the noise: match the moments of the prior truncated to the
-            # cell, so that readings that flicker about an edge locate it.
+            # cell, so that readings that flicker about an edge locate this edge.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
@@ -275,8 +275,9 @@ class Thermometer:
         if jump > half:
             edge = 0.5 * (reading + self.reading) + 0.5 * move
             return edge, min(noise + (move * move + 4.0 * var_move) / 12.0, self._flat)
-        # A repeated reading holds no new information: the cell only bounds the variance, and its
-        # edges hold back an estimate that leaves it, once per time in which it moves by one sd.
+        # A repeated reading has no new information: the cell only bounds the variance. An estimate
+        # outside the cell is measured to be at the edge, once per time in which the temperature
+        # changes by one sd.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))

@@ -108,7 +108,7 @@ class Correction:
         self.n_slow = 9 if self.of_force is None else 24
 
     def _find_felt(self) -> None:
-        """Find the columns that depend on each quantity with a variance, to propagate it."""
+        """Find the columns that depend on each quantity whose variance is propagated."""
         self.layout = layout = Layout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
