@@ -79,7 +79,7 @@ def test_a_unit_without_lags_gets_none():
 def test_a_bump_is_no_disturbance_and_no_motion():
     # At 0.5 Hz a cell of 30 samples is a minute, and the bump passes within two of them.
     bump = np.array([450.0, -400.0, 500.0])
-    _, study = study_of('bump', n=12, bump=bump, bump_c=17.0)
+    _, study = study_of('bump', bump=bump, bump_c=17.0)
     judgement = judged(strangers.fitted(study), study)
     # The bends are a polygon with corners every 0.5 K in a bell of 0.85 K sd.
     assert judgement.norm < 60.0
@@ -93,7 +93,8 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     # Stages of the x axis that are equal are fitted as two of a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
     _, program, *_, held = second_simulator.PLANS['mild']
-    records = second_simulator.runs_of(unit, program, second_simulator.directions(9, 5), 5)
+    up = second_simulator.directions(9, 5)
+    records = second_simulator.runs_of(unit, program, up, 5, lasts_s=15000.0)
     tests = second_simulator.runs_of(unit, held[0], second_simulator.directions(2, 7), 7,
                                      soaked_s=21600.0, soaked_c=20.0)  # fmt: skip
     result = fit_and_correct(records, tests, full_scale=second_simulator.FULL_SCALE)
