@@ -178,8 +178,9 @@ class _PartCurves:
     def _series(self, lag: Stages, axis: int) -> Floats:
         """Return the weighted regressors of bias, scale factor and initial lags, shape (n, k)."""
         x: Floats = self._t.copy()
-        for tau_s, share in zip(lag, Lag('board', *lag).shares if lag[0] else (), strict=False):
-            x -= share * tau_s * self._ratio(_even(np.asarray(tau_s)))
+        if lag[0]:
+            for tau_s, share in zip(lag, Lag('board', *lag).shares, strict=True):
+                x -= share * tau_s * self._ratio(_even(np.asarray(tau_s)))
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
         # The spline of the bias has a node every 0.6 K, but at least 4 and at most 60 nodes.
