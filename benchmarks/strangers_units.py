@@ -68,6 +68,8 @@ class Unit:
         Bias per temperature of the hidden node above the board [ug/K].
     case_s, board_s, part_s, hidden_s : float or ndarray, shape (3,)
         Time constants [s]; a part that lags by 0 s is the board itself.
+    case_share : ndarray, shape (3,)
+        Share of the heat that a part exchanges with the case; the rest is with the board.
     heat_k : float
         Temperature of the board above that of the case at rest, by self-heating [K].
     counts : float
@@ -97,6 +99,7 @@ class Unit:
     case_s: float = 200.0
     board_s: float = 600.0
     part_s: Floats = field(default_factory=_zeros)
+    case_share: Floats = field(default_factory=_zeros)
     hidden_s: float = 1500.0
     heat_k: float = 1.0
     counts: float = 4e5
@@ -184,8 +187,8 @@ def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Flo
     b[CASE] /= unit.case_s
     A[BOARD, CASE], A[BOARD, BOARD] = 1.0 / unit.board_s, -1.0 / unit.board_s
     h[BOARD] = unit.heat_k / unit.board_s
-    for node, lag_s in zip(range(2, 5), unit.part_s, strict=True):
-        A[node, BOARD], A[node, node] = 1.0 / max(lag_s, 1.0), -1.0 / max(lag_s, 1.0)
+    for node, lag_s, share in zip(range(2, 5), unit.part_s, unit.case_share, strict=True):
+        A[node, [BOARD, CASE, node]] = np.array([1.0 - share, share, -1.0]) / max(lag_s, 1.0)
     A[HIDDEN, BOARD] = 1.0 / unit.hidden_s
     A[HIDDEN, CASE] = environment.path / unit.hidden_s
     A[HIDDEN, HIDDEN] = -(1.0 + environment.path) / unit.hidden_s

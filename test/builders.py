@@ -85,6 +85,7 @@ def rich_calibration():
             term('board', (0.1, 0.1, 0.2), (1e-6, 2e-6, 1e-6), tau_s=600.0),
             term(
                 'board', (-0.05, 0.02, 0.0), (2e-6, -2e-6, 2e-6), tau_s=2400.0, second_tau_s=400.0,
+                sensor='frame', sensor_share=0.4,
             ),
             term('gradient_lag', (0.2, -0.1, 0.1), (1e-6, 0.0, -1e-6), tau_s=240.0),
             term('board', (1e-3, -2e-3, 1e-3), group='product', tau_s=600.0, power=1),
@@ -97,7 +98,7 @@ def rich_calibration():
             term('bend', (0.1, 0.1, 0.2), knee_k=-3.0, range=(0.0, 40.0)),
             term(
                 'play', (0.1, -0.1, 0.1), width_k=1.6, tau_s=900.0, second_tau_s=120.0,
-                range=(-2.0, 2.0),
+                sensor_share=-0.2, range=(-2.0, 2.0),
             ),
         ),
     )  # fmt: skip

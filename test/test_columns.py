@@ -77,7 +77,9 @@ def test_what_the_bank_needs_remembered():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
     # Separate lags for the plays that follow a lag.
-    taus = {name: tuple(lag.tau_s for lag in spec.lags_of(name)) for name in spec.inputs}
+    taus = {
+        name: tuple(lag.tau_s for lag in spec.lags if lag.input == name) for name in spec.inputs
+    }
     assert taus['board'] == tuple(sorted((*FINE_TAUS, 450.0, 900.0, 1800.0)))
     assert taus['case'] == taus['tip'] == FINE_TAUS
     assert len(spec.plays) == 20

@@ -121,6 +121,33 @@ def test_a_lag_of_two_stages_is_that_of_two_parts_in_series(rng):
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
 
 
+def test_a_part_between_board_and_sensor(rng):
+    times = np.arange(0.0, 7200.0, 30.0)
+    board, case = 20.0 + np.cumsum(0.2 * rng.standard_normal((2, len(times))), axis=1)
+    lag = Lag('board', 900.0, 150.0, 'case', 0.4)
+    spec = MemorySpec(lags=(lag, ('case', 900.0)), plays=((900.0, 0.4, 150.0, 'case', 0.4),))
+    memory = ThermalMemory(spec)
+    streamed = []
+    for time, of_board, of_case in zip(times, board, case, strict=True):
+        stamp, gradient = round(time * 1e9), of_case - of_board
+        memory.banks['case'].step(stamp, gradient)
+        memory.board_step(stamp, of_board)
+        streamed.append(memory.at(stamp, of_board, [gradient]))
+    streamed = np.array(streamed)
+    part = after_two_stages(times, 0.6 * board + 0.4 * case)
+    np.testing.assert_allclose(board - streamed[:, 0], part, atol=1e-5)
+    on_grid = memory_on_grid(spec, 30.0, board, [case - board])
+    np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
+    # An error of the case's lag moves the part in the opposite direction.
+    P = start_covariance(spec.lags)
+    assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
+    # The unknown start is that of the younger input.
+    late = ThermalMemory(spec)
+    late.board_step(0, 20.0)
+    late.banks['case'].step(600 * SECOND_NS, 1.0)
+    assert late.start_shares(700 * SECOND_NS)[0] == lag.start_share(100.0)
+
+
 def test_the_unknown_start_of_a_lag_of_two_stages(rng):
     # A board in a long random walk, which then stands still.
     D, step, n = 0.005, 6.0, 4000
@@ -144,11 +171,11 @@ def test_the_unknown_start_of_a_lag_of_two_stages(rng):
 
 
 def test_a_second_stage_adds_the_errors_of_both():
-    bank = LagBank((900.0,), (150.0,))
-    bank.step(0, 0.0)
-    bank.note_jump(2.0)
+    memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
+    memory.board_step(0, 0.0)
+    memory.note_jump(2.0)
     # (900 + 150) / (900 - 150): at most, were the errors of both stages of opposite sign.
-    assert bank.at(0, 0.0)[1] == pytest.approx([(2.0 * 1.4) ** 2])
+    assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
 
 
 def plays(*widths):

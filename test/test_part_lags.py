@@ -62,6 +62,19 @@ def test_the_lags_are_those_of_the_parts_each_for_its_axis():
     assert judged(calibration, study).norm < 2.0
 
 
+def test_a_part_between_board_and_case():
+    case_share = np.array([0.6, 0.3, 0.0])
+    unit, study = study_of('between', part_s=PARTS_S, case_share=case_share)
+    calibration = strangers.fitted(study)
+    parts = {one.part for one in calibration.response if one.kind == 'board'}
+    assert {part.second_tau_s for part in parts} == {0.0}
+    taus, _, shares = np.array(sorted(parts)).T
+    # As without a case: ramps determine the lag of 1 K of the case, and so its share, within 0.01.
+    assert taus == pytest.approx(unit.part_s, rel=0.02)
+    assert shares == pytest.approx(case_share, abs=0.02)
+    assert judged(calibration, study).norm < 2.0
+
+
 def test_one_thermometer_is_sufficient():
     unit, study = study_of('parts', n=12, part_s=PARTS_S, sensors=('board',))
     calibration = strangers.fitted(study)
@@ -153,6 +166,7 @@ def test_fit_says_how_far_the_parts_lag(tmp_path, cli):
     asked = ('fit', *tables, '--gravity', GRAVITY, '-o', tmp_path / 'unit.yaml', '--force')
     (line,) = (text for text in cli(*asked).stdout.splitlines() if 'its part' in text)
     spoken = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
-    content = json.loads(cli(*asked, '--json').stdout)['part_lags_s']
-    assert content == pytest.approx(unit.part_s, rel=0.01)
-    assert spoken == pytest.approx(content, abs=0.5)
+    content = json.loads(cli(*asked, '--json').stdout)
+    assert content['part_lags_s'] == pytest.approx(unit.part_s, rel=0.01)
+    assert spoken == pytest.approx(content['part_lags_s'], abs=0.5)
+    assert content['part_case_shares'] == [0.0, 0.0, 0.0]

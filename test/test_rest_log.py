@@ -39,11 +39,15 @@ def rest(number):
 
 
 def test_a_state_with_rates_survives_the_log_and_one_without_names_none():
-    start = replace(START, memory=replace(START.memory, rates=('case',)))
+    between = ('board', 600.0, 60.0, 'case', 0.4)
+    memory = MemorySpec(('case',), (('board', 60.0), between), ((600.0, 0.8, *between[2:]),),
+                        ('case',))  # fmt: skip
+    start = replace(START, memory=memory)
     one = rest(1)
-    one = replace(one, state=(*one.state[:7], 0.01, 1e-9, *one.state[7:]))
+    one = replace(one, shares=(0.5, 0.25),
+                  state=(*one.state[:7], 0.01, 1e-9, *one.state[7:], 0.4, 0.0, 0.2))  # fmt: skip
     assert decode(encode(start) + encode(one)) == ([(start, one)], 0)
-    assert b'"memory":[["case"],[["board",60.0,0.0]],[]]' in encode(START)
+    assert b'"memory":[["case"],[["board",60.0]],[]]' in encode(START)
 
 
 @pytest.fixture

@@ -91,6 +91,7 @@ _PREPARED: dict[str, Bounds] = {
     # The response.
     'value of a column': _between(-1e10, 1e10, 'of its kind', 'the cube of 1273 K is 2e9'),
     'span of a column': _positive(1e-9, 2e10, 'of its kind', 'a millionth of a rate of 0.1 K/min'),
+    'share': _between(-10.0, 10.0, '', 'no part amplifies a temperature difference tenfold'),
     'width': _nil_or(1e-4, 1e4, 'K', 'resolution of a thermometer; more than temperatures differ'),
     'gradient': _between(-1273.15, 1273.15, 'K', '0 K to where solder melts'),
     'power': Bounds(at_least=0, at_most=4, why='powers above the third are not observed'),

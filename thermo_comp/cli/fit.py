@@ -186,10 +186,15 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     _say_models(out, result.fit.selected.trials)
     parts = result.fit.windows.model.parts
     # Behind a steady ramp a lag of two stages is the sum of their time constants.
-    taus = None if parts is None else [sum(stages) for stages in parts]
-    if taus is not None:
+    taus = parts and [part.tau_s + part.second_tau_s for part in parts]
+    shares = parts and [part.sensor_share for part in parts]
+    if taus and shares:
+        source = 'the board'
+        if any(shares):
+            away = ', '.join(f'{share:.2f}' for share in shares)
+            source = f'a temperature between board and case (case share {away})'
         out.line(
-            'each axis is a curve of the temperature of its part, which lags the board by '
+            f'each axis is a curve of the temperature of its part, which lags {source} by '
             f'{", ".join(f"{tau:.0f}" for tau in taus)} s (x, y, z)'
         )
     _say_groups(out, calibration)
@@ -215,6 +220,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
         residuals_m_s2=result.residuals,
         models=[_model(trial) for trial in result.fit.selected.trials],
         part_lags_s=taus,
+        part_case_shares=shares,
         **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
         gyroscope=gyroscope and picked(gyroscope, _RATES) | {'residuals_rad_s': result.rates},
         **picked(result, 'positions least_known findings'),

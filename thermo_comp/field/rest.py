@@ -11,7 +11,7 @@ only the line that is being written.
 
 import json
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass
 from typing import Any
 
@@ -58,8 +58,10 @@ class Rest:
 def encode(one: Start | Rest) -> bytes:
     """Write one record as a line."""
     if isinstance(one, Start):
-        # Rates stand there only if there are any: earlier releases do not know them.
-        *memory, rates = vars(one.memory).values()
+        # Earlier releases know neither rates nor the later fields of lags and plays: these are
+        # written only if they differ from their defaults.
+        sensors, lags, plays, rates = vars(one.memory).values()
+        memory = [sensors, *([_shortened(each) for each in all_] for all_ in (lags, plays))]
         data: Any = {**vars(one), 'memory': [*memory, rates] if rates else memory}
     else:
         # Nine digits resolve 0.001 counts of a 24-bit converter.
@@ -69,6 +71,14 @@ def encode(one: Start | Rest) -> bytes:
         ]
     text = json.dumps(data, separators=(',', ':'), ensure_ascii=True).encode()
     return b'%08x %s\n' % (zlib.crc32(text), text)
+
+
+def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
+    """Leave out the last fields that have their default values."""
+    values, defaults = tuple(quantity), [*type(quantity)._field_defaults.values()]
+    while defaults and values[-1] == defaults.pop():
+        values = values[:-1]
+    return values
 
 
 def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
@@ -97,8 +107,8 @@ def _start(data: dict[str, Any]) -> Start:
     sensors, lags, plays, *rates = data['memory']
     memory = MemorySpec(
         tuple(map(str, sensors)),
-        tuple(Lag(str(name), *map(_number, taus)) for name, *taus in lags),
-        tuple(Play(*map(_number, play)) for play in plays),
+        tuple(_quantity(Lag, lag) for lag in lags),
+        tuple(_quantity(Play, play) for play in plays),
         tuple(map(str, *rates)) if rates else (),
     )
     start = Start(**{**data, 'memory': memory})
@@ -115,6 +125,17 @@ def _rest(data: list[Any], memory: MemorySpec) -> Rest:
     if lengths != (3, 3, Layout(memory).width, len(memory.lags), 0) or min(sd) < 0.0:
         raise ValueError(lengths)
     return Rest(_whole(stamp_ns), _whole(n), mean, sd, state, shares, rate)
+
+
+def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
+    """Make a lag or play from the values of its first fields."""
+    names = cls._fields[: len(values)]
+    return cls(
+        *(
+            str(value) if name in ('input', 'sensor') else _number(value)
+            for name, value in zip(names, values, strict=True)
+        )
+    )
 
 
 def _number(value: float) -> float:

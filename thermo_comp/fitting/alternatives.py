@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ..typing import Floats
-from ..unit.columns import Column, Stages, bank
+from ..unit.columns import Column, Part, bank
 from .beginning import Problem, regress
 from .left_out import is_better
 from .nonlinear import with_forces
@@ -25,14 +25,12 @@ from .windows import SET, Model, ThermalWindows, Track, thermal_windows
 
 
 def model_of(
-    bags: Sequence[ReducedBag],
-    options: FitOptions,
-    parts: tuple[Stages, Stages, Stages] | None = None,
+    bags: Sequence[ReducedBag], options: FitOptions, parts: tuple[Part, Part, Part] | None = None
 ) -> Model:
     """
     Return the model of the prior, or else a model with all columns that the bags can determine.
 
-    `parts`: time constants of each axis, see `Model`; None for the bank of time constants
+    `parts`: the lag of each axis, see `Model`; None for the bank of time constants
     """
     prior, reference = options.prior, options.reference_temperature
     if prior is not None:
@@ -105,7 +103,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     parts = find_parts(windows, problem.start) if is_free else None
     if parts is None:
         return regress(windows, problem)
-    model = model_of(bags, options, parts.stages)
+    model = model_of(bags, options, parts.lags)
     of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
     fit = regress(of_parts, problem)
     # The noise estimated by the fit includes the error of the lags; `parts.noise` does not.

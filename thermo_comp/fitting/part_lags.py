@@ -5,9 +5,11 @@ Owns the search for the thermal lag of each axis.
 
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
 temperature of one part of the unit: t is the board temperature less the reference temperature, and
-m = T - L(T) the difference between the board temperature T and its lag. The lag has one stage or,
-where a part hangs on another part, two stages in series. The time constants minimise the RMS
-residual of a spline of the bias and a cubic of the scale factor, both over x.
+m = T - L(T + v g) the difference between the board temperature T and that of the part. The part
+lags a temperature between board and case: that of the board plus the share v of the gradient g.
+The lag has one stage or, where a part hangs on another part, two stages in series. The time
+constants and v minimise the RMS residual of a spline of the bias and a cubic of the scale factor,
+both over x.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from ..thermal.memory import Lag
 from ..typing import Floats
-from ..unit.columns import Stages
+from ..unit.columns import Part
 from .hyperparameters import undisturbed
 from .start import ConstantCalibration, position_means, white_noise_of
 from .windows import ThermalWindows
@@ -35,12 +37,12 @@ class Parts:
     """
     The thermal lags of the axes of a unit.
 
-    stages: the time constants of each axis; 0 if the axis follows the board without a lag
+    lags: the lag of each axis; 0 s if the axis follows the board without a lag
     undisturbed: factors, up to 1, that reduce the weights of outlying windows, shape (n,)
     noise: mean over the axes of the windows' white noise [m/s^2]
     """
 
-    stages: tuple[Stages, Stages, Stages]
+    lags: tuple[Part, Part, Part]
     undisturbed: Floats
     noise: float
 
@@ -53,20 +55,22 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     the data do not determine a time constant.
     """
     data, columns = windows.data, windows.model.columns
-    of_board = [k for k, column in enumerate(columns) if column.group == 'board']
-    if not of_board or not windows.has_temperature:
+    if not windows.has_temperature or not any(column.group == 'board' for column in columns):
         return None
     noise = white_noise_of(data, start.scale)
+    # Every k-th window: 3000 to 6000 of them are sufficient to find a time constant.
+    some = slice(None, None, max(len(data.time) // 3000, 1))
     accepted = None
     for has_stress in (False, True):
-        curves = _PartCurves(windows, start, of_board, has_stress=has_stress)
-        lags = [curves.stages(axis, noise[axis]) for axis in range(3)]
-        if not all(curves.is_determined(lag, axis) for axis, lag in enumerate(lags)):
+        curves = _PartCurves(windows, start, some, has_stress=has_stress)
+        lags = curves.lags(noise)
+        if lags is None:
             continue
-        residual = np.column_stack([curves.residual(lag, axis) for axis, lag in enumerate(lags)])
+        whole = _PartCurves(windows, start, slice(None), has_stress=has_stress)
+        residual = np.column_stack([whole.residual(lag, axis) for axis, lag in enumerate(lags)])
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
-        x, y, z = ((round(tau, 1), round(second, 1)) for tau, second in lags)
+        x, y, z = (Part(round(lag[0], 1), round(lag[1], 1), round(lag[2], 4)) for lag in lags)
         parts = Parts((x, y, z), factors, float(noise.mean()))
         # An RMS residual of up to 1.5 times the white noise is attributed to noise.
         if (square <= (1.5 * noise) ** 2).all():
@@ -80,107 +84,156 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
 
 class _PartCurves:
     """
-    Bias and scale factor of each axis as functions of x (see the module), for any time constants.
+    Bias and scale factor of each axis as functions of x (see the module), for any lags.
 
-    `columns`: indices of the columns of group `board`, the lags of the board temperature
+    `rows`: the windows that are used
     `has_stress`: whether both also depend on m, by a coefficient that is linear in x: the stress
         between a part and the board
     """
 
     def __init__(
-        self,
-        windows: ThermalWindows,
-        start: ConstantCalibration,
-        columns: list[int],
-        *,
-        has_stress: bool,
+        self, windows: ThermalWindows, start: ConstantCalibration, rows: slice, *, has_stress: bool
     ) -> None:
-        data = windows.data
-        self._position, self._bag = data.position, data.bag
-        self._weight = data.weight[:, None]
-        self._first = data.edges[:-1]
-        self._t = windows.temperature - windows.model.reference_temperature
-        self._taus = np.array([windows.model.columns[k].tau_s for k in columns])
+        data, columns = windows.data, windows.model.columns
+        of_board = [k for k, column in enumerate(columns) if column.group == 'board']
+        _, self._first, self._position = np.unique(
+            data.position[rows], return_index=True, return_inverse=True
+        )
+        self._bag, self._age = data.bag[rows], data.age[rows]
+        self._weight = data.weight[rows, None]
+        self._t = windows.temperature[rows] - windows.model.reference_temperature
+        self._taus = np.array([columns[k].tau_s for k in of_board])
         #: Time constants tried [s]: those of the columns, and shorter ones.
         self._tried = np.array([15.0, 21.0, 30.0, 42.0, *self._taus])
         # The lag m at a time constant tau between those of the columns is interpolated: m / tau
         # is a smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
-        ratios = np.column_stack((windows.rate, windows.raw[:, columns] / self._taus))
-        self._ratio = CubicSpline(_even(np.append(0.0, self._taus)), ratios, axis=1)
-        self._age, self._has_stress = data.age, has_stress
+        ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
+        knots = _even(np.append(0.0, self._taus))
+        self._ratio = CubicSpline(knots, ratios, axis=1)
+        # Likewise the lag of the gradient, whose limit is the gradient.
+        of_case = [
+            [c.group == 'gradient_lag' and c.tau_s == tau and c.sensor == 'case' for c in columns]
+            for tau in self._taus
+        ]
+        self._has_case = bool(np.any(of_case, axis=1).all())
+        if self._has_case:
+            gradients = np.column_stack((windows.gradient, windows.raw @ np.transpose(of_case)))
+            self._gradient = CubicSpline(knots, gradients[rows], axis=1)
+        self._has_stress = has_stress
         force = (position_means(data) - start.bias) / start.scale
-        self._force = force[data.position]
-        self._measured = self._centred(data.mean / start.scale)
-        # Every k-th window: 3000 to 6000 of them are sufficient to find a time constant.
-        self._some = slice(None, None, max(len(data.time) // 3000, 1))
+        self._force = force[data.position[rows]]
+        self._measured = self._centred(data.mean[rows] / start.scale)
 
-    def stages(self, axis: int, noise: float) -> Stages:
+    def lags(self, noise: Floats) -> list[Part] | None:
+        """Return the lag of each axis; None if one explains little or is not determined."""
+        lags = []
+        for axis in range(3):
+            lag = self._lag(axis, noise[axis])
+            # Much wider than the limits of `find_parts`, which weigh outlying windows down.
+            typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
+            is_of_use = typical <= 3.0 * noise[axis] or self.reduction(lag, axis) >= 4.0
+            if not is_of_use or not self._is_determined(lag, axis):
+                return None
+            lags.append(lag)
+        return lags
+
+    def _lag(self, axis: int, noise: float) -> Part:
         """
-        Return the time constants with the smallest RMS residual; 0 if none reduces it.
+        Return the lag with the smallest RMS residual; 0 s if none reduces it.
 
-        A second stage must reduce a residual above the white noise (`noise`) by 5 %.
+        A second stage, or a share of the gradient, must reduce a residual above the white noise
+        (`noise`) by 5 %.
         """
-        tau = self._time_constant(axis)
-        single = self._square((tau, 0.0), axis)
-        if single <= 1.1**2 * noise**2 * len(self._t[self._some]):
-            return tau, 0.0
+        best = Part(self._time_constant(axis))
+        enough = 1.1**2 * noise**2 * len(self._t)
+        if self._square(best, axis) > enough:
+            lags = [self._searched(axis, _in_two_stages(best), (0.2, 0.4, 0.0))]
+            if self._has_case:
+                lags.append(self._searched(axis, Part(best.tau_s + 15.0), (0.4, 0.0, 0.3)))
+            best = self._better(axis, best, min(lags, key=lambda lag: self._square(lag, axis)))
+        if self._has_case and self._square(best, axis) > enough:
+            first = best if best.second_tau_s else _in_two_stages(best)
+            best = self._better(axis, best, self._searched(axis, first, (0.2, 0.4, 0.3)))
+        return best
 
-        def log_square(logs: Floats) -> float:
-            return float(np.log(self._square(_in_order(*np.exp(logs)), axis)))
+    def _better(self, axis: int, simple: Part, other: Part) -> Part:
+        """Return the second lag if its RMS residual is 5 % below that of the first."""
+        is_better = self._square(other, axis) < self._square(simple, axis) / 1.05**2
+        return other if is_better else simple
 
-        # The residual has a valley along a constant sum of both time constants.
-        first = np.log([0.8 * tau + 1.0, 0.2 * tau + 1.0])
-        options: Any = {'xatol': 2e-3, 'fatol': 1e-4, 'maxfev': 150}
-        both = _in_order(
-            *np.exp(minimize(log_square, first, method='Nelder-Mead', options=options).x)
-        )
-        return both if self._square(both, axis) < single / 1.05**2 else (tau, 0.0)
+    def _searched(self, axis: int, first: Part, steps: tuple[float, float, float]) -> Part:
+        """
+        Return the lag of the smallest RMS residual by the simplex method.
+
+        `steps`: first steps of the logarithms of the time constants, and of the share of the
+        gradient; 0 for a value that remains that of the lag `first`
+        """
+        start = np.array([np.log(first.tau_s), np.log(first.second_tau_s or 1.0), first[2]])
+        free = np.flatnonzero(steps)
+
+        def lag_at(values: Floats) -> Part:
+            every = start.copy()
+            every[free] = values
+            second = float(np.exp(every[1])) if first.second_tau_s else 0.0
+            return _in_order(float(np.exp(every[0])), second, float(np.clip(every[2], -2.0, 2.0)))
+
+        simplex = start[free] + np.vstack((np.zeros(len(free)), np.diag(np.array(steps)[free])))
+        options: Any = {'xatol': 2e-3, 'fatol': 1e-4, 'maxfev': 150, 'initial_simplex': simplex}
+
+        def log_square(values: Floats) -> float:
+            return float(np.log(self._square(lag_at(values), axis)))
+
+        minimum = minimize(log_square, simplex[0], method='Nelder-Mead', options=options)
+        return lag_at(minimum.x)
 
     def _time_constant(self, axis: int) -> float:
         """Return the single time constant with the smallest RMS residual [s]; 0 for none."""
-        squares = [self._square((tau, 0.0), axis) for tau in self._tried]
+        squares = [self._square(Part(tau), axis) for tau in self._tried]
         best = float(self._tried[int(np.argmin(squares))])
         minimum = minimize_scalar(
-            lambda log_tau: float(np.log(self._square((float(np.exp(log_tau)), 0.0), axis))),
+            lambda log_tau: float(np.log(self._square(Part(float(np.exp(log_tau))), axis))),
             bounds=(float(np.log(best / _STEP)), float(np.log(best * _STEP))),
             method='bounded',
             options={'xatol': 1e-3},
         )
         tau = float(np.exp(minimum.x))
-        return tau if self._square((tau, 0.0), axis) < self._square((0.0, 0.0), axis) else 0.0
+        return tau if self._square(Part(tau), axis) < self._square(Part(0.0), axis) else 0.0
 
-    def is_determined(self, lag: Stages, axis: int) -> bool:
+    def _is_determined(self, lag: Part, axis: int) -> bool:
         """Whether time constants larger, or smaller, by `_STEP` add 5 % to the RMS residual."""
-        tau, second = lag
-        others = [(ratio * tau, ratio * second) for ratio in (1.0 / _STEP, _STEP)]
+        tau, second, share = lag
+        others = [Part(ratio * tau, ratio * second, share) for ratio in (1.0 / _STEP, _STEP)]
         if not tau:
-            others = [(float(self._tried[0]) * _STEP, 0.0)]
+            others = [Part(float(self._tried[0]) * _STEP)]
         limit = 1.05**2 * self._square(lag, axis)
         return all(self._square(other, axis) > limit for other in others)
 
-    def reduction(self, lag: Stages, axis: int) -> float:
+    def reduction(self, lag: Part, axis: int) -> float:
         """Return the ratio of the RMS residual of an axis without a lag to that with `lag`."""
-        return float(np.sqrt(self._square((0.0, 0.0), axis) / self._square(lag, axis)))
+        return float(np.sqrt(self._square(Part(0.0), axis) / self._square(lag, axis)))
 
-    def residual(self, lag: Stages, axis: int) -> Floats:
+    def residual(self, lag: Part, axis: int) -> Floats:
         """Return the residuals of one axis in all windows, shape (n,) [m/s^2]."""
         series = self._series(lag, axis)
         left = self._measured[:, axis] - series @ _solved(series, self._measured[:, axis])
         return np.asarray(left / np.sqrt(self._weight[:, 0]))
 
-    def _square(self, lag: Stages, axis: int) -> float:
-        """Return the weighted sum of squared residuals of an axis over every k-th window."""
-        series = self._series(lag, axis)[self._some]
-        measured = self._measured[self._some, axis]
+    def _square(self, lag: Part, axis: int) -> float:
+        """Return the weighted sum of squared residuals of an axis."""
+        series, measured = self._series(lag, axis), self._measured[:, axis]
         left = measured - series @ _solved(series, measured)
         return max(float(left @ left), 1e-30)
 
-    def _series(self, lag: Stages, axis: int) -> Floats:
+    def _series(self, lag: Part, axis: int) -> Floats:
         """Return the weighted regressors of bias, scale factor and initial lags, shape (n, k)."""
         x: Floats = self._t.copy()
-        if lag[0]:
-            for tau_s, share in zip(lag, Lag('board', *lag).shares, strict=True):
-                x -= share * tau_s * self._ratio(_even(np.asarray(tau_s)))
+        if lag.tau_s:
+            tau, second, of_case = lag
+            for tau_s, share in zip((tau, second), Lag('board', tau, second).shares, strict=True):
+                at = _even(np.asarray(tau_s))
+                x -= share * tau_s * self._ratio(at)
+                if of_case:
+                    x += of_case * share * self._gradient(at)
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
         # The spline of the bias has a node every 0.6 K, but at least 4 and at most 60 nodes.
@@ -205,11 +258,17 @@ class _PartCurves:
         return np.asarray((values - level[self._position]) * np.sqrt(self._weight))
 
 
-def _in_order(tau_s: float, second_tau_s: float) -> Stages:
-    """Return two time constants, the longer first, the shorter at most 0.89 of the longer."""
+def _in_two_stages(lag: Part) -> Part:
+    """Return two stages of a lag of one stage, for the start of a search."""
+    # The residual has a valley along a constant sum of both time constants.
+    return Part(0.8 * lag.tau_s + 1.0, 0.2 * lag.tau_s + 1.0, lag.sensor_share)
+
+
+def _in_order(tau_s: float, second_tau_s: float, sensor_share: float) -> Part:
+    """Return a lag with the longer time constant first, the shorter at most 0.89 of it."""
     # Columns accept ratios up to 0.9; both time constants are rounded to 0.1 s before.
     longer, shorter = max(tau_s, second_tau_s), min(tau_s, second_tau_s)
-    return float(longer), float(min(shorter, 0.89 * longer))
+    return Part(longer, min(shorter, 0.89 * longer), sensor_share)
 
 
 def _even(tau_s: Floats) -> Floats:

@@ -219,19 +219,30 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 
     The parts of two units of a type differ in their time constants. A lag is interpolated between
     those of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages is a
-    sum of two lags; its powers are approximated by those of one lag with the sum of the time
-    constants.
+    sum of two lags, and one between board and sensor a sum of their lags; their powers are
+    approximated by those of one lag of the board with the sum of the time constants.
     """
-    if column.second_tau_s:
-        tau, second, lag = column.tau_s, column.second_tau_s, column.source
-        if not isinstance(lag, Lag) or column.term.form is not LINE:
-            return _on_common_lags(replace(column, tau_s=tau + second, second_tau_s=0.0))
+    tau, second, lag = column.tau_s, column.second_tau_s, column.source
+    is_line = isinstance(lag, Lag) and column.term.form is LINE
+    if not is_line and (second or column.sensor_share):
+        return _on_common_lags(
+            replace(column, tau_s=tau + second, second_tau_s=0.0, sensor_share=0.0)
+        )
+    if column.sensor_share:
+        of_board = replace(column, sensor_share=0.0)
+        of_sensor = replace(of_board, group='gradient_lag', kind='gradient_lag')
+        return [
+            (common, factor * part)
+            for each, factor in ((of_board, 1.0), (of_sensor, -column.sensor_share))
+            for common, part in _on_common_lags(each)
+        ]
+    if second and isinstance(lag, Lag):
         return [
             (common, share * part)
             for tau_s, share in zip((tau, second), lag.shares, strict=True)
             for common, part in _on_common_lags(replace(column, tau_s=tau_s, second_tau_s=0.0))
         ]
-    if not isinstance(column.source, Lag) or column.tau_s in FINE_TAUS:
+    if not isinstance(lag, Lag) or tau in FINE_TAUS:
         return [(column, 1.0)]
     at = bisect(FINE_TAUS, column.tau_s)
     if not at:

@@ -21,7 +21,7 @@ from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Gradient, Layout
 from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats, Ints
-from ..unit.columns import Column, ColumnTable, Stages, memory_of
+from ..unit.columns import Column, ColumnTable, Part, memory_of
 from ..unit.functions import TemperatureFunction
 from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
@@ -79,7 +79,7 @@ class Model:
     The model of a fit: curves and columns, and the settings of the thermal state.
 
     name: name of the model in the provenance
-    parts: time constants of the lag of the part of each axis; None if not known
+    parts: the lag of the part of each axis; None if not known
     sensors: thermometers other than the board's; the first is the case's
     """
 
@@ -89,7 +89,7 @@ class Model:
     sensors: tuple[str, ...]
     detector: DetectorSettings
     reference_temperature: float
-    parts: tuple[Stages, Stages, Stages] | None = None
+    parts: tuple[Part, Part, Part] | None = None
 
     @property
     def acts_on(self) -> Bools | None:
@@ -99,8 +99,10 @@ class Model:
         return np.array(
             [
                 [
-                    (column.tau_s, column.second_tau_s) == stages or not column.source.is_of_part
-                    for stages in self.parts
+                    not column.source.is_of_part
+                    # A lag of a gradient has no `sensor_share`.
+                    or column.part in (part, part._replace(sensor_share=0.0))
+                    for part in self.parts
                 ]
                 for column in self.columns
             ]

@@ -10,6 +10,10 @@ linear between two readings (first-order hold) the exact step of m over dt is
 A part may exchange heat with another part that lags the board: the lag then has two stages in
 series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighted sum of the m of
 two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
+
+A part may also exchange heat with both the board and another part, at a sensor s: it lags the
+temperature ``T + v g`` between them, with ``g = T_s - T``. Its lag is that of the board less v
+times the lag of the gradient.
 """
 
 import math
@@ -43,13 +47,33 @@ class _Lag(NamedTuple):
     input: str
     tau_s: float
     second_tau_s: float = 0.0
+    sensor: str = ''
+    sensor_share: float = 0.0
 
 
 class Lag(_Lag, Quantity):
     """
-    The board temperature less its lag, or the lag of the gradient of a sensor (`input`) [K], with
-    the time constants of its two stages [s]; the second is shorter, or 0 for a lag of one stage.
+    The board temperature less that of a part which lags it, or the lag of the gradient of a sensor
+    (`input`) [K], with the time constants of its two stages [s]; the second is shorter, or 0 for a
+    lag of one stage. A part may lag a temperature between board and sensor: that of the board plus
+    `sensor_share` of the gradient of `sensor`.
     """
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The thermometers that the quantity is computed from."""
+        return (self.input, self.sensor) if self.sensor else (self.input,)
+
+    @property
+    def singles(self) -> dict[tuple[str, float], float]:
+        """Share of each single lag in this lag, by input and time constant."""
+        stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
+        return {
+            (name, tau): factor * share
+            for name, factor in zip(self.inputs, (1.0, -self.sensor_share), strict=False)
+            for tau, share in stages
+            if tau
+        }
 
     @property
     def shares(self) -> tuple[float, float]:
@@ -76,6 +100,8 @@ class _Play(NamedTuple):
     tau_s: float
     width_k: float
     second_tau_s: float = 0.0
+    sensor: str = ''
+    sensor_share: float = 0.0
 
 
 class Play(_Play, Quantity):
@@ -89,7 +115,12 @@ class Play(_Play, Quantity):
     @property
     def lag(self) -> Lag | None:
         """The lag that the play follows; None if it follows the board."""
-        return Lag(BOARD_INPUT, self.tau_s, self.second_tau_s) if self.tau_s else None
+        return Lag(BOARD_INPUT, self.tau_s, *self[2:]) if self.tau_s else None
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The thermometers that the quantity is computed from."""
+        return self.lag.inputs if self.lag else (self.input,)
 
 
 @dataclass(frozen=True)
@@ -113,15 +144,10 @@ class MemorySpec:
         """The board and the sensors, in the order of their lags."""
         return (BOARD_INPUT, *self.sensors)
 
-    def lags_of(self, name: str) -> tuple[Lag, ...]:
-        """Return the lags of one input."""
-        return tuple(lag for lag in self.lags if lag.input == name)
 
-
-def _single(lags: Iterable[Lag]) -> dict[tuple[str, float], int]:
-    """Return the number of each single lag that the lags contain, by input and time constant."""
-    taus = [(lag.input, tau) for lag in lags for tau in (lag.tau_s, lag.second_tau_s) if tau]
-    return {key: k for k, key in enumerate(dict.fromkeys(taus))}
+def _singles(lags: Iterable[Lag]) -> tuple[tuple[str, float], ...]:
+    """Return the input and the time constant of each single lag that the lags contain."""
+    return tuple(dict.fromkeys(single for lag in lags for single in lag.singles))
 
 
 def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
@@ -133,42 +159,29 @@ def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
     inputs. After the first reading the covariance decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
     """
     every = [Lag(*lag) for lag in lags]
-    single = _single(every)
-    tau = np.array([tau for _, tau in single])
-    names = np.array([name for name, _ in single])
+    singles = _singles(every)
+    tau = np.array([tau for _, tau in singles])
+    names = np.array([name for name, _ in singles])
     sd = np.where(names == BOARD_INPUT, BOARD_START_SD, GRADIENT_START_SD)
     with np.errstate(invalid='ignore'):
         shape = tau[:, np.newaxis] * tau / (tau[:, np.newaxis] + tau)
     is_same = names[:, np.newaxis] == names
     shape[np.diag_indices_from(shape)] *= 1.0 + START_JITTER
     covariance = np.where(is_same, 2.0 / START_TAU_S * sd * sd * shape, 0.0)
-    shares = np.zeros((len(every), len(single)))
-    for k, lag in enumerate(every):
-        for tau_s, share in zip((lag.tau_s, lag.second_tau_s), lag.shares, strict=True):
-            if tau_s:
-                shares[k, single[lag.input, tau_s]] = share
+    shares = np.array([[lag.singles.get(single, 0.0) for single in singles] for lag in every])
+    shares = shares.reshape(len(every), len(singles))
     return np.asarray(shares @ covariance @ shares.T)
 
 
 class LagBank:
     """
-    The lags of one input; `start_ns` is the first stamp since the last `forget`.
+    Single lags of one input; `start_ns` is the first stamp since the last `forget`.
 
-    The state consists of single lags with the time constants `taus`; a lag of two stages is a
-    weighted sum of two single lags.
+    taus: time constants of the lags [s]
     """
 
-    def __init__(self, taus: tuple[float, ...], second_taus: tuple[float, ...] = ()) -> None:
-        seconds = second_taus or (0.0,) * len(taus)
-        self._lags = tuple(Lag('', *both) for both in zip(taus, seconds, strict=True))
-        number = {tau: k for (_, tau), k in _single(self._lags).items()}
-        self.taus = tuple(number)
-        #: For each lag the numbers of its single lags and their shares; empty without sums.
-        self._sums = [
-            (number[lag.tau_s], number.get(lag.second_tau_s, 0), *lag.shares) for lag in self._lags
-        ]
-        if not any(seconds):
-            self._sums = []
+    def __init__(self, taus: tuple[float, ...]) -> None:
+        self.taus = taus
         self._sparse_s = SPARSE_SHARE * min(self.taus, default=math.inf)
         self._nil = [0.0] * len(self.taus)
         self.forget()
@@ -197,7 +210,7 @@ class LagBank:
         if dt_ns <= 0:
             self.lagging = [m + change for m in self.lagging]
         else:
-            self.lagging, self.extra = self._single_at(stamp_ns, value)
+            self.lagging, self.extra = self.at(stamp_ns, value)
             self.stamp_ns = stamp_ns
             if sd or dt_ns * 1e-9 > self._sparse_s:
                 self._doubt(_coefficients(self.taus, dt_ns)[0], dt_ns * 1e-9, change, sd)
@@ -225,15 +238,6 @@ class LagBank:
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
         """Return ``u - L`` [K] and the extra variance of each lag at a stamp, with u = `value`."""
-        lagging, extra = self._single_at(stamp_ns, value)
-        if not self._sums:
-            return lagging, extra
-        # The errors of the two single lags have common causes: standard deviations add.
-        return [a * lagging[i] + b * lagging[j] for i, j, a, b in self._sums], [
-            (a * math.sqrt(extra[i]) - b * math.sqrt(extra[j])) ** 2 for i, j, a, b in self._sums
-        ]
-
-    def _single_at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -246,11 +250,10 @@ class LagBank:
             return lagging, self.extra
         return lagging, [v * e * e for v, e in zip(self.extra, decays, strict=True)]
 
-    def start_shares(self, stamp_ns: int) -> list[float]:
-        """Return the remaining share of each lag's start value at a stamp, 1 to 0."""
+    def age_s(self, stamp_ns: int) -> float:
+        """Return the time from the first value to a stamp [s]; 0 without a value."""
         start_ns = self.start_ns
-        age = 0.0 if start_ns is None else max(stamp_ns - start_ns, 0) * 1e-9
-        return [lag.start_share(age) for lag in self._lags]
+        return 0.0 if start_ns is None else max(stamp_ns - start_ns, 0) * 1e-9
 
 
 @lru_cache(maxsize=1024)
@@ -273,17 +276,23 @@ class ThermalMemory:
 
     def __init__(self, spec: MemorySpec) -> None:
         self.spec = spec
-        #: The lags of each input, by the input's name.
-        self.banks = {}
-        for name in spec.inputs:
-            lags = spec.lags_of(name)
-            taus = tuple(lag.tau_s for lag in lags)
-            self.banks[name] = LagBank(taus, tuple(lag.second_tau_s for lag in lags))
+        singles = sorted(_singles(spec.lags), key=lambda single: spec.inputs.index(single[0]))
+        #: The single lags of each input, by the input's name.
+        self.banks = {
+            name: LagBank(tuple(tau for of, tau in singles if of == name)) for name in spec.inputs
+        }
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: For each play: index of the board lag that it follows, -1 for the board; half-width [K].
-        lags = spec.lags_of(BOARD_INPUT)
-        self._inputs = [lags.index(play.lag) if play.lag else -1 for play in spec.plays]
+        #: For each lag the numbers of its single lags, each with its share; empty if the lags are
+        #: the single lags.
+        self._sums = [
+            [(singles.index(single), share) for single, share in lag.singles.items()]
+            for lag in spec.lags
+        ]
+        if [lag.singles for lag in spec.lags] == [{single: 1.0} for single in singles]:
+            self._sums = []
+        #: For each play: index of the lag that it follows, -1 for the board; half-width [K].
+        self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
         self._widths = [play.width_k for play in spec.plays]
         self._held: list[float] = []
 
@@ -296,8 +305,11 @@ class ThermalMemory:
     def board_step(self, stamp_ns: int, board: float) -> None:
         """Take the next estimate of the board temperature [degC]."""
         self.board.step(stamp_ns, board)
-        lagging, _ = self.board.at(stamp_ns, board)
-        inputs = [board if place < 0 else board - lagging[place] for place in self._inputs]
+        if not self._widths:
+            return
+        # The sensors have no reading at this stamp: their gradients are the last ones.
+        behind, _ = self._lags(stamp_ns, board, [self.banks[s].input for s in self.spec.sensors])
+        inputs = [board if place < 0 else board - behind[place] for place in self._inputs]
         self._held = [
             v - r if p < v - r else v + r if p > v + r else p
             for p, v, r in zip(self._held or inputs, inputs, self._widths, strict=True)
@@ -310,27 +322,38 @@ class ThermalMemory:
 
     def at(self, stamp_ns: int, board: float, gradients: list[float]) -> list[float]:
         """Return (lag [K], extra variance [K^2]) per lag, then each play less its input [K]."""
-        lagging, variances = self.board.at(stamp_ns, board)
-        values, extra = lagging, variances
-        for name, gradient in zip(self.spec.sensors, gradients, strict=True):
-            if (bank := self.banks[name]).taus:
-                behind, more = bank.at(stamp_ns, gradient)
-                values = values + [gradient - m for m in behind]
-                extra = extra + more
-        result = [0.0] * (2 * len(values))
-        result[0::2] = values
+        behind, extra = self._lags(stamp_ns, board, gradients)
+        result = [0.0] * (2 * len(behind))
+        result[0::2] = behind
         result[1::2] = extra
         if not self._held:
             return result + [0.0] * len(self._widths)
         for place, p, r in zip(self._inputs, self._held, self._widths, strict=True):
-            beside = p - (board if place < 0 else board - lagging[place])
+            beside = p - (board if place < 0 else board - behind[place])
             result.append(-r if beside < -r else r if beside > r else beside)
         return result
 
+    def _lags(
+        self, stamp_ns: int, board: float, gradients: Sequence[float]
+    ) -> tuple[list[float], list[float]]:
+        """Return each lag of the spec [K], and its extra variance [K^2]."""
+        values, extra = self.board.at(stamp_ns, board)
+        for name, gradient in zip(self.spec.sensors, gradients, strict=True):
+            if (bank := self.banks[name]).taus:
+                lagging, more = bank.at(stamp_ns, gradient)
+                values = values + [gradient - m for m in lagging]
+                extra = extra + more
+        if not self._sums:
+            return values, extra
+        # The errors of the single lags have common causes: standard deviations add.
+        return [sum([share * values[k] for k, share in lag]) for lag in self._sums], [
+            sum([abs(share) * math.sqrt(extra[k]) for k, share in lag]) ** 2 for lag in self._sums
+        ]
+
     def start_shares(self, stamp_ns: int) -> list[float]:
         """Return the remaining share of each lag's start value at a stamp, in the spec's order."""
-        banks = self.banks.values()
-        return [share for bank in banks for share in bank.start_shares(stamp_ns)]
+        ages = {name: bank.age_s(stamp_ns) for name, bank in self.banks.items()}
+        return [lag.start_share(min(map(ages.__getitem__, lag.inputs))) for lag in self.spec.lags]
 
 
 def memory_on_grid(
@@ -342,21 +365,18 @@ def memory_on_grid(
     Returns (n, 2 * n_lags + n_plays): (lag [K], 0) per lag, then each play less its input [K].
     """
     inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
-    columns: list[Floats] = []
     single: dict[tuple[str, float], Floats] = {}
-    for name, tau in _single(spec.lags):
+    for name, tau in _singles(spec.lags):
         u = inputs[name]
         lost = -math.expm1(-step_s / tau)
         driven = np.diff(u, prepend=u[:1]) * (lost * tau / step_s)
-        single[name, tau] = _recursion(1.0 - lost, driven)
-    behind: dict[Lag, Floats] = {}
-    for lag in spec.lags:
-        u, m = inputs[lag.input], single[lag.input, lag.tau_s]
-        if lag.second_tau_s:
-            share, second_share = lag.shares
-            m = share * m + second_share * single[lag.input, lag.second_tau_s]
-        behind[lag] = m
-        columns += [m if lag.input == BOARD_INPUT else u - m, np.zeros_like(u)]
+        m = _recursion(1.0 - lost, driven)
+        single[name, tau] = m if name == BOARD_INPUT else u - m
+    behind = {
+        lag: np.asarray(sum(share * single[of] for of, share in lag.singles.items()))
+        for lag in spec.lags
+    }
+    columns = [part for lag in behind.values() for part in (lag, np.zeros_like(lag))]
     for play in spec.plays:
         v = board - behind[play.lag] if play.lag else board
         columns.append(_play(v, play.width_k) - v)

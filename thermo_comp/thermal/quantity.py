@@ -19,6 +19,11 @@ class Quantity:
     is_of_part: ClassVar[bool] = True
 
     @property
+    def inputs(self) -> tuple[str, ...]:
+        """The thermometers that the quantity is computed from."""
+        return (self.input,)
+
+    @property
     def by_board(self) -> float:
         """Derivative by the board temperature, at given lags and other thermometers' readings."""
         return float(self.input == 'board')

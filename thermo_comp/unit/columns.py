@@ -22,7 +22,7 @@ Tracker, fit, correction, covariance and file use this table.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -58,8 +58,19 @@ if TYPE_CHECKING:
 else:
     _Group, _Kind = Literal[tuple(GROUPS)], Literal[tuple(TERMS)]
 _Value = Annotated[float, QUANTITIES['value of a column']]
-#: Time constants of the two stages of a lag [s]; the second is 0 for a lag of one stage.
-Stages = tuple[float, float]
+
+
+class Part(NamedTuple):
+    """
+    The lag of a part of the unit, by the keys of a column.
+
+    tau_s, second_tau_s: time constants of its two stages [s]; the second is 0 for one stage
+    sensor_share: the part lags the board temperature plus this share of the gradient of the sensor
+    """
+
+    tau_s: float
+    second_tau_s: float = 0.0
+    sensor_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -82,6 +93,11 @@ class Column:
         float,
         QUANTITIES['lag'],
         'Time constant of a second stage of the lag, in series with the first; 0 = none.',
+    ] = 0.0
+    sensor_share: Annotated[
+        float,
+        QUANTITIES['share'],
+        'The lag is that of T_board + sensor_share * g_s (board, square, cube, play, bend).',
     ] = 0.0
     width_k: Annotated[
         float, QUANTITIES['width'], 'Width of gradient_even, half-width of play.'
@@ -129,9 +145,14 @@ class Column:
         return self.term.source(self)
 
     @property
+    def part(self) -> Part:
+        """The lag of the part that the value is computed from."""
+        return Part(self.tau_s, self.second_tau_s, self.sensor_share)
+
+    @property
     def is_of_sensor(self) -> bool:
         """Whether the value is computed from readings of `sensor`."""
-        return self.source.input != BOARD_INPUT
+        return self.source.inputs != (BOARD_INPUT,)
 
     @property
     def is_gradient(self) -> bool:
@@ -143,26 +164,29 @@ def bank(
     sensors: Sequence[str] = ('case',),
     at_rest: Mapping[str, float] | None = None,
     span_k: tuple[float, float] = (0.0, 0.0),
-    parts: Sequence[Stages] | None = None,
+    parts: Sequence[Part] | None = None,
 ) -> tuple[Column, ...]:
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
     of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K],
-    `parts` the only time constants of lags, those of the part of each axis.
+    `parts` the only lags, those of the part of each axis.
     """
     fine, coarse, of_plays, of_bends = (
-        [(tau, 0.0) for tau in taus] for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
+        list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
     )
+    fine_gradient, coarse_gradient = fine, coarse
     most_knees = MOST_KNEES if parts is None else MOST_PART_KNEES
     if parts is not None:
         of_plays = of_bends = sorted({*parts})
-        fine = coarse = [stages for stages in of_bends if stages[0]]
+        fine = coarse = [part for part in of_bends if part.tau_s]
+        of_gradients = {part._replace(sensor_share=0.0) for part in fine}
+        fine_gradient = coarse_gradient = sorted(of_gradients)
     columns = _family('gradient', ['gradient'], sensors)
     columns += _family('board', ['board'], lags=fine)
-    columns += _family('gradient_lag', ['gradient_lag'], sensors, lags=fine)
+    columns += _family('gradient_lag', ['gradient_lag'], sensors, lags=fine_gradient)
     columns += _family('product', ['board'], powers=(1, 2), lags=coarse)
     columns += _family('gradient_x_temperature', ['gradient'], sensors, powers=(1,))
-    columns += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse)
+    columns += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse_gradient)
     # The bias of a part that lags the board by m is a polynomial in its temperature t - m:
     # (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
     columns += _family('square', ['square'], powers=(0, 1), lags=coarse)
@@ -193,19 +217,17 @@ def _family(
     kinds: Sequence[str],
     sensors: Sequence[str] = ('case',),
     powers: Sequence[int] = (0,),
-    lags: Sequence[Stages] = ((0.0, 0.0),),
+    lags: Sequence[Part] = (Part(0.0),),
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
     """Return the columns of a group with all combinations of the properties."""
     return [
         Column(
-            *(group, kind, sensor, tau, second, width),
+            *(group, kind, sensor, *part, width),
             power=power,
             range=TERMS[kind].bounds or UNBOUNDED,
         )
-        for sensor, kind, power, (tau, second), width in product(
-            sensors, kinds, powers, lags, widths
-        )
+        for sensor, kind, power, part, width in product(sensors, kinds, powers, lags, widths)
     ]
 
 
@@ -214,7 +236,7 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
     sources: set[Quantity] = set()
     for column in columns:
         sources.add(column.source)
-        if column.source.input not in (BOARD_INPUT, *sensors):
+        if not {*column.source.inputs} <= {BOARD_INPUT, *sensors}:
             raise ValueError(f'`sensor` must be one of {tuple(sensors)}, got {column.sensor}')
     plays = [source for source in sources if isinstance(source, Play)]
     lags = {source for source in sources if isinstance(source, Lag)}

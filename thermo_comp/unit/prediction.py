@@ -185,10 +185,9 @@ def ramp_states(
         if isinstance(quantity, Rate | Gradient):
             states[:, place] = rate if isinstance(quantity, Rate) else gradient
         elif isinstance(quantity, Lag):
-            for tau, share in zip(quantity[1:], quantity.shares, strict=True):
-                end = tau * rate if quantity.input == BOARD_INPUT else gradient
-                reached = 1.0 - np.exp(-np.asarray(lasted_s) / tau) if tau else 1.0
-                states[:, place] += share * end * reached
+            for (name, tau), share in quantity.singles.items():
+                end = tau * rate if name == BOARD_INPUT else gradient
+                states[:, place] += share * end * (1.0 - np.exp(-np.asarray(lasted_s) / tau))
         elif isinstance(quantity, Play):
             states[:, place] = -np.sign(rate) * quantity.width_k
     return states

@@ -92,8 +92,9 @@ class Term(ABC):
         return float(self.order * largest ** (self.order - 1)) * column.source.per_kelvin
 
 
-def _lag(name: str, column: Column) -> memory.Lag:
-    return memory.Lag(name, column.tau_s, column.second_tau_s)
+def _lag_of_part(column: Column) -> memory.Lag:
+    sensor = column.sensor if column.sensor_share else ''
+    return memory.Lag(memory.BOARD_INPUT, *column.part[:2], sensor, column.sensor_share)
 
 
 class Gradient(Term):
@@ -127,7 +128,7 @@ class Board(Term):
 
     def source(self, column: Column) -> Quantity:
         """Return ``T_board - L_tau(T_board)``, or for a bend without lag the board's own."""
-        return _lag(memory.BOARD_INPUT, column) if column.tau_s else state.Board()
+        return _lag_of_part(column) if column.tau_s else state.Board()
 
 
 class GradientLag(Term):
@@ -143,7 +144,7 @@ class GradientLag(Term):
 
     def source(self, column: Column) -> Quantity:
         """Return ``L_tau(g_s)``."""
-        return _lag(column.sensor, column)
+        return memory.Lag(column.sensor, *column.part[:2])
 
 
 class Square(Term):
@@ -155,7 +156,7 @@ class Square(Term):
 
     def source(self, column: Column) -> Quantity:
         """Return ``T_board - L_tau(T_board)``, or g_s."""
-        return _lag(memory.BOARD_INPUT, column) if column.tau_s else state.Gradient(column.sensor)
+        return _lag_of_part(column) if column.tau_s else state.Gradient(column.sensor)
 
 
 class Cube(Board):
@@ -195,7 +196,8 @@ class Play(Term):
 
     def source(self, column: Column) -> Quantity:
         """Return ``P(v) - v``, P the play of half-width `width_k`, v = t or t less its lag."""
-        return memory.Play(column.tau_s, column.width_k, column.second_tau_s)
+        lag = _lag_of_part(column)
+        return memory.Play(lag.tau_s, column.width_k, *lag[2:])
 
 
 class Bend(Board):
