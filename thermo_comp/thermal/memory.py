@@ -293,6 +293,14 @@ class ThermalMemory:
             self._sums = []
         #: For each play: index of the lag that it follows, -1 for the board; half-width [K].
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
+        #: The single lags of the lag that each play follows, as in `_sums`; none for the board.
+        self._followed = [
+            [(singles.index(single), share) for single, share in play.lag.singles.items()]
+            if play.lag
+            else []
+            for play in spec.plays
+        ]
+        self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
         self._held: list[float] = []
 
@@ -305,11 +313,15 @@ class ThermalMemory:
     def board_step(self, stamp_ns: int, board: float) -> None:
         """Take the next estimate of the board temperature [degC]."""
         self.board.step(stamp_ns, board)
-        if not self._widths:
-            return
-        # The sensors have no reading at this stamp: their gradients are the last ones.
-        behind, _ = self._lags(stamp_ns, board, [self.banks[s].input for s in self.spec.sensors])
-        inputs = [board if place < 0 else board - behind[place] for place in self._inputs]
+        values = self.board.lagging
+        if self._needs_sensors:
+            # The sensors have no reading at this stamp: their gradients are the last ones.
+            gradients = [self.banks[name].input for name in self.spec.sensors]
+            values, _ = self._single_lags(stamp_ns, board, gradients)
+        inputs = [
+            board - sum([share * values[k] for k, share in lag]) if lag else board
+            for lag in self._followed
+        ]
         self._held = [
             v - r if p < v - r else v + r if p > v + r else p
             for p, v, r in zip(self._held or inputs, inputs, self._widths, strict=True)
@@ -322,7 +334,15 @@ class ThermalMemory:
 
     def at(self, stamp_ns: int, board: float, gradients: list[float]) -> list[float]:
         """Return (lag [K], extra variance [K^2]) per lag, then each play less its input [K]."""
-        behind, extra = self._lags(stamp_ns, board, gradients)
+        behind, extra = self._single_lags(stamp_ns, board, gradients)
+        if self._sums:
+            values, variances = behind, extra
+            behind = [sum([share * values[k] for k, share in lag]) for lag in self._sums]
+            # The errors of the single lags have common causes: standard deviations add.
+            extra = [
+                sum([abs(share) * math.sqrt(variances[k]) for k, share in lag]) ** 2
+                for lag in self._sums
+            ]
         result = [0.0] * (2 * len(behind))
         result[0::2] = behind
         result[1::2] = extra
@@ -333,22 +353,17 @@ class ThermalMemory:
             result.append(-r if beside < -r else r if beside > r else beside)
         return result
 
-    def _lags(
+    def _single_lags(
         self, stamp_ns: int, board: float, gradients: Sequence[float]
     ) -> tuple[list[float], list[float]]:
-        """Return each lag of the spec [K], and its extra variance [K^2]."""
+        """Return each single lag [K], and its extra variance [K^2]."""
         values, extra = self.board.at(stamp_ns, board)
         for name, gradient in zip(self.spec.sensors, gradients, strict=True):
             if (bank := self.banks[name]).taus:
                 lagging, more = bank.at(stamp_ns, gradient)
                 values = values + [gradient - m for m in lagging]
                 extra = extra + more
-        if not self._sums:
-            return values, extra
-        # The errors of the single lags have common causes: standard deviations add.
-        return [sum([share * values[k] for k, share in lag]) for lag in self._sums], [
-            sum([abs(share) * math.sqrt(extra[k]) for k, share in lag]) ** 2 for lag in self._sums
-        ]
+        return values, extra
 
     def start_shares(self, stamp_ns: int) -> list[float]:
         """Return the remaining share of each lag's start value at a stamp, in the spec's order."""
