@@ -58,15 +58,19 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
         return None
     noise = white_noise_of(data, start.scale)
-    # Every k-th window: 3000 to 6000 of them are sufficient to find a time constant.
-    some = slice(None, None, max(len(data.time) // 3000, 1))
     accepted = None
     for has_stress in (False, True):
-        curves = _PartCurves(windows, start, some, has_stress=has_stress)
-        lags = curves.lags(noise)
+        # Every k-th window: some 500 are sufficient for a search, and 3000 to determine its result.
+        few, many, whole = (
+            _PartCurves(windows, start, rows, has_stress=has_stress)
+            for rows in (
+                slice(None, None, max(len(data.time) // n, 1)) for n in (500, 3000, 10**9)
+            )
+        )
+        lags = few.lags(noise)
         if lags is None:
             continue
-        whole = _PartCurves(windows, start, slice(None), has_stress=has_stress)
+        lags = [many.near(lag, axis) for axis, lag in enumerate(lags)]
         residual = np.column_stack([whole.residual(lag, axis) for axis, lag in enumerate(lags)])
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
@@ -77,7 +81,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
             return parts
         # A larger residual has another cause, e.g. slow noise: the lags are then accepted only if
         # they reduce the RMS residual of each axis to an eighth or less of that without a lag.
-        if accepted is None and min(map(curves.reduction, lags, range(3))) >= 8.0:
+        if accepted is None and min(map(many.reduction, lags, range(3))) >= 8.0:
             accepted = parts
     return accepted
 
@@ -129,13 +133,15 @@ class _PartCurves:
         lags = []
         for axis in range(3):
             lag = self._lag(axis, noise[axis])
-            # Much wider than the limits of `find_parts`, which weigh outlying windows down.
-            typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
-            is_of_use = typical <= 3.0 * noise[axis] or self.reduction(lag, axis) >= 4.0
-            if not is_of_use or not self._is_determined(lag, axis):
+            if not self._is_of_use(lag, axis, noise[axis]) or not self._is_determined(lag, axis):
                 return None
             lags.append(lag)
         return lags
+
+    def _is_of_use(self, lag: Part, axis: int, noise: float) -> bool:
+        """Whether a lag may meet the limits of `find_parts`; the limits here are wider."""
+        typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
+        return bool(typical <= 3.0 * noise or self.reduction(lag, axis) >= 4.0)
 
     def _lag(self, axis: int, noise: float) -> Part:
         """
@@ -144,17 +150,31 @@ class _PartCurves:
         A second stage, or a share of the gradient, must reduce a residual above the white noise
         (`noise`) by 5 %.
         """
-        best = Part(self._time_constant(axis))
+        best = self._time_constant(axis)
         enough = 1.1**2 * noise**2 * len(self._t)
         if self._square(best, axis) > enough:
             lags = [self._searched(axis, _in_two_stages(best), (0.2, 0.4, 0.0))]
             if self._has_case:
-                lags.append(self._searched(axis, Part(best.tau_s + 15.0), (0.4, 0.0, 0.3)))
+                # The residual has a valley of several minima along a constant time constant less
+                # the time by which the temperature between board and case leads the board.
+                along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
+                for first in (best, min(along, key=lambda lag: self._square(lag, axis))):
+                    first = first._replace(tau_s=max(first.tau_s, 15.0))
+                    lags.append(self._searched(axis, first, (0.2, 0.0, 0.1)))
             best = self._better(axis, best, min(lags, key=lambda lag: self._square(lag, axis)))
-        if self._has_case and self._square(best, axis) > enough:
+        is_incomplete = self._is_of_use(best, axis, noise) and self._square(best, axis) > enough
+        if self._has_case and is_incomplete:
             first = best if best.second_tau_s else _in_two_stages(best)
             best = self._better(axis, best, self._searched(axis, first, (0.2, 0.4, 0.3)))
         return best
+
+    def near(self, lag: Part, axis: int) -> Part:
+        """Return the lag with the smallest RMS residual near a lag."""
+        if not lag.tau_s:
+            return lag
+        tau_step, second_step, share_step = 0.03, 0.06, 0.02
+        steps = tau_step, second_step * bool(lag.second_tau_s), share_step * bool(lag.sensor_share)
+        return self._searched(axis, lag, steps)
 
     def _better(self, axis: int, simple: Part, other: Part) -> Part:
         """Return the second lag if its RMS residual is 5 % below that of the first."""
@@ -186,18 +206,21 @@ class _PartCurves:
         minimum = minimize(log_square, simplex[0], method='Nelder-Mead', options=options)
         return lag_at(minimum.x)
 
-    def _time_constant(self, axis: int) -> float:
-        """Return the single time constant with the smallest RMS residual [s]; 0 for none."""
-        squares = [self._square(Part(tau), axis) for tau in self._tried]
-        best = float(self._tried[int(np.argmin(squares))])
+    def _time_constant(self, axis: int, sensor_share: float = 0.0) -> Part:
+        """Return the lag of one stage with the smallest RMS residual; 0 s for none."""
+
+        def square(tau_s: float) -> float:
+            return self._square(Part(tau_s, 0.0, sensor_share if tau_s else 0.0), axis)
+
+        best = min(self._tried.tolist(), key=square)
         minimum = minimize_scalar(
-            lambda log_tau: float(np.log(self._square(Part(float(np.exp(log_tau))), axis))),
+            lambda log_tau: float(np.log(square(float(np.exp(log_tau))))),
             bounds=(float(np.log(best / _STEP)), float(np.log(best * _STEP))),
             method='bounded',
             options={'xatol': 1e-3},
         )
         tau = float(np.exp(minimum.x))
-        return tau if self._square(Part(tau), axis) < self._square(Part(0.0), axis) else 0.0
+        return Part(tau, 0.0, sensor_share) if square(tau) < square(0.0) else Part(0.0)
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """Whether time constants larger, or smaller, by `_STEP` add 5 % to the RMS residual."""
