@@ -144,7 +144,8 @@ def test_the_evidence_is_complete(response):
     assert 'refusal' not in {finding.level for finding in response.findings}
     # The file contains the contribution of each group.
     judged = {(group.part, group.group) for group in calibration.evidence}
-    assert {('bias', 'curve'), ('scale', 'curve')} <= judged
+    # Each axis of this unit is a curve of its part.
+    assert {('bias', 'part'), ('scale', 'part')} <= judged
     # A term with zero weight is only needed for the covariance.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
     assert {term.group for term in weighty} <= {group for _, group in judged}

@@ -21,7 +21,7 @@ from .priors import prior_model
 from .reduction import ReducedBag
 from .selection import Fit, Selected
 from .sensors import board_span, gradients_at_rest, learn_detector
-from .windows import SET, Model, ThermalWindows, Track, thermal_windows
+from .windows import PART, PART_SUMS, SET, Model, ThermalWindows, Track, thermal_windows
 
 
 def model_of(
@@ -51,6 +51,8 @@ def model_of(
         columns = tuple(column for column in columns if not column.is_of_sensor)
     if options.groups is not None:
         groups = {*options.groups, *options.forced}
+        if PART in groups:
+            groups.update(PART_SUMS)
         columns = tuple(column for column in columns if column.group in groups)
     sets = sets_of(options, bags)
     return Model(options.model, sets, columns, sensors, detector, reference, parts)

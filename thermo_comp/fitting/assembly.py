@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import __version__
 from ..thermal.state import USUAL_BOARD_LAG_S
-from ..typing import Floats
+from ..typing import Bools, Floats
 from ..unit.calibration import (
     FORMAT_VERSION,
     Axes,
@@ -38,7 +38,7 @@ from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit
 from .unknowns import Layout, State
-from .windows import Sets, ThermalWindows
+from .windows import PART, Model, ThermalWindows
 
 Range = tuple[float, float]
 
@@ -60,11 +60,10 @@ def build_calibration(
     """
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
-    # Places of the response columns that are in use, or that only the covariance has.
-    weights = layout.weights[:, 0, len(model.sets.groups) :]
-    used = np.flatnonzero((weights >= 0).any(axis=0)).tolist()
+    # Response columns that are in use, or that only the covariance has.
+    used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
-    to_file = file_parameters(regression, layout, state, model.sets, used, kinds)
+    to_file = file_parameters(regression, layout, state, model, used, kinds)
     values = to_file @ as_vector(state, layout)[: layout.n_unit]
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
     static, dynamic = _regime_sets(fit, claim, known)
@@ -135,7 +134,9 @@ def _valid_columns(
 ) -> list[Column]:
     """Return the response columns in use with their valid ranges."""
     lower, upper = _temperature_range(windows)
-    n_curves = len(windows.model.sets.groups)
+    is_weighed = np.any(state.weights != 0.0, axis=(0, 1))
+    alone = is_weighed[len(windows.model.sets.groups) :]
+    weighed = _of_columns(windows, is_weighed)
     result = []
     for k in used:
         column = windows.model.columns[k]
@@ -143,15 +144,23 @@ def _valid_columns(
         if column.term.bounds is None:
             order = column.term.order
             valid = _range(windows.raw[:, k], 0.01, order)
-            if not state.weights[:, :, n_curves + k].any():
+            if k not in weighed:
                 # A column with zero weight contributes only to the covariance, which is valid at
                 # any value.
                 most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
-        result.append(
-            replace(column, range=valid if known is None else union((valid, column.range)))
-        )
+        # Columns that occur in the curves of parts alone have their group.
+        group = PART if k in weighed and not alone[k] else column.group
+        valid = valid if known is None else union((valid, column.range))
+        result.append(replace(column, group=group, range=valid))
     return result
+
+
+def _of_columns(windows: ThermalWindows, mask: Bools) -> list[int]:
+    """Return the response columns that a mask of the regression's columns contains."""
+    sums, n_curves = windows.model.part_curves.sums, len(windows.model.sets.groups)
+    contained = mask[: sums.shape[1]] | (sums != 0.0)[mask[sums.shape[1] :]].any(axis=0)
+    return [int(k) for k in np.flatnonzero(contained[n_curves:])]
 
 
 def _provenance(
@@ -274,7 +283,7 @@ def file_parameters(
     regression: Regression,
     layout: Layout,
     state: State,
-    sets: Sets,
+    model: Model,
     used: Sequence[int],
     kinds: Sequence[Kind] = (),
 ) -> Floats:
@@ -283,6 +292,7 @@ def file_parameters(
 
     `used`: response columns in the file; `kinds`: nonlinear terms in the file
     """
+    sets, sums = model.sets, model.part_curves.sums
     n, m = sets.static.n_free, sets.dynamic.n_free
     # The last row is zero: place -1 marks a parameter that is not estimated.
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)
@@ -296,6 +306,9 @@ def file_parameters(
             (of_scale, 1.0, unknown[layout.kappa[axis]] / state.kappa[axis]),
         ):
             each = unknown[places] * (unit / regression.rms)[:, None]
+            # Curves of parts are sums of the other columns.
+            each, of_parts = np.split(each, [sums.shape[1]])
+            each = each + sums.T @ of_parts
             static, (delta,), dynamic, response = np.split(each, [n, n + 1, n + 1 + m])
             if sets.is_shared:
                 both = np.zeros((max(n, m), layout.n_unit))

@@ -68,7 +68,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     candidates = _candidates(windows, start, options, has_one_direction=n_directions == 1)
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
-        *others, widest = informative_priors(known, regression, state, windows.model.sets, options)
+        *others, widest = informative_priors(known, regression, state, windows.model, options)
         prior = replace(prior, column_sd=data.parts.astype(np.float64), informative=widest)
         fixed = replace(candidates, fixed=np.ones_like(candidates.fixed))
         return Fit(windows, regression, fit_all(regression, state, prior, fixed, others))
@@ -149,9 +149,10 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     """
     data = windows.data
     longest_s = float(data.age.max())
-    taus = [column.tau_s for column in windows.model.columns]
-    taus = [0.0] * (len(data.groups) - len(taus)) + taus
-    return np.asarray(np.array(taus) > longest_s / np.log(10.0))
+    model = windows.model
+    taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])
+    of_part = ((model.part_curves.sums != 0.0) * taus).max(axis=1, initial=0.0)
+    return np.asarray(np.append(taus, of_part) > longest_s / np.log(10.0))
 
 
 def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> float:

@@ -83,7 +83,7 @@ def bags_contradicting_prior(
     """
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
     regression, state = _at_calibration(known, data, options.gravity)
-    first = informative_priors(known, regression, state, windows.model.sets, options)[0]
+    first = informative_priors(known, regression, state, windows.model, options)[0]
     # Length of a typical window [s], and the white noise of its mean [m/s^2].
     window_s = windows.typical_count * known.unit.cycle_time_s
     sigma = np.array(known.noise_density_m_s2_sqrt_hz) / np.sqrt(window_s)

@@ -36,12 +36,14 @@ from .windows import Sets
 COUNTS_FULL_SCALE = 32767.0
 # Families of curves over temperature that are polynomials, of order 1, 2 and 3.
 _POLYNOMIALS = ('linear', 'quadratic', 'cubic')
-#: Groups of columns that the fit selects: the curve, the difference of the two sets, the response.
+#: Groups of columns that the fit selects: the curve, the difference of the two sets, the curves of
+#: the parts, the response.
 GROUPS = tuple(
     dict.fromkeys(
         (
             'curve',
             'set',
+            'part',
             *(column.group for column in bank(at_rest={'case': 1.0}, span_k=(-9.0, 9.0))),
         )
     )

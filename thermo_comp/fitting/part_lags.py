@@ -60,7 +60,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     noise = white_noise_of(data, start.scale)
     accepted = None
     for has_stress in (False, True):
-        # Every k-th window: some 500 are sufficient for a search, and 3000 to determine its result.
+        # Every k-th window: 500 of them are sufficient for a search, 3000 for its result.
         few, many, whole = (
             _PartCurves(windows, start, rows, has_stress=has_stress)
             for rows in (
@@ -158,8 +158,8 @@ class _PartCurves:
                 # The residual has a valley of several minima along a constant time constant less
                 # the time by which the temperature between board and case leads the board.
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
-                for first in (best, min(along, key=lambda lag: self._square(lag, axis))):
-                    first = first._replace(tau_s=max(first.tau_s, 15.0))
+                for near in (best, min(along, key=lambda lag: self._square(lag, axis))):
+                    first = near._replace(tau_s=max(near.tau_s, 15.0))
                     lags.append(self._searched(axis, first, (0.2, 0.0, 0.1)))
             best = self._better(axis, best, min(lags, key=lambda lag: self._square(lag, axis)))
         is_incomplete = self._is_of_use(best, axis, noise) and self._square(best, axis) > enough

@@ -89,7 +89,11 @@ def with_calibration(calibration: Calibration, regression: Regression, state: St
 
 
 def informative_priors(
-    calibration: Calibration, regression: Regression, state: State, sets: Sets, options: FitOptions
+    calibration: Calibration,
+    regression: Regression,
+    state: State,
+    model: Model,
+    options: FitOptions,
 ) -> list[InformativePrior]:
     """
     Return candidate priors from a calibration, which the fit compares by evidence.
@@ -129,7 +133,7 @@ def informative_priors(
     layout = regression.layout(regression.windows.parts)
     kinds = regression.forces.kinds if regression.forces else ()
     used = range(len(calibration.response))
-    to_file = file_parameters(regression, layout, state, sets, used, kinds)
+    to_file = file_parameters(regression, layout, state, model, used, kinds)
     mean = as_vector(state, layout)[: layout.n_unit]
     result = []
     for variances, share in tried:

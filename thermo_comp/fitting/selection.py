@@ -27,7 +27,7 @@ from .hyperparameters import (
 from .left_out import Score, gain, is_better, is_near, is_undecided, score_of
 from .regression import Posterior, Regression
 from .unknowns import InformativePrior, Prior, State
-from .windows import BEND, CURVE, SET, ThermalWindows
+from .windows import BEND, CURVE, PART, PART_SUMS, SET, ThermalWindows
 
 #: Smallest possible gain in log evidence of a group that is tried: odds of e^4 = 55 to one.
 TRIAL_GAIN = 4.0
@@ -84,9 +84,17 @@ class Fit(NamedTuple):
         return self.selected.posterior
 
 
-def _complete_rms(posterior: Posterior) -> float:
-    """Return the largest left-out drift of a model that lacks no column [m/s^2]."""
-    return 2.0 * float(posterior.prior.sigma.mean())
+def _is_complete(trial: Trial) -> bool:
+    """Whether noise explains the left-out drift of a model."""
+    return trial.score.rms <= 2.0 * float(trial.posterior.prior.sigma.mean())
+
+
+def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
+    """Return the last of the models that is better than those before."""
+    for trial in trials:
+        if is_better(chosen.score, trial.score):
+            chosen = trial
+    return chosen
 
 
 class Growth:
@@ -237,7 +245,11 @@ def select(
         downweigh(regression, curve.posterior)
         first = growth.extended(curve)
         trials.append(first)
-    chosen, more = _grown(growth, first, progress)
+    parts = None
+    if PART in growth.free:
+        # Curves over the temperatures of parts take the place of the curve over that of the board.
+        parts = better_beginning([growth.extended(fit, (PART,)) for fit in fits])
+    chosen, more = _grown(growth, first, parts, progress)
     trials += more
     if chosen is not constants and not is_better(constants.score, chosen.score):
         more_evidence = chosen.posterior.log_evidence - constants.posterior.log_evidence
@@ -249,20 +261,24 @@ def select(
 
 
 def _grown(
-    growth: Growth, first: Trial, progress: Callable[[float], None]
+    growth: Growth, first: Trial, parts: Trial | None, progress: Callable[[float], None]
 ) -> tuple[Trial, list[Trial]]:
-    """Add groups to the curve; return the best model and all that were tried."""
+    """
+    Add groups to the curve, or to the curves of parts; return the best model and all that were
+    tried.
+    """
     chosen, trials = first, []
-    if growth.regression.windows.has_part_lags:
-        # Groups of the curve of parts that lag the board: a polynomial in t - m, m the lag.
-        trials = growth.with_bends(first, ('board', 'product', 'square'))
-        for trial in trials:
-            if is_better(chosen.score, trial.score):
-                chosen = trial
+    if parts is not None:
+        trials = [parts, *growth.trials(parts, [BEND] if BEND in growth.free else [])]
+        chosen = _best(chosen, trials)
+    if growth.regression.windows.has_part_lags and not _is_complete(chosen):
+        more = growth.with_bends(first, PART_SUMS)
+        trials += more
+        chosen = _best(chosen, more)
     chosen, more = growth.added(chosen, progress)
     trials += more
     is_without_bends = BEND in growth.free and BEND not in chosen.groups
-    if is_without_bends and chosen.score.rms > _complete_rms(chosen.posterior):
+    if is_without_bends and not _is_complete(chosen):
         # A change of slope of a part is visible only in a model with the lag of this part, not in
         # a model whose products and squares approximate the lag. A model of bends is continued if
         # its drift is less than three times that of the chosen model.

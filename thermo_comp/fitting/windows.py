@@ -9,8 +9,10 @@ The thermal tracker of the compensator is run over the bags' readings, and the c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -22,13 +24,16 @@ from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Gradient, 
 from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats, Ints
 from ..unit.columns import Column, ColumnTable, Part, memory_of
-from ..unit.functions import TemperatureFunction
+from ..unit.functions import Polynomial, TemperatureFunction
 from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
 from .unknowns import Windows
 
-#: Groups of the columns of the curve, of the difference of the sets, and of bends.
-CURVE, SET, BEND = 'curve', 'set', 'bend'
+#: Groups of the columns of the curve, of the difference of the sets, of bends, and of the curves
+#: over the temperatures of parts.
+CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
+#: Groups whose columns, with those of the curve, are summed in a curve over a part's temperature.
+PART_SUMS = ('board', 'product', 'square')
 #: Smallest number of windows of a short rest: fewer do not determine its noise.
 FEWEST_WINDOWS = 20
 #: Number of sections of equal length in a position. The bags repeat the chamber's program, so a
@@ -55,6 +60,11 @@ class Sets:
         if not self.is_shared:
             static = [(1.0 - weight) * value for value in static]
         return [*static, weight, *(weight * value for value in dynamic)]
+
+    @property
+    def has_cubic(self) -> bool:
+        """Whether the curves that both sets share have the columns t, t^2 and t^3."""
+        return self.is_shared and isinstance(self.static, Polynomial) and self.static.n_free == 3
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
@@ -107,6 +117,46 @@ class Model:
                 for column in self.columns
             ]
         )
+
+    @cached_property
+    def part_curves(self) -> PartCurves:
+        """The curves over the temperatures of the parts; none without known parts or columns."""
+        n_curves = len(self.sets.groups)
+        none = PartCurves(np.zeros(0, np.int64), np.zeros(0, np.int64),
+                          np.zeros((0, n_curves + len(self.columns))))  # fmt: skip
+        if self.parts is None or not self.sets.has_cubic:
+            return none
+        places = {
+            (column.kind, column.power, column.part): n_curves + k
+            for k, column in enumerate(self.columns)
+        }
+        # Kinds of the columns of m, m^2 and m^3, m being the lag of the part.
+        of_lag = 'board', 'square', 'cube'
+        rows = []
+        for part in self.parts:
+            for power in (1, 2, 3):
+                # (t - m)^power, by the binomial theorem.
+                row = np.zeros(n_curves + len(self.columns))
+                row[power - 1] = 1.0
+                for k, kind in enumerate(of_lag[:power] if part.tau_s else (), 1):
+                    if (place := places.get((kind, power - k, part))) is None:
+                        return none
+                    row[place] = math.comb(power, k) * (-1.0) ** k
+                rows.append(row)
+        return PartCurves(np.repeat(range(3), 3), np.tile((1, 2, 3), 3), np.array(rows))
+
+
+class PartCurves(NamedTuple):
+    """
+    Curves over the temperature of the part of an axis: sums of columns, with one weight each.
+
+    axis, power: of each curve, shape (p,)
+    sums: factors of the columns of the sets and of the response, shape (p, m)
+    """
+
+    axis: Ints
+    power: Ints
+    sums: Floats
 
 
 class Track(NamedTuple):
@@ -280,6 +330,7 @@ def _rows(
 
 def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: Ints) -> Windows:
     """Make the data of the regression."""
+    curves = model.part_curves
     groups, columns, acts_on = model.sets.groups, model.columns, model.acts_on
     n_curves, lags = len(groups), Layout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 3]
@@ -291,6 +342,15 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     # Fc = 1 at the reference temperature in both regimes.
     in_scale = [*[True] * n_curves, *(column.term.has_scale for column in columns)]
     in_scale[model.sets.level] = False
+    start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
+    lag = np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64)
+    of_part = rows.columns @ curves.sums.T
+    # All columns of a curve that depend on a lag depend on that of the part.
+    lag_of_part = np.where(curves.sums != 0.0, lag, -1).max(axis=1, initial=-1)
+    # The largest slope of x^p is p |x|^(p - 1).
+    most = np.repeat(np.abs(of_part[:, ::3]).max(axis=0, initial=0.0), 3)
+    steepest = curves.power * most ** (curves.power - 1)
+    kelvins = np.sqrt(np.mean(of_part**2, axis=0)) / np.maximum(steepest, 1e-300)
     return Windows(
         position=position,
         bag=bag,
@@ -298,17 +358,21 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         time=rows.time,
         weight=rows.n_samples / float(np.median(rows.n_samples)),
         mean=rows.mean,
-        columns=rows.columns,
-        groups=(*groups, *(column.group for column in columns)),
-        lag=np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64),
-        kelvins=_kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient),
-        start=np.hstack((np.zeros((len(t), n_curves)), rows.start)),
+        columns=np.hstack((rows.columns, of_part)),
+        groups=(*groups, *(column.group for column in columns), *[PART] * len(curves.axis)),
+        lag=np.append(lag, lag_of_part),
+        kelvins=np.append(
+            _kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient), kelvins
+        ),
+        start=np.hstack((start, start @ curves.sums.T)),
         start_covariance=start_covariance(spec.lags),
-        in_scale=np.array(in_scale),
+        in_scale=np.append(in_scale, np.full(len(curves.axis), fill_value=True)),
         tilt=tilt[:, is_tilting] / tilt_rms[is_tilting],
         acts_on=None
         if acts_on is None
-        else np.vstack((np.ones((n_curves, 3), dtype=bool), acts_on)),
+        else np.vstack(
+            (np.ones((n_curves, 3), dtype=bool), acts_on, np.eye(3, dtype=bool)[curves.axis])
+        ),
     )
 
 

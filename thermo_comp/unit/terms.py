@@ -124,7 +124,11 @@ class Board(Term):
 
     kind, formula = 'board', 'T - lagged T'
     positive: ClassVar[_Names] = ('tau_s',)
-    groups: ClassVar[_Pairs] = (('board', 'parts that lag the board'),)
+    groups: ClassVar[_Pairs] = (
+        ('board', 'parts that lag the board'),
+        # A sum of the curve and of columns of `board`, `product` and `square`, for each axis.
+        ('part', 'curve of the part of each axis'),
+    )
 
     def source(self, column: Column) -> Quantity:
         """Return ``T_board - L_tau(T_board)``, or for a bend without lag the board's own."""
