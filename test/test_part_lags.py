@@ -19,13 +19,17 @@ from strangers_cases import (
     navigation,
     one_test,
     positions,
+    program,
     soaks,
     third_node,
 )
 from strangers_units import GRAVITY, UG, rng_of, spread
 
 from thermo_comp.fitting.priors import population
-from thermo_comp.unit.columns import FINE_TAUS
+from thermo_comp.fitting.windows import Model, Sets
+from thermo_comp.thermal.settings import DetectorSettings
+from thermo_comp.unit.columns import FINE_TAUS, Part, bank
+from thermo_comp.unit.functions import Polynomial
 
 HEADER = 'time_s,accel_x,accel_y,accel_z,temperature_board,temperature_case'
 PARTS_S = np.array([520.0, 910.0, 1400.0])
@@ -73,6 +77,39 @@ def test_a_part_between_board_and_case():
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert judged(calibration, study).norm < 2.0
+
+
+def test_bags_of_one_warm_up_predict_another():
+    # Thawed from a freezer, always alike: the board's temperature determines its lags.
+    thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
+    rng = rng_of('thaw')
+    unit = navigation(rng, part_s=PARTS_S / 4.0)
+    bags = positions(unit, thaw, spread(10, rng), rng)
+    held = positions(unit, program(-15.0, 10.0, (20.0, 20.0, 90.0)), spread(2, rng), rng)
+    study = Study('', bags, one_test(held), FULL_SCALE)
+    calibration = strangers.fitted(study)
+    assert {one.group for one in calibration.response if any(one.bias)} == {'part'}
+    # 0.65 ug is the noise of a mean of a minute.
+    assert judged(calibration, study).norm < 2.0
+
+
+def test_a_curve_over_a_part_is_a_sum_of_columns():
+    t, m = np.linspace(-15.0, 15.0, 7), np.linspace(4.0, -3.0, 7)
+    part = Part(900.0)
+    line = Polynomial((0.0, 1.0, 1.0, 1.0))
+    model = Model('response', Sets(line, Polynomial((0.0, 1.0, 1.0))), bank(parts=[part] * 3),
+                  ('case',), DetectorSettings(), 20.0, (part,) * 3)  # fmt: skip
+    columns = np.zeros((len(model.part_curves.sums[0]), len(t)))
+    columns[:3] = t, t**2, t**3
+    powers = {'board': 1, 'square': 2, 'cube': 3}
+    for k, column in enumerate(model.columns, len(columns) - len(model.columns)):
+        columns[k] = t**column.power * m ** powers.get(column.kind, 0)
+    curves = model.part_curves
+    for axis, power, row in zip(*curves, strict=True):
+        np.testing.assert_allclose(row @ columns, (t - m) ** power)
+        assert axis in (0, 1, 2)
+    without = replace(model, columns=tuple(one for one in model.columns if one.kind != 'cube'))
+    assert not len(without.part_curves.sums)
 
 
 def test_one_thermometer_is_sufficient():
