@@ -5,8 +5,9 @@ Owns the published uncertainty: the covariance of the fit, widened by what the d
 determine, and the lack of fit, the excess of the left-out errors over this covariance.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
-mixture of fits on a grid of this standard deviation. The weight of each fit is its evidence times
-a half-Student prior. The standard deviation of gravity is a common error of the scale factors.
+mixture of fits on a grid of this standard deviation. The weight of each fit is the evidence of the
+norms times a half-Student prior. The standard deviation of gravity is a common error of the scale
+factors.
 
 The lack of fit per regime and temperature is the mean square of the left-out drift less the
 published variance of this drift. The lack of fit covers effects that no column describes, such as
@@ -26,6 +27,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import LackOfFit
@@ -142,7 +144,7 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     # scale, and falling to 0 below a hundredth of the scale, which few mountings reach.
     density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
     density += np.log(np.minimum(grid / 0.01, 1.0))
-    weight = np.array([fit.log_evidence for fit in fits]) + density
+    weight = _norm_evidence(regression, posterior, tried) + density
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
@@ -152,6 +154,33 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
         difference = as_vector(fit.state, fit.layout)[:n] - mode
         covariance += share * (fit.covariance + np.outer(difference, difference))
     return covariance, float(np.sqrt(weight @ tried**2))
+
+
+def _norm_evidence(regression: Regression, posterior: Posterior, offset_sd: Floats) -> Floats:
+    """
+    Return the log evidence of the mean norms of the positions, for each sd of mountings, (k,).
+
+    Drifts are left out: with large mountings the attitudes could explain what a model lacks.
+    """
+    point, windows, prior = (
+        regression.at(posterior.state, posterior.prior),
+        regression.windows,
+        posterior.prior,
+    )
+    first, along, n = windows.edges[:-1], point.norms_by_unit, posterior.layout.n_unit
+    errors = np.linalg.norm(regression.force(posterior.state), axis=1)
+    sums = np.add.reduceat(
+        regression.weight[:, None] * np.column_stack((errors, errors**0)), first
+    )
+    errors = sums[:, 0] / sums[:, 1] - regression.norms(posterior.state) + along @ point.away[:n]
+    if prior.informative is None:
+        of_prior = along / np.sqrt(point.precision[:n])
+    else:
+        of_prior = solve_triangular(prior.informative.root, along.T, trans='T').T
+    noise = float(np.mean(prior.sigma**2)) * (1.0 / sums[:, 1] + prior.noise.ratio)
+    variances, vectors = np.linalg.eigh(of_prior @ of_prior.T + np.diag(noise))
+    variances = np.maximum(variances, noise.min()) + offset_sd[:, None] ** 2
+    return np.asarray(-0.5 * np.sum((vectors.T @ errors) ** 2 / variances + np.log(variances), 1))
 
 
 def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:

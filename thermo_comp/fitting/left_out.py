@@ -187,10 +187,6 @@ def _by_positions(
     """Leave out each position; return folds of drift and norm, corrected windows and drift."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point = regression.at(posterior.state, posterior.prior)
-    products = regression.products(point.layout.used)
-    means = point.tangent.of(
-        regression.at_starts(products.means[:, None], point.state, products.base)
-    )
     n_positions = windows.n_positions
     edges = windows.edges
     counts = np.diff(edges).astype(np.float64)
@@ -206,7 +202,7 @@ def _by_positions(
         if counts[p] >= _FEWEST_WINDOWS and is_known:
             drift[rows] = corrected - np.average(corrected, axis=0, weights=weight)
             squares[p] = np.average(np.mean(drift[rows] ** 2, axis=1), weights=weight)
-        if _is_norm_determined(point, posterior, means[p, :, 0], root, p):
+        if _is_norm_determined(point, posterior, root, p):
             force[rows] = corrected
             error = np.linalg.norm(corrected, axis=1) - sizes[p]
             norms[p] = np.average(error**2, weights=weight)
@@ -253,21 +249,11 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
     return _is_determined(by_others, by_all + noise)
 
 
-def _is_norm_determined(
-    point: Point, posterior: Posterior, means: Floats, root: Floats, p: int
-) -> bool:
-    """
-    Whether a fit without this position, with this root, determines its norm; `means`: derivatives
-    of its mean reading, see `Tangent.of`.
-    """
+def _is_norm_determined(point: Point, posterior: Posterior, root: Floats, p: int) -> bool:
+    """Whether a fit without this position, with this root, determines its norm."""
     if not point.regression.gravity:
         return False
-    state, layout = point.state, point.layout
-    on_axes = np.linalg.inv(state.inverse).T @ state.up[p] / state.kappa
-    along = np.zeros(layout.n_unit)
-    for axis in range(3):
-        places = layout.unit[axis, :-1]
-        along[places] += on_axes[axis] * means[axis, -1 - len(places) : -1]
+    along = point.norms_by_unit[p]
     by_all = float(np.sum((along @ posterior.root) ** 2)) + point.prior.offset_sd**2
     return _is_determined(float(np.sum((along @ root) ** 2)), by_all)
 

@@ -145,6 +145,22 @@ class Point:
         """The normal equations of the unit, those of positions and bags eliminated."""
         return self._reduced(self.normal)
 
+    @cached_property
+    def norms_by_unit(self) -> Floats:
+        """Derivatives of the mean norm of a reading, by the unit's unknowns, (n_positions, n)."""
+        regression, state, layout = self.regression, self.state, self.layout
+        products = regression.products(layout.used)
+        means = self.tangent.of(
+            regression.at_starts(products.means[:, None], state, products.base)
+        )[:, :, 0]
+        # The force along the axes of a reading, and the norm by these.
+        on_axes = state.up @ np.linalg.inv(state.inverse) / state.kappa
+        result = np.zeros((len(means), layout.n_unit))
+        for axis in range(3):
+            places = layout.unit[axis, :-1]
+            result[:, places] += on_axes[:, [axis]] * means[:, axis, -1 - len(places) : -1]
+        return result
+
     def _reduced(self, normal: Normal) -> Reduced:
         in_sigmas = normal.scaled(self.prior.sigma**-2.0)
         reduced = eliminate(in_sigmas, self.layout, self.precision, self.away)
