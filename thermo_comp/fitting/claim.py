@@ -37,6 +37,7 @@ from .regression import Posterior, Regression
 from .selection import LAGS, Fit
 from .start import within_positions
 from .unknowns import Layout, Prior, State
+from .windows import CURVE, PART
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,10 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     was almost constant is judged as if it had changed as much as the temperature.
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
-    inactive = regression.inactive(posterior, np.isin(groups, LAGS) & typical.any(axis=0))
+    may = np.isin(groups, LAGS) & typical.any(axis=0)
+    if not np.isin(groups[prior.column_sd.any(axis=0)], (CURVE, PART)).any():
+        may |= groups == CURVE
+    inactive = regression.inactive(posterior, may)
     seen = np.diag(inactive.S).reshape(-1, 3)
     seen = seen.sum(axis=1) / np.maximum((seen > 0.0).sum(axis=1), 1)
     sd = np.zeros_like(typical)
@@ -144,7 +148,14 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     # scale, and falling to 0 below a hundredth of the scale, which few mountings reach.
     density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
     density += np.log(np.minimum(grid / 0.01, 1.0))
-    weight = _norm_evidence(regression, posterior, tried) + density
+    # With large mountings the attitudes are free and could explain what the model lacks. So the
+    # evidence of an sd, relative to that of the mode, is at most the evidence of the norms alone.
+    evidence = np.array([
+        [fit.log_evidence for fit in fits],
+        _norm_evidence(regression, posterior, tried, fits[-1].root),
+    ])  # fmt: skip
+    nearest = int(np.argmin(np.abs(np.log(tried / prior.offset_sd))))
+    weight = (evidence - evidence[:, [nearest]]).min(axis=0) + density
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
@@ -156,28 +167,34 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     return covariance, float(np.sqrt(weight @ tried**2))
 
 
-def _norm_evidence(regression: Regression, posterior: Posterior, offset_sd: Floats) -> Floats:
+def _norm_evidence(
+    regression: Regression, posterior: Posterior, offset_sd: Floats, by_drifts: Floats
+) -> Floats:
     """
     Return the log evidence of the mean norms of the positions, for each sd of mountings, (k,).
 
-    Drifts are left out: with large mountings the attitudes could explain what a model lacks.
+    `by_drifts`: root of the unit's covariance if the norms are unknown, for the thermal weights
     """
-    point, windows, prior = (
-        regression.at(posterior.state, posterior.prior),
-        regression.windows,
-        posterior.prior,
-    )
-    first, along, n = windows.edges[:-1], point.norms_by_unit, posterior.layout.n_unit
-    errors = np.linalg.norm(regression.force(posterior.state), axis=1)
-    sums = np.add.reduceat(
-        regression.weight[:, None] * np.column_stack((errors, errors**0)), first
-    )
-    errors = sums[:, 0] / sums[:, 1] - regression.norms(posterior.state) + along @ point.away[:n]
+    prior, state, layout = posterior.prior, posterior.state, posterior.layout
+    point, first = regression.at(state, prior), regression.windows.edges[:-1]
+    along = point.norms_by_unit
+    weight = np.add.reduceat(regression.weight, first)
+    residual = regression.weight[:, None] * regression.residual(state, layout)
+    residual = np.add.reduceat(residual, first) / weight[:, None]
+    # Errors of the norms without offsets.
+    errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     if prior.informative is None:
-        of_prior = along / np.sqrt(point.precision[:n])
+        # The prior of the constants is almost flat; it is taken about the state.
+        weights = layout.axis[:, 2:].ravel()
+        constants = np.setdiff1d(np.arange(layout.n_unit), weights)
+        of_prior = np.hstack((
+            along[:, constants] / np.sqrt(point.precision[constants]),
+            along[:, weights] @ by_drifts[weights],
+        ))  # fmt: skip
     else:
+        errors += along @ point.away[: layout.n_unit]
         of_prior = solve_triangular(prior.informative.root, along.T, trans='T').T
-    noise = float(np.mean(prior.sigma**2)) * (1.0 / sums[:, 1] + prior.noise.ratio)
+    noise = float(np.mean(prior.sigma**2)) * (1.0 / weight + prior.noise.ratio)
     variances, vectors = np.linalg.eigh(of_prior @ of_prior.T + np.diag(noise))
     variances = np.maximum(variances, noise.min()) + offset_sd[:, None] ** 2
     return np.asarray(-0.5 * np.sum((vectors.T @ errors) ** 2 / variances + np.log(variances), 1))

@@ -145,6 +145,11 @@ class Point:
         """The normal equations of the unit, those of positions and bags eliminated."""
         return self._reduced(self.normal)
 
+    @property
+    def norm_by_axes(self) -> Floats:
+        """Derivatives of the norm of each position by the readings, shape (n_positions, 3)."""
+        return np.asarray(self.state.up @ np.linalg.inv(self.state.inverse) / self.state.kappa)
+
     @cached_property
     def norms_by_unit(self) -> Floats:
         """Derivatives of the mean norm of a reading, by the unit's unknowns, (n_positions, n)."""
@@ -153,12 +158,12 @@ class Point:
         means = self.tangent.of(
             regression.at_starts(products.means[:, None], state, products.base)
         )[:, :, 0]
-        # The force along the axes of a reading, and the norm by these.
-        on_axes = state.up @ np.linalg.inv(state.inverse) / state.kappa
         result = np.zeros((len(means), layout.n_unit))
         for axis in range(3):
             places = layout.unit[axis, :-1]
-            result[:, places] += on_axes[:, [axis]] * means[:, axis, -1 - len(places) : -1]
+            result[:, places] += (
+                self.norm_by_axes[:, [axis]] * means[:, axis, -1 - len(places) : -1]
+            )
         return result
 
     def _reduced(self, normal: Normal) -> Reduced:
