@@ -34,7 +34,7 @@ from ..unit.calibration import LackOfFit
 from .equations import as_vector
 from .hyperparameters import STUDENT_NU
 from .regression import Posterior, Regression
-from .selection import LAGS, Fit
+from .selection import LAGS, TRIAL_GAIN, Fit
 from .start import within_positions
 from .unknowns import Layout, Prior, State
 from .windows import CURVE, PART
@@ -149,13 +149,14 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
     density += np.log(np.minimum(grid / 0.01, 1.0))
     # With large mountings the attitudes are free and could explain what the model lacks. So the
-    # evidence of an sd, relative to that of the mode, is at most the evidence of the norms alone.
+    # drifts increase the evidence of an sd, relative to that of the mode, by at most `TRIAL_GAIN`.
     evidence = np.array([
         [fit.log_evidence for fit in fits],
         _norm_evidence(regression, posterior, tried, fits[-1].root),
     ])  # fmt: skip
     nearest = int(np.argmin(np.abs(np.log(tried / prior.offset_sd))))
-    weight = (evidence - evidence[:, [nearest]]).min(axis=0) + density
+    whole, norms = evidence - evidence[:, [nearest]]
+    weight = np.minimum(whole, norms + TRIAL_GAIN) + density
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
