@@ -73,7 +73,7 @@ def fit(
     misalignment. Parameters that the bags do not determine keep their prior
     and its uncertainty. Local gravity must be given.
 
-    Groups: curve, set, gradient, board, gradient_lag, product,
+    Groups: curve, set, part, gradient, board, gradient_lag, product,
     gradient_x_temperature, square, gradient_even, gradient_even_about_rest,
     play, bend. A group is kept if it improves the correction of data left
     out of the fit.
