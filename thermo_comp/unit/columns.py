@@ -14,8 +14,9 @@ Each group of the bank has the columns of the kind with the same name, except th
 *product* has the kind board, and *gradient_x_temperature* the kinds gradient and gradient_lag,
 times a power of temperature, for coefficients that change with temperature. *square* also has the
 kind cube, and *gradient_even* the kinds size and square. *part* has the kinds board, square and
-cube: with the curve they sum up to the curves over the temperatures of parts. *gradient_even_about_rest* has the
-columns of *gradient_even* as functions of the gradient less its value at rest.
+cube: with the curve they sum up to the curves over the temperatures of parts.
+*gradient_even_about_rest* has the columns of *gradient_even* as functions of the gradient less its
+value at rest.
 
 Tracker, fit, correction, covariance and file use this table.
 """
