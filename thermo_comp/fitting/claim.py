@@ -111,14 +111,17 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     was almost constant is judged as if it had changed as much as the temperature.
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
-    may = np.isin(groups, LAGS) & typical.any(axis=0)
-    if not np.isin(groups[prior.column_sd.any(axis=0)], (CURVE, PART)).any():
-        may |= groups == CURVE
+    active = groups[prior.column_sd.any(axis=0)]
+    # A model without any curve lacks that over the board's temperature. One attitude cannot tell
+    # the curve of a bias from that of a scale factor: powers that a curve lacks may be in it.
+    curves = [PART] * (PART in active) or [CURVE] * (CURVE not in active)
+    may = np.isin(groups, [*LAGS, *curves]) & typical.any(axis=0)
     inactive = regression.inactive(posterior, may)
     seen = np.diag(inactive.S).reshape(-1, 3)
     seen = seen.sum(axis=1) / np.maximum((seen > 0.0).sum(axis=1), 1)
     sd = np.zeros_like(typical)
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(seen, 1e-300))
+    sd = np.where(groups == PART, np.minimum(sd, typical), sd)
     for group in LAGS:
         # The lags of a group share one prior variance: their sum is bounded by that of one lag.
         is_lag = np.isin(groups, group) & (sd > 0.0)

@@ -307,7 +307,7 @@ class Regression(Equations):
         """Return sparsity and quality factors of inactive columns, (m,), at the mode."""
         point = self.at(posterior.state, posterior.prior)
         state, layout, sigma, n = point.state, point.layout, point.prior.sigma, point.layout.n_unit
-        part, column = np.nonzero(self.windows.parts & wanted & ~layout.used.any(axis=0))
+        part, column = np.nonzero(self.windows.parts & wanted & ~layout.used)
         if not len(column):
             return Inactive(part, column, np.zeros((0, 0)), np.zeros(0))
         base = self.products(layout.used).base

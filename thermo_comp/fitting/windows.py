@@ -9,7 +9,6 @@ The thermal tracker of the compensator is run over the bags' readings, and the c
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,6 +24,7 @@ from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats, Ints
 from ..unit.columns import Column, ColumnTable, Part, memory_of
 from ..unit.functions import Polynomial, TemperatureFunction
+from .part_curves import PartCurves, curves_of
 from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
 from .unknowns import Windows
@@ -121,42 +121,8 @@ class Model:
     @cached_property
     def part_curves(self) -> PartCurves:
         """The curves over the temperatures of the parts; none without known parts or columns."""
-        n_curves = len(self.sets.groups)
-        none = PartCurves(np.zeros(0, np.int64), np.zeros(0, np.int64),
-                          np.zeros((0, n_curves + len(self.columns))))  # fmt: skip
-        if self.parts is None or not self.sets.has_cubic:
-            return none
-        places = {
-            (column.kind, column.power, column.part): n_curves + k
-            for k, column in enumerate(self.columns)
-        }
-        # Kinds of the columns of m, m^2 and m^3, m being the lag of the part.
-        of_lag = 'board', 'square', 'cube'
-        rows = []
-        for part in self.parts:
-            for power in (1, 2, 3):
-                # (t - m)^power, by the binomial theorem.
-                row = np.zeros(n_curves + len(self.columns))
-                row[power - 1] = 1.0
-                for k, kind in enumerate(of_lag[:power] if part.tau_s else (), 1):
-                    if (place := places.get((kind, power - k, part))) is None:
-                        return none
-                    row[place] = math.comb(power, k) * (-1.0) ** k
-                rows.append(row)
-        return PartCurves(np.repeat(range(3), 3), np.tile((1, 2, 3), 3), np.array(rows))
-
-
-class PartCurves(NamedTuple):
-    """
-    Curves over the temperature of the part of an axis: sums of columns, with one weight each.
-
-    axis, power: of each curve, shape (p,)
-    sums: factors of the columns of the sets and of the response, shape (p, m)
-    """
-
-    axis: Ints
-    power: Ints
-    sums: Floats
+        parts = self.parts if self.sets.has_cubic else None
+        return curves_of(parts or (), self.columns, len(self.sets.groups))
 
 
 class Track(NamedTuple):
@@ -347,10 +313,6 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     of_part = rows.columns @ curves.sums.T
     # All columns of a curve that depend on a lag depend on that of the part.
     lag_of_part = np.where(curves.sums != 0.0, lag, -1).max(axis=1, initial=-1)
-    # The largest slope of x^p is p |x|^(p - 1).
-    most = np.repeat(np.abs(of_part[:, ::3]).max(axis=0, initial=0.0), 3)
-    steepest = curves.power * most ** (curves.power - 1)
-    kelvins = np.sqrt(np.mean(of_part**2, axis=0)) / np.maximum(steepest, 1e-300)
     return Windows(
         position=position,
         bag=bag,
@@ -362,7 +324,8 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         groups=(*groups, *(column.group for column in columns), *[PART] * len(curves.axis)),
         lag=np.append(lag, lag_of_part),
         kelvins=np.append(
-            _kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient), kelvins
+            _kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient),
+            curves.kelvins(of_part),
         ),
         start=np.hstack((start, start @ curves.sums.T)),
         start_covariance=start_covariance(spec.lags),

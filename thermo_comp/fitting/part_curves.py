@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the curves over the temperatures of parts: sums of columns with one weight each.
+
+The temperature of the part of an axis is ``x = t - m``, t being that of the board and m the lag of
+the part. By the binomial theorem x^p is a sum of the columns t^p, t^(p-1) m, ..., m^p, which the
+bank has. If all bags repeat one warm-up, t and m are functions of each other, and separate weights
+of these columns would not be those of the part.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..typing import Floats, Ints
+from ..unit.columns import Column, Part
+
+#: Highest power of x.
+ORDER = 3
+#: Kinds of the columns of m, m^2 and m^3.
+_OF_LAG = 'board', 'square', 'cube'
+
+
+class PartCurves(NamedTuple):
+    """
+    The curves over the temperatures of the parts of some axes.
+
+    axis, power: of each curve, shape (p,)
+    sums: factors of the columns of the sets and of the response, shape (p, m)
+    """
+
+    axis: Ints
+    power: Ints
+    sums: Floats
+
+    def kelvins(self, values: Floats) -> Floats:
+        """Return the temperature change that corresponds to the RMS of each curve [K]."""
+        # The largest slope of x^p is p |x|^(p - 1).
+        most = np.repeat(np.abs(values[:, ::ORDER]).max(axis=0, initial=0.0), ORDER)
+        steepest = self.power * most ** (self.power - 1)
+        rms = np.sqrt(np.mean(values**2, axis=0))
+        return np.asarray(rms / np.maximum(steepest, 1e-300))
+
+
+def curves_of(parts: Sequence[Part], columns: Sequence[Column], n_curves: int) -> PartCurves:
+    """
+    Return the curves over the temperature of the part of each axis; none if a column is missing.
+
+    `n_curves`: number of the columns of the sets, which begin with t, t^2 and t^3
+    """
+    places = {
+        (column.kind, column.power, column.part): n_curves + k for k, column in enumerate(columns)
+    }
+    rows = []
+    for part in parts:
+        for power in range(1, ORDER + 1):
+            row = np.zeros(n_curves + len(columns))
+            row[power - 1] = 1.0
+            for k, kind in enumerate(_OF_LAG[:power] if part.tau_s else (), 1):
+                if (place := places.get((kind, power - k, part))) is None:
+                    return curves_of((), columns, n_curves)
+                row[place] = math.comb(power, k) * (-1.0) ** k
+            rows.append(row)
+    axes, powers = range(len(parts)), range(1, ORDER + 1)
+    return PartCurves(
+        np.repeat(np.array(axes, np.int64), ORDER),
+        np.tile(np.array(powers, np.int64), len(parts)),
+        np.array(rows).reshape(-1, n_curves + len(columns)),
+    )
