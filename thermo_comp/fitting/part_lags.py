@@ -60,17 +60,17 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     noise = white_noise_of(data, start.scale)
     accepted = None
     for has_stress in (False, True):
+
+        def curves(n_windows: int, *, has_stress: bool = has_stress) -> _PartCurves:
+            rows = slice(None, None, max(len(data.time) // n_windows, 1))
+            return _PartCurves(windows, start, rows, has_stress=has_stress)
+
         # Every k-th window: 500 of them are sufficient for a search, 3000 for its result.
-        few, many, whole = (
-            _PartCurves(windows, start, rows, has_stress=has_stress)
-            for rows in (
-                slice(None, None, max(len(data.time) // n, 1)) for n in (500, 3000, 10**9)
-            )
-        )
-        lags = few.lags(noise)
-        if lags is None:
+        searched = curves(500).lags(noise)
+        if searched is None:
             continue
-        lags = [many.near(lag, axis) for axis, lag in enumerate(lags)]
+        many, whole = curves(3000), curves(len(data.time))
+        lags = [many.near(lag, axis) for axis, lag in enumerate(searched)]
         residual = np.column_stack([whole.residual(lag, axis) for axis, lag in enumerate(lags)])
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
