@@ -39,6 +39,8 @@ from strangers_units import GRAVITY, REFERENCE_C, UG, Bag, Floats, rng_of
 import thermo_comp
 from thermo_comp import CompensatorConfig
 from thermo_comp.fitting import FitOptions
+from thermo_comp.unit.calibration import parameter_layout
+from thermo_comp.unit.posterior import Posterior
 
 #: Options of the models by the package: the fit, and two baselines beside constants and cubic.
 PACKAGE: dict[str, dict[str, Any]] = {
@@ -137,8 +139,8 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
     forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
-        # The constants of a pose cancel in its drift. The variance of these constants is taken to
-        # be the smallest variance in the pose, where the curve over temperature adds nothing.
+        # The offset of a new mounting is constant in a pose and cancels in its drift: subtract the
+        # smallest variance, that at the reference, where the curve over temperature adds nothing.
         variances = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
         sd = np.sqrt(np.concatenate(
             [v - v.min(axis=0) + out.white for v, out in zip(variances, outs, strict=True)]
@@ -211,12 +213,32 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     )
 
 
+def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calibration:
+    """
+    Return a calibration whose covariance has no constants: bias, scale and misalignment.
+
+    One pose determines the constants to 50 mg only. They cancel in its drift, but not in a
+    difference of two variances: ``a^2`` times the variance of a scale factor has the noise of `a`.
+    """
+    if calibration.posterior is None:
+        return calibration
+    layout, posterior = parameter_layout(calibration), calibration.posterior
+    matrix, variances = posterior.matrix.copy(), posterior.variances.copy()
+    blocks = (*layout.bias, *layout.scale)
+    constants = [place for block in blocks for place in (block.static, block.dynamic)]
+    constants += range(layout.misalignment, layout.n_parameters)
+    matrix[constants], variances[constants] = 0.0, 0.0
+    return replace(calibration, posterior=Posterior.of(matrix, variances))
+
+
 def scored(
     study: Study, model: thermo_comp.Calibration, tests: dict[str, list[Minutes]]
 ) -> dict[str, Score]:
     """Score a calibration on each set of held-out bags."""
     if study.bound is not None:
         return {'': bias_score(model, study)}
+    if study.is_drift:
+        model = without_constants(model)
     return {
         test: score([corrected(model, bag) for bag in study.tests[test]], bags,
                     is_drift=study.is_drift)

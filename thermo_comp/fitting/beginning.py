@@ -29,7 +29,7 @@ from .start import (
     white_noise_of,
     within_positions,
 )
-from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State
+from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State, Windows
 from .windows import CURVE, ThermalWindows
 
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
@@ -62,6 +62,8 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
         # the supports have 2 P. Below 6 attitudes a tilt cannot be distinguished from a drift of
         # the unit. In the paper's model tilts would absorb the errors of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
+    if known is None and _has_soaks_only(windows):
+        data = _at_rest(data)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
@@ -88,6 +90,25 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     wide = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=wide))
     return Fit(windows, regression, selected, candidates.typical)
+
+
+def _has_soaks_only(windows: ThermalWindows) -> bool:
+    """Whether no position has more than 1 % of the change of the temperature (RMS)."""
+    t, position = windows.temperature, windows.data.position
+    within = within_positions(t[:, None], position)[:, 0]
+    square = np.bincount(position, within**2) / np.bincount(position)
+    return bool(square.max() < 1e-4 * np.var(t))
+
+
+def _at_rest(data: Windows) -> Windows:
+    """
+    Return the windows with columns that are constant in each position.
+
+    A lag of unknown size changes the readings of a soak by as much as the rest of the temperature
+    does. Their drift does not determine the curve, but the norms of the positions do.
+    """
+    means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
+    return replace(data, columns=means[data.position], start=np.zeros_like(data.start))
 
 
 def initial_state(regression: Regression, start: ConstantCalibration, up: Floats) -> State:

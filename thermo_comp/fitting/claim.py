@@ -111,6 +111,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     was almost constant is judged as if it had changed as much as the temperature.
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
+    kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
     # A model without any curve lacks that over the board's temperature. One attitude cannot tell
     # the curve of a bias from that of a scale factor: powers that a curve lacks may be in it.
@@ -122,13 +123,19 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     sd = np.zeros_like(typical)
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(seen, 1e-300))
     sd = np.where(groups == PART, np.minimum(sd, typical), sd)
-    for group in LAGS:
-        # The lags of a group share one prior variance: their sum is bounded by that of one lag.
-        is_lag = np.isin(groups, group) & (sd > 0.0)
-        share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
-        sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
+    if CURVE in active:
+        # The effect of a lag is that of the curve at a delayed temperature, so the largest slope
+        # of the curve limits it (RMS of the three axes).
+        is_curve = (groups == CURVE) & (kelvins > 0.0)
+        steepest = posterior.state.weights[:, :, is_curve] / kelvins[is_curve]
+        slopes = np.sqrt(np.mean(np.sum(steepest**2, axis=2), axis=1))
+        of_curve = np.outer(slopes, kelvins)
+        typical = np.where(np.isin(groups, LAGS), np.minimum(typical, of_curve), typical)
+    # All lags together have at most the effect of one lag: they share its prior variance.
+    is_lag = np.isin(groups, LAGS) & (sd > 0.0)
+    share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
+    sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    kelvins = regression.windows.kelvins
     # A column counts as constant if it changed by less than 1 % of the change of temperature.
     is_constant = kelvins < 0.01 * float(kelvins[0])
     ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)

@@ -151,6 +151,28 @@ class Growth:
         smooth = self.extended(before, more, typical)
         return [smooth, *(self.trials(smooth, [BEND]) if BEND in self.free else [])]
 
+    def lowest_degree(self, constants: Trial) -> Trial:
+        """
+        Fit the curve with its first column, then with more of them as long as each is likelier by
+        `TRIAL_GAIN`: norms alone are explained by many curves.
+        """
+        prior = replace(
+            constants.posterior.prior, offset_sd=constants.posterior.prior.offset_scale
+        )
+        typical, state = self._candidates.typical, constants.posterior.state
+        number = np.cumsum(self._names == CURVE)
+        curves = [
+            self.fit(
+                (*constants.groups, CURVE), state, prior, np.where(number <= degree, typical, 0.0)
+            )
+            for degree in range(1, int(number[-1]) + 1)
+        ]
+        chosen = curves[0]
+        for curve in curves[1:]:
+            if log_density(curve.posterior) - log_density(chosen.posterior) > TRIAL_GAIN:
+                chosen = curve
+        return chosen
+
     def trials(self, chosen: Trial, absent: list[str]) -> list[Trial]:
         """Fit the chosen model plus each group with a large possible gain in log evidence."""
         if not absent:
@@ -241,9 +263,12 @@ def select(
     trials = [constants]
     if CURVE in growth.free:
         # The curve is added without a test: it may improve the score only with other groups.
-        curve = better_beginning([growth.extended(fit, (CURVE,)) for fit in fits])
-        downweigh(regression, curve.posterior)
-        first = growth.extended(curve)
+        if regression.windows.has_drifts:
+            curve = better_beginning([growth.extended(fit, (CURVE,)) for fit in fits])
+            downweigh(regression, curve.posterior)
+            first = growth.extended(curve)
+        else:
+            first = growth.lowest_degree(constants)
         trials.append(first)
     parts = None
     if PART in growth.free:

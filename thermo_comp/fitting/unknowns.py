@@ -87,6 +87,12 @@ class Windows:
         every = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
         return np.where(every.T, 1.0, 1e-6)
 
+    @cached_property
+    def has_drifts(self) -> bool:
+        """Whether a column changes within a position."""
+        same = self.position[1:] == self.position[:-1]
+        return bool(np.diff(self.columns, axis=0)[same].any())
+
     @property
     def n_sections(self) -> int:
         """Number of program sections."""
