@@ -66,13 +66,13 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     has_choice = has_case and options.prior is None and options.detector is None
     if not has_choice or not _may_have_sets(fit.selected):
         return fit
-    # The alternative detector ends the dynamic regime once the case temperature is constant, and
-    # not only once those of case and board are. Only models with two sets depend on the regime.
+    # The alternative detector ends the dynamic regime once the case temperature is constant; the
+    # default also waits for the board temperature. Only models with two sets depend on the regime.
     model = fit.windows.model
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
     other = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves of the program limit the number of columns; here both models have the same.
+    # Left-out halves of the program limit the number of columns, which is equal in both models.
     return other if is_better(fit.selected.score, other.selected.score, by_halves=False) else fit
 
 

@@ -60,7 +60,7 @@ def build_calibration(
     """
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
-    # Response columns that are in use, or that only the covariance has.
+    # Response columns with a weight, or with an entry in the covariance alone.
     used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_parameters(regression, layout, state, model, used, kinds)
@@ -149,7 +149,7 @@ def _valid_columns(
                 # any value.
                 most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
-        # Columns that occur in the curves of parts alone have their group.
+        # A column that is used only in the curves of parts gets the group of these curves.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if known is None else union((valid, column.range))
         result.append(replace(column, group=group, range=valid))

@@ -145,7 +145,8 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
 
     The effect of such a lag is nearly collinear with the curve, and its final value would be
-    extrapolated. No model has these columns; the covariance has the linear ones, see `claim`.
+    extrapolated. No model uses such columns; those linear in temperature enter the covariance, see
+    `claim`.
     """
     data = windows.data
     longest_s = float(data.age.max())
@@ -193,7 +194,8 @@ def _candidates(
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
     if data.n_positions >= POSITIONS_NEEDED:
-        # Rests of one temperature each show the drift as differences between their norms.
+        # If each rest has one temperature, the drift appears as a difference between the rests'
+        # norms.
         force = (position_means(data) - start.bias) / start.scale
         sizes = sizes_of(windows, options)
         errors = np.linalg.norm(force, axis=1) - sizes

@@ -45,9 +45,9 @@ class Claim:
     """
     The published uncertainty of a unit.
 
-    layout: places of the unknowns of the fit and of the columns that only the covariance has
+    layout: places of the unknowns of the fit and of the columns in the covariance alone
     covariance: of the unit's own unknowns, shape (n_unit, n_unit)
-    offset_sd: standard deviation of a new mounting or turn-on [m/s^2]
+    offset_sd: sd of the bias offset of a new mounting or turn-on [m/s^2]
     """
 
     layout: Layout
@@ -65,7 +65,7 @@ def claim_of(
     Return the published covariance of the fit of the chosen model.
 
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
-    do not determine are added to the covariance; `gravity_sd`: [m/s^2]
+    do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2]
     """
     prior = chosen.prior
     posterior = regression.solve(chosen.state, prior, n_steps=0)
@@ -103,17 +103,18 @@ def _places(layout: Layout, wider: Layout) -> Ints:
 
 def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) -> Prior:
     """
-    Add unseen columns to the prior, so that the covariance does not state that they are 0.
+    Add columns that the data do not determine to the prior, so that their variance is not 0.
 
     An inactive column is consistent with 0, but the data bound it only to ``1 / sqrt(S)``, S being
     its information given the active columns. If this bound exceeds two standard deviations of a
-    window's noise, the column enters the covariance with this sd and zero weight. A column that
-    was almost constant is judged as if it had changed as much as the temperature.
+    window's noise, the column enters the covariance with this sd and zero weight. For a column
+    that was almost constant, the bound is scaled to the change of temperature.
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     active = groups[prior.column_sd.any(axis=0)]
-    # A model without any curve lacks that over the board's temperature. One attitude cannot tell
-    # the curve of a bias from that of a scale factor: powers that a curve lacks may be in it.
+    # In a model without any curve the unseen curve is that over the board's temperature. From one
+    # attitude the curves of bias and scale factor cannot be separated: each may have powers that
+    # the curve of a part lacks.
     curves = [PART] * (PART in active) or [CURVE] * (CURVE not in active)
     may = np.isin(groups, [*LAGS, *curves]) & typical.any(axis=0)
     inactive = regression.inactive(posterior, may)
@@ -151,8 +152,9 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     # scale, and falling to 0 below a hundredth of the scale, which few mountings reach.
     density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
     density += np.log(np.minimum(grid / 0.01, 1.0))
-    # With large mountings the attitudes are free and could explain what the model lacks. So the
-    # drifts increase the evidence of an sd, relative to that of the mode, by at most `TRIAL_GAIN`.
+    # A large mounting sd leaves the attitudes free to absorb errors of the model. Therefore the
+    # drifts may increase the log evidence of an sd, over that of the mode, by at most
+    # `TRIAL_GAIN`.
     evidence = np.array([
         [fit.log_evidence for fit in fits],
         _norm_evidence(regression, posterior, tried, fits[-1].root),
@@ -177,7 +179,8 @@ def _norm_evidence(
     """
     Return the log evidence of the mean norms of the positions, for each sd of mountings, (k,).
 
-    `by_drifts`: root of the unit's covariance if the norms are unknown, for the thermal weights
+    `by_drifts`: root of the unit's covariance without information from the norms; the covariance
+        of the thermal weights is taken from it
     """
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     point, first = regression.at(state, prior), regression.windows.edges[:-1]
@@ -188,7 +191,7 @@ def _norm_evidence(
     # Errors of the norms without offsets.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     if prior.informative is None:
-        # The prior of the constants is almost flat; it is taken about the state.
+        # The prior of the constants is almost flat, so it is centred on the state.
         weights = layout.axis[:, 2:].ravel()
         constants = np.setdiff1d(np.arange(layout.n_unit), weights)
         of_prior = np.hstack((

@@ -107,7 +107,7 @@ class Reduced:
     The normal equations of the unit's n unknowns, with all others eliminated.
 
     layout: places of the unknowns
-    starts_prior: precision of the initial lag states, and this times their value, (2, n_bags, r)
+    starts_prior: precision of the initial lag states, and precision times state, (2, n_bags, r)
     matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
     positions: the blocks of the positions; the initial lag states of the bag, then the unknowns of
         the unit remain
@@ -145,7 +145,7 @@ class Reduced:
         return replace(self, common=Blocks.of(block, cross))
 
     def follow(self, step: Floats) -> tuple[Floats, Floats]:
-        """Return the steps of the unknowns of positions and bags, given that of the unit."""
+        """Return the steps of the unknowns of positions and bags, given the step of the unit's."""
         r, solved = len(self.bags.root[0]), self.positions.solved
         starts = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
         if self.common is not None:
@@ -157,8 +157,9 @@ class Reduced:
 
     def variances(self, root: Floats) -> tuple[Floats, Floats]:
         """
-        Return the variances of the unknowns of positions and bags, given an upper triangular root
-        of the covariance of the unit's, without the prior on the sum of the initial lag states.
+        Return the variances of the unknowns of positions and bags, without the prior on the sum of
+        the initial lag states; `root`: upper triangular root of the covariance of the unit's
+        unknowns.
         """
         bag, r, solved = self.layout.bag, len(self.bags.root[0]), self.positions.solved
         by_unit, by_starts = self.bags.solved[..., :-1], solved[..., :r]

@@ -139,7 +139,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
     positions, sections, norms = _gains(before, after)
     drift = [gain for gain in (positions, sections) if gain]
-    # The RMS error of halves may rise by a quarter: that of two folds scatters by about as much.
+    # The RMS error of the two halves may rise by a quarter, which is about its scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
         return 0.0

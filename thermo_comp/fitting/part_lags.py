@@ -7,7 +7,7 @@ The bias and the scale factor of an axis are modelled as functions of ``x = t - 
 temperature of one part of the unit: t is the board temperature less the reference temperature, and
 m = T - L(T + v g) the difference between the board temperature T and that of the part. The part
 lags a temperature between board and case: that of the board plus the share v of the gradient g.
-The lag has one stage or, where a part hangs on another part, two stages in series. The time
+The lag has one stage or, for a part that is heated through another part, two in series. The time
 constants and v minimise the RMS residual of a spline of the bias and a cubic of the scale factor,
 both over x.
 """
@@ -91,8 +91,8 @@ class _PartCurves:
     Bias and scale factor of each axis as functions of x (see the module), for any lags.
 
     `rows`: the windows that are used
-    `has_stress`: whether both also depend on m, by a coefficient that is linear in x: the stress
-        between a part and the board
+    `has_stress`: whether bias and scale also depend on m, by a coefficient that is linear in x:
+        the stress between a part and the board
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class _PartCurves:
         ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
         knots = _even(np.append(0.0, self._taus))
         self._ratio = CubicSpline(knots, ratios, axis=1)
-        # Likewise the lag of the gradient, whose limit is the gradient.
+        # The lag of the gradient is interpolated likewise; its limit at tau = 0 is the gradient.
         of_case = [
             [c.group == 'gradient_lag' and c.tau_s == tau and c.sensor == 'case' for c in columns]
             for tau in self._taus

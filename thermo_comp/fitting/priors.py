@@ -3,10 +3,10 @@
 """
 Owns informative priors: an earlier calibration of the unit, or the population of its type.
 
-Such a prior is a calibration: a mean and a covariance of all parameters. A population has the mean
+An informative prior is a calibration: mean and covariance of all parameters form the Gaussian
+prior of the regression, which has the calibration's columns. For a population these are the mean
 and the scatter over units of the parameters relative to the scale factors. The covariance of an
-earlier calibration of the unit is increased by the ageing of the unit. The calibration is the
-Gaussian prior of the regression, and its columns are those of the regression.
+earlier calibration of the unit is increased by the ageing of the unit.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ def informative_priors(
     """
     Return candidate priors from a calibration, which the fit compares by evidence.
 
-    The fit begins with the last one, the widest. FitError if the calibration has no covariance.
+    The last candidate is the widest; the fit begins with it. FitError if the calibration has no
+    covariance.
     """
     if calibration.posterior is None:
         raise FitError('the prior has no covariance: an imported calibration cannot be a prior')

@@ -173,9 +173,9 @@ def reduce_source(
     Stream one source and keep its sufficient statistics.
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
-    3 s, or less if shorter rests determine bias and scale better; the largest
-    variance of a rest is chosen in the same way. A cell has `least` samples, or 5 if the samples
-    are slow and the unit rarely rests as long.
+    3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
+    is chosen in the same way. A cell has `least` samples, or 5 if the samples are slow and most
+    rests are shorter than a cell.
     """
     reading = _Pass(source, CellAccumulator(min(cell_s, window_s), full_scale, window_s, least))
     # The norms at rest choose the thresholds only if they are those of gravity.
@@ -255,12 +255,12 @@ def _with_shorter_cells(
     rests are lost.
     """
     if share < 0.95 and source.force is None:
-        # The rests are interrupted: shorter cells must add 5 % of the bag.
+        # For interrupted rests: shorter cells are used if they add 5 % of the bag.
         shorter = reduced(least=10)
         if shorter.n_still_cells / shorter.n_cells > share + 0.05:
             return shorter
     if share < 0.5:
-        # The rests are short: shorter cells must show six attitudes.
+        # For short rests: shorter cells are used if they show six attitudes.
         shorter = reduced(least=5)
         means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
         means = means.reshape(-1, 3)

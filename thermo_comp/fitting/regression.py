@@ -135,8 +135,8 @@ class Point:
     def _common_variance(self) -> float:
         """
         Prior variance of the sum over the bags of an initial lag state. The sd of the mean over
-        the bags is 0.1 of the sd of one bag: a non-zero mean is a response of the unit, which
-        other initial states would show as well.
+        the bags is 0.1 of the sd of one bag: a mean that is not 0 is an effect of the unit, not of
+        the bags' initial states.
         """
         return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_share
 

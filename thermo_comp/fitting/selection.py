@@ -199,11 +199,10 @@ class Growth:
 
 def better_beginning(fits: Sequence[Trial]) -> Trial:
     """
-    Choose between fits begun with small and with large mountings: the one better on left-out data.
-
-    If neither is better, the large mountings must be likelier by `TRIAL_GAIN`. Both fits explain
-    the norms of few positions, one by mounting offsets, the other by misalignments; only
-    misalignments predict the norm of another position.
+    Choose the fit that is better on left-out data: begun with a small or with a large prior sd of
+    mounting offsets. If neither is better, the large sd must be likelier by `TRIAL_GAIN`. Both
+    fits explain the norms of few positions, one by mounting offsets, the other by misalignments;
+    only misalignments predict the norm of another position.
     """
     small, *others = fits
     for large in others:

@@ -312,14 +312,14 @@ def lay_out(
     bag_of_position: Ints,
     n_tilts: int,
     n_starts: int,
-    bends: Bools,
+    active: Bools,
     forces: Forces | None = None,
 ) -> Layout:
     """
     Assign a place to every unknown.
 
-    `used`: active columns of bias and scale, shape (2, m); `bends`: active nonlinear coefficients,
-    shape (2 k,)
+    `used`, `active`: active columns of bias and scale, shape (2, m), and active nonlinear
+    coefficients, shape (2 k,)
     """
     n = 0
 
@@ -330,11 +330,11 @@ def lay_out(
         return np.arange(n - size, n).reshape(shape)
 
     n_linear = 2 + int(used.sum())
-    axis = take(3, n_linear + int(bends.sum()))
+    axis = take(3, n_linear + int(active.sum()))
     weights = np.full((2, 3, used.shape[1]), -1)
     weights.transpose(1, 0, 2)[:, used] = axis[:, 2:n_linear]
-    nonlinear = np.full((3, len(bends)), -1)
-    nonlinear[:, bends] = axis[:, n_linear:]
+    nonlinear = np.full((3, len(active)), -1)
+    nonlinear[:, active] = axis[:, n_linear:]
     radius = take(int(forces is not None and forces.radius_sd > 0.0))
     misalignment = take(3)
     n_unit = n

@@ -29,8 +29,8 @@ from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
 from .unknowns import Windows
 
-#: Groups of the columns of the curve, of the difference of the sets, of bends, and of the curves
-#: over the temperatures of parts.
+#: Groups of columns: the curve, the difference of the sets, bends (changes of slope at a
+#: temperature), and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
 #: Groups whose columns, with those of the curve, are summed in a curve over a part's temperature.
 PART_SUMS = ('board', 'product', 'square')
@@ -311,7 +311,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
     lag = np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64)
     of_part = rows.columns @ curves.sums.T
-    # All columns of a curve that depend on a lag depend on that of the part.
+    # The columns of a curve over a part's temperature have at most one lag, that of the part.
     lag_of_part = np.where(curves.sums != 0.0, lag, -1).max(axis=1, initial=-1)
     return Windows(
         position=position,
