@@ -107,7 +107,8 @@ class ChangeDetector:
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
         """
         Take the sensor's last used reading. The baseline follows the rate at a relative speed
-        `pace`: 1 in a soak, 0 in a ramp. Returns the sign of the departure from it, 0 = none.
+        `pace`: 1 in a soak, 0 in a ramp. Returns the sign of the rate's departure from the
+            baseline, 0 = none.
         """
         stamp = self._stamp_ns
         dt = 0.0 if stamp is None else (stamp_ns - stamp) * 1e-9

@@ -12,8 +12,8 @@ series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighte
 two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 
 A part may also exchange heat with both the board and another part, at a sensor s: it lags the
-temperature ``T + v g`` between them, with ``g = T_s - T``. Its lag is that of the board less v
-times the lag of the gradient.
+temperature ``T + v g`` between them, with ``g = T_s - T``. The lag of this part is that of the
+board less v times the lag of the gradient.
 """
 
 import math
@@ -222,7 +222,7 @@ class LagBank:
         for variance, e, tau in zip(self.extra, decays, self.taus, strict=True):
             grown = variance
             if dt > SPARSE_SHARE * tau:
-                # The input may have changed at any time between readings this far apart.
+                # Between readings far apart, the time at which the input changed is unknown.
                 grown += (change * (1.0 - e)) ** 2
             if sd:
                 # The error is the same from step to step: deviations add, not variances.

@@ -308,7 +308,7 @@ def mix(state: State, other: State, share: float) -> State:
 
 
 def predict(state: State, dt: float, lag: float, power: float) -> State:
-    """Carry a state over `dt` [s]; acceleration: decay `lag` [s], noise `power` [K^2/s^5]."""
+    """Predict a state `dt` [s] later; acceleration: decay `lag` [s], noise `power` [K^2/s^5]."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     half = 0.5 * dt * dt
     decay = 1.0 / (1.0 + dt / lag)

@@ -195,7 +195,8 @@ def bank(
     columns += _family('square', ['cube'], lags=coarse)
     even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
     even += _family('gradient_even', ['size', 'square'], sensors, (0, 1, 2))
-    # A heat pump's load is even in the heat flow; the effect of a change is even about rest.
+    # A heat pump's load is even in the heat flow; the effect of a temperature change is even about
+    # the gradient at rest.
     rest = at_rest or {}
     columns += even + [
         replace(column, group='gradient_even_about_rest', rest_k=rest[column.sensor])
@@ -294,7 +295,7 @@ class ColumnTable:
             for term in dict.fromkeys(terms.tolist())
             if term.form is not LINE
         ]
-        # Temperatures of parts are made of two numbers of a state.
+        # The temperature of a part is the difference of two numbers of a state.
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
 

@@ -32,12 +32,14 @@ GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
 #: Number of board temperatures at which curves and differences of the sets are evaluated.
 _GAP_TEMPERATURES = 33
-#: Variance of rounding [counts^2]: twice 1/12, as the converter carries the remainder on.
+#: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
+#: cycle.
 ROUNDING_VARIANCE = 1.0 / 6.0
 #: Smallest noise variance of a message / largest variance of any axis: keeps the covariance
 #: positive definite in spite of rounding; far below the noise of any instrument.
 _LEAST_SHARE = 1e-13
-#: Largest number accepted in a line: corrected samples of smaller numbers do not overflow.
+#: Largest number accepted in a result of `Correction.line`: with smaller numbers the corrected
+#: samples do not overflow.
 _LARGEST = 1e140
 #: Number of states from which one call per column costs less than a table of all sums.
 _FEW = 64
@@ -58,7 +60,7 @@ class Correction:
     """
     Both sets of a calibration, blended by the weight of the thermal state, and its response.
 
-    memory: memory that the tracker needs for force and angular rate, or the memory it has
+    memory: memory that the tracker needs for force and angular rate, or the tracker's memory
     noise: noise variance of one message per axis, rounding included [m^2/s^4]
     noise_trace: the sum of `noise`
     misalignment: yx, zx, zy of M and their variances; with a nonlinearity then its constants
@@ -166,7 +168,9 @@ class Correction:
         )
 
     def felt(self, slopes: Floats) -> Floats:
-        """Differentiate bias and relative scale by `Layout.pairs`, (p, 6, n), by those of phi."""
+        """
+        Differentiate bias and relative scale by `Layout.pairs`, (p, 6, n), given `slopes` of phi.
+        """
         columns = self._felt_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))
         if len(columns):
