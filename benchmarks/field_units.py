@@ -123,7 +123,7 @@ def measured(force: Floats, warmth: Floats, state: Floats) -> Floats:
 
 
 def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Return the force that counts [K] mean to a file with deviations `state`."""
+    """Correct counts [K] with a calibration file of deviations `state`."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray((counts - bias) / scale @ M.T)
 

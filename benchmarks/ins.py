@@ -6,12 +6,12 @@ Owns the position error of an inertial navigator due to accelerometer drift, raw
 A platform stands in the chamber of the held-out bag, so that any motion that its navigator
 computes is an error. The navigator levels itself for five minutes, then navigates freely for half
 an hour; or it gets a zero-velocity update (ZUPT) every minute, and then coasts for five minutes.
-A flight of either kind begins in every minute of the run, with the raw accelerometer, with one set
+One flight of each kind begins in every minute of the run, with the raw accelerometer, with one set
 of coefficients, and compensated.
 
 The gyroscopes are ideal and the Earth does not rotate, so that only the accelerometer matters; the
-vertical channel, which needs a barometer, is held. The filter has four
-errors per level axis, position p, velocity v, tilt a and accelerometer b, as of [1]_ chapter 12::
+height, which needs a barometer, is kept constant. The filter has four errors per level axis,
+position p, velocity v, tilt a and accelerometer b, as of [1]_ chapter 12::
 
     p' = v      v' = b - g a      a' = v / R      b' = -b / tau + noise
 

@@ -204,7 +204,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
         result[f'{one.kind} ratio'] = (np.array(one.coefficient) - true) / of_terms[:, 0, k]
         slope = np.array(one.per_kelvin) - unit.share * true
         result[f'{one.kind} slope ratio'] = slope / of_terms[:, 1, k]
-    # Nearly along an axis, where the terms are largest.
+    # The new mounting is nearly along an axis, where the terms are largest.
     other = np.eye(3)[seed % 3] * rng.choice((-1.0, 1.0)) + 0.1 * rng.standard_normal(3)
     new = run(unit, other / np.linalg.norm(other), rng, (5.0,))
     result['after'] = np.array([left(calibration, new, 5.0)])
