@@ -38,7 +38,7 @@ AXES = ('x', 'y', 'z')
 CALIBRATION_HEAD = """\
 # The calibration file
 
-A calibration file describes one unit. It is YAML, written by `thermo_comp fit`.
+A calibration file describes one unit in YAML, and is written by `thermo_comp fit`.
 `config/calibration.example.yaml` is an annotated example, `config/calibration.schema.json` the JSON
 Schema; this page is generated from the schema.
 
@@ -136,7 +136,7 @@ an output that is its input.
 ## Recording a test
 
 `thermo_comp record` is a separate node, `thermo_comp_record`: it subscribes to the inputs above, and to every other
-`temperature/<name>`, once they have a publisher, reliably if offered. This node publishes nothing. See
+`temperature/<name>`, once they have a publisher, reliably if offered. `thermo_comp_record` publishes nothing. See
 [Recording](recording.md#recording).
 
 ## Parameters
