@@ -13,7 +13,7 @@ from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, ResidualRow
 from thermo_comp.fitting.data_checks import (
     Finding,
-    can_tell_misalignment,
+    determines_misalignment,
     distinct_directions,
     enforce,
     geometry,
@@ -96,7 +96,7 @@ def test_a_missing_case_is_said(good):
 def test_six_faces_tell_no_misalignment(good):
     windows, _ = good
     faces = np.vstack((np.eye(3), -np.eye(3)))
-    assert not can_tell_misalignment(faces)
+    assert not determines_misalignment(faces)
     assert 'the misalignment keeps its prior' in (
         findings_of(windows, faces)['misalignment'].message
     )
@@ -104,7 +104,7 @@ def test_six_faces_tell_no_misalignment(good):
     tilted = faces + 0.03
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
-    assert not can_tell_misalignment(np.vstack((faces, tilted)))
+    assert not determines_misalignment(np.vstack((faces, tilted)))
 
 
 def test_few_and_badly_spread_positions_are_said(good):

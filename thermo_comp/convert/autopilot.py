@@ -13,7 +13,7 @@ the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher
 temperature.
 
 ArduPilot's DataFlash (``.BIN``): a message type per IMU in old logs (``IMU``, ``IMU2``), a type
-with an instance number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. Samples
+with an instance number ``I`` in new ones; the IMU's temperature is ``T`` or ``Temp``. Samples
 logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected. The
 value 2 (learning) corrects nothing; ArduPilot sets it to 1 when learning ends.
 

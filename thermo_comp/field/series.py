@@ -5,8 +5,8 @@ Owns rests as measurements of a calibration: ``|f| - g`` and its derivatives by 
 
 A rest at an unknown attitude measures one number. With x the axes' forces before the misalignment
 M, f = M x, u = f / |f| and v = M^T u, an error d_bias [input units] and d_scale [relative] of axis
-i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. So, to first order, the true error
-of the calibration along u is ``|f| - g = H (true - calibrated) + noise``.
+i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order the true error of
+the calibration along u is ``|f| - g = H (true - calibrated) + noise``.
 """
 
 from __future__ import annotations

@@ -259,7 +259,7 @@ def _judge_positions(up: Floats) -> Finding:
             f'{POSITIONS_NEEDED} positions separate them, '
             f'{POSITIONS_FOR_MISALIGNMENT} give the misalignment',
         )
-    if not can_tell_misalignment(up):
+    if not determines_misalignment(up):
         return _advice(
             'misalignment',
             f'{n} positions determine bias and scale; the misalignment keeps its prior: it needs '
@@ -282,7 +282,7 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
         )
 
 
-def can_tell_misalignment(up: Floats) -> bool:
+def determines_misalignment(up: Floats) -> bool:
     """
     Whether the number and the spread of positions are sufficient to estimate M.
 
@@ -308,7 +308,7 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
     worst, skewed = float(np.abs(state.bias).max()), float(np.abs(state.misalignment).max())
     largest = max(scale, worst / options.gravity, skewed)
     is_none = largest < 1e-4 and raw < 2e-5 * options.gravity
-    if is_none and span > 20.0 and can_tell_misalignment(state.up):
+    if is_none and span > 20.0 and determines_misalignment(state.up):
         yield Finding(
             'compensated',
             'refusal',

@@ -165,7 +165,7 @@ def serve(handle: int, parent: int) -> None:
     os.nice(NICENESS)
     pipe = Connection(handle)
     with suppress(AttributeError, OSError):
-        # This process is killed with the node, even while a file hangs.
+        # The kernel kills the reading process when the node ends, even while a file hangs.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         return
