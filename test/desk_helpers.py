@@ -41,7 +41,7 @@ def write_fit_of_the_readme(path, cli):
 
 
 class Desk:
-    """Prepares files once, and runs examples in folders where they lie ready."""
+    """Prepares files once, and runs examples in folders that contain these files."""
 
     def __init__(self, folder, cli, once):
         self._cli = cli

@@ -67,7 +67,7 @@ def assert_same(blocks, rows, index):
 
 def test_signed_counts_and_the_printed_equations():
     # Signed counts of +g and -g: the offset is half their sum, the scale is of half their
-    # difference. Eq. (3) and (4) as printed exchange the two.
+    # difference. Eq. (3) and (4) as printed exchange sum and difference.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))

@@ -122,8 +122,7 @@ def test_the_paper_s_model_on_its_own_physics(golovach):
     # A linear static set and a quadratic dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # The residual of the model in this unit's ramps changes its levels, which are as good as the
-    # model.
+    # This model leaves an error in the unit's ramps, which shifts the estimated levels by as much.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)
@@ -195,7 +194,8 @@ def test_six_faces_leave_misalignment_at_its_prior():
 
 
 def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng):
-    # WHY: both were fitted without a message. The triad without drift has constants only.
+    # WHY: compensated samples, and samples of a triad without drift, were both fitted without a
+    # message.
     records = records_of(PLAIN, positions(9, 1), 4)
     bias, scale, M = PLAIN.bias_at_reference, PLAIN.scale_factor, np.array(PLAIN.M)
 

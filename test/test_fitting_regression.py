@@ -155,7 +155,8 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # Except for the number of bags: the bound is a fixed part of the sd of a start.
+    # The bound on the mean of all starts, a tenth of the sd of a start, depends on the number of
+    # bags: allow for this difference.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 

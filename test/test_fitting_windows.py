@@ -109,8 +109,8 @@ def test_columns_are_those_of_the_tracker(bags):
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # Here the lags follow the tracker's estimates, there its readings; plays turn at once, or a
-    # part of a window later.
+    # The lags here follow the tracker's estimates, those of the fit its readings, so that plays
+    # turn up to a part of a window apart.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 

@@ -227,7 +227,7 @@ def test_the_rate_is_corrected_by_hand_numbers():
     least = np.square((1e-4, 2e-4, 1e-4)) / 0.01 + np.square((1e-5, 2e-5, 1e-5))
     assert (np.array(variances) >= least).all()
     assert variances == pytest.approx(least, rel=0.05)
-    # The bias sd for an INS: the same without the noise of a message.
+    # The bias sd for an INS does not contain the noise of a message.
     sd = compensator.status().rate_bias_sd
     noise = np.square((1e-4, 2e-4, 1e-4)) / 0.01
     np.testing.assert_allclose(np.square(sd), variances - noise, rtol=1e-6)

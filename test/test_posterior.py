@@ -164,7 +164,7 @@ def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
 def test_a_side_that_was_never_up_is_named(rng):
     ups = positions(30, 4)
     result = fitted(rng, ups[ups[:, 2] > 0.2])
-    # Or a neighbour in the grid.
+    # The attitude may also be a neighbour in the grid.
     np.testing.assert_allclose(result.least_known.up, (0.0, 0.0, -1.0), atol=0.06)
     assert '-z up' in said(result)
     assert said(result) in ' '.join(result.calibration.provenance.notes)

@@ -127,8 +127,8 @@ def test_a_crossed_edge_locates_the_temperature():
 
 
 def test_an_unchanged_coarse_reading_is_not_an_ever_better_one():
-    # WHY: a thousand equal readings still only say "within the cell". WHAT: the claimed sd stays
-    # that of a uniform distribution, 1 / sqrt(12) of a quantum.
+    # WHY: a thousand equal readings only show that the temperature is within the cell. WHAT: the
+    # claimed sd stays that of a uniform distribution, 1 / sqrt(12) of a quantum.
     thermometer = Thermometer(ThermometerSettings(0.001, 0.0625))
     for k in range(5000):
         thermometer.update(k * SECOND_NS, 20.0)

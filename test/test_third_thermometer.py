@@ -3,8 +3,8 @@
 """
 A third thermometer is found in the bags, fitted, applied by replay, and improves the result.
 
-The electronics under the lid are switched at random, which board and case do not feel, so that
-only the lid's thermometer explains the effect on the axes.
+The electronics under the lid are switched at random. Board and case temperature do not change, so
+that only the lid's thermometer explains the effect on the axes.
 """
 
 import math

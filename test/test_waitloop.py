@@ -234,9 +234,9 @@ def test_quality_of_service_is_open_to_overrides(node):
     ('qos', 'interval_s', 'is_resting'),
     [
         pytest.param(BEST_EFFORT, None, True, id='as measured'),
-        pytest.param(BEST_EFFORT, 749.0, True, id='four in three rests'),
-        pytest.param(BEST_EFFORT, 751.0, False, id='hardly more than one in a rest'),
-        pytest.param(BEST_EFFORT, 0.0, False, id='a middleware that does not tell the time'),
+        pytest.param(BEST_EFFORT, 749.0, True, id='four messages in three pauses'),
+        pytest.param(BEST_EFFORT, 751.0, False, id='hardly more than one message in a pause'),
+        pytest.param(BEST_EFFORT, 0.0, False, id='a middleware without arrival times'),
         pytest.param(RELIABLE, None, False, id='reliable'),
     ],
 )
