@@ -137,8 +137,8 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
     forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
-        # The constants of a pose cancel in its drift. The variance of these constants is taken to
-        # be the smallest variance in the pose, where the curve over temperature adds nothing.
+        # The constants of a pose cancel in its drift. The variance of a pose's constants is taken
+        # to be the smallest variance in the pose, where the curve over temperature adds nothing.
         variances = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
         sd = np.sqrt(np.concatenate(
             [v - v.min(axis=0) + out.white for v, out in zip(variances, outs, strict=True)]

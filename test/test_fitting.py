@@ -122,7 +122,8 @@ def test_the_paper_s_model_on_its_own_physics(golovach):
     # A linear static set and a quadratic dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # This model leaves an error in the unit's ramps, which shifts the estimated levels by as much.
+    # The paper's model leaves an error in the unit's ramps, which shifts the estimated levels by
+    # as much.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)

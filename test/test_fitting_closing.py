@@ -128,7 +128,7 @@ def test_ratio_and_time_are_found(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # The threshold has a false alarm rate of 1 % per series; none of these exceeds it.
+    # The threshold has a false alarm rate of 1 % per series; none of these series exceeds it.
     assert [
         whitener.estimate(series, weight)
         for whitener, weight, series in (drawn(rng, 5, 100, Noise()) for _ in range(10))

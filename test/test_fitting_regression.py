@@ -212,9 +212,9 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: With LINEAR groups the problem is linear in everything except directions, which are determined
-#: to some urad: the result is exact except for rounding. With PRODUCTS it is of first order
-#: (positions) or two steps (sections): the remainder is the product of the changes of start and
-#: weight.
+#: to some urad: the result is exact except for rounding. With PRODUCTS the result is of first
+#: order (positions) or two steps (sections): the remainder is the product of the changes of start
+#: and weight.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 

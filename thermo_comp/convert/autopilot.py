@@ -14,8 +14,8 @@ temperature.
 
 ArduPilot's DataFlash (``.BIN``): a message type per IMU in old logs (``IMU``, ``IMU2``), a type
 with an instance number ``I`` in new ones; the IMU's temperature is ``T`` or ``Temp``. Samples
-logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected. The
-value 2 (learning) corrects nothing; ArduPilot sets it to 1 when learning ends.
+logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected.
+While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets 1 at the end.
 
 https://docs.px4.io/main/en/dev_log/ulog_file_format
 https://ardupilot.org/copter/docs/logmessages.html

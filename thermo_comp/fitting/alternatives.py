@@ -98,7 +98,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     Fit the windows with one lag per axis, or with a bank of time constants.
 
     The bank is fitted if no lag per axis is found, or if the lags leave more left-out drift than
-    noise explains. The bank then replaces the lags if it is better on left-out data.
+    noise explains. The bank replaces the lags per axis if it is better on left-out data.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'

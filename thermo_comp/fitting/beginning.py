@@ -144,8 +144,8 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     """
     Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
 
-    The effect of such a lag is nearly collinear with the curve, and its final value would be
-    extrapolated. No model uses such columns; those linear in temperature enter the covariance, see
+    The effect of a slow lag is nearly collinear with the curve, and its final value would be
+    extrapolated. No model uses slow columns; those linear in temperature enter the covariance, see
     `claim`.
     """
     data = windows.data

@@ -5,9 +5,9 @@ Owns the published uncertainty: the covariance of the fit, widened by what the d
 determine, and the lack of fit, the excess of the left-out errors over this covariance.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
-mixture of fits on a grid of this standard deviation. The weight of each fit is the evidence of the
-norms times a half-Student prior. The standard deviation of gravity is a common error of the scale
-factors.
+mixture of fits on a grid of this standard deviation. A fit's weight in the mixture is the evidence
+of the norms times a half-Student prior. The standard deviation of gravity is a common error of the
+scale factors.
 
 The lack of fit per regime and temperature is the mean square of the left-out drift less the
 published variance of this drift. The lack of fit covers effects that no column describes, such as
@@ -106,9 +106,9 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     Add columns that the data do not determine to the prior, so that their variance is not 0.
 
     An inactive column is consistent with 0, but the data bound it only to ``1 / sqrt(S)``, S being
-    its information given the active columns. If this bound exceeds two standard deviations of a
-    window's noise, the column enters the covariance with this sd and zero weight. For a column
-    that was almost constant, the bound is scaled to the change of temperature.
+    its information given the active columns. A column whose bound exceeds two sd of a window's
+    noise enters the covariance with the bound as sd, and zero weight. The bound of an almost
+    constant column is scaled to the change of temperature.
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     active = groups[prior.column_sd.any(axis=0)]

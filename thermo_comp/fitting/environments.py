@@ -4,10 +4,10 @@
 Owns the exclusion of bags from another environment, and their part in the published error.
 
 In a chamber with a fan the board temperature follows the case temperature by one law, in still air
-by another. The bias of a part without a thermometer then depends on the environment, and no set of
-coefficients describes both. A bag of still air among those of the chamber would increase the error
-in the chamber. The fit excludes such a bag and publishes the error of its correction as a lack of
-fit.
+by another. The bias of a part without a thermometer depends on the environment, and no set of
+coefficients describes two environments. A bag of still air would increase the error in the
+chamber. The fit excludes a bag of another environment and publishes the error of its correction as
+a lack of fit.
 """
 
 from __future__ import annotations

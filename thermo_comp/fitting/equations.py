@@ -8,9 +8,9 @@ Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + kappa (A l_p)_i g + noise,
     a = (A u_p)_i g,  A = M^-1,  l_p across u_p: tilt of the support
 
-B and S are columns of one table (`unit.columns`), each divided by its RMS. With g = 0 this is the
-equation of an angular rate: b, B beta and o_p remain. If |f| differs between positions it replaces
-g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added (`forces`). The terms
+B and S are columns of one table (`unit.columns`), each divided by its RMS. With g = 0 the equation
+is that of an angular rate: b, B beta and o_p remain. If |f| differs between positions it replaces
+g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added (`forces`). All terms
 are linear combinations of the base series of the windows (`series`).
 """
 

@@ -223,8 +223,8 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # The whitened step H_k = (i >= k) is 1 at k and 1 - r after k. The product of H_k with a
-    # residual is a sum from k on; the square of H_k without the trend follows from such sums of
-    # the trend.
+    # residual is a sum from k on; the square of H_k without the trend follows from sums of the
+    # trend.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)

@@ -12,8 +12,8 @@ The errors are the drift (each axis less its mean over the position, which does 
 attitude) and ``|f| - g`` of the position, if the other positions determine it.
 
 A model is better if it reduces the error by more than the standard error over the folds, both for
-positions and for sections of the program. A model that describes only one recording, or only one
-program, fails one of the two tests.
+positions and for sections of the program. A model that describes only one recording fails for
+positions, one of only one program fails for sections.
 
 References
 ----------
@@ -67,9 +67,9 @@ class Folds:
         Return the log ratio of the mean square error to that of another model, and its standard
         error, over the folds that both have; None without such folds.
 
-        There are two estimates: the mean over folds of their log ratios, which is robust to a few
-        large folds, and the log ratio of the sums with its jackknife error, which is robust to
-        small folds. If their signs agree the more significant estimate is returned, else 0.
+        Of two estimates with equal signs the more significant is returned, else 0: the mean over
+        folds of their log ratios, which is robust to a few large folds, and the log ratio of the
+        sums with its jackknife error, which is robust to small folds.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
@@ -134,8 +134,8 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
     Return the gain of a model if it exceeds its standard errors, else 0.
 
-    The gain is the sum of the log gains of the drift. If the drifts are equal, it is the log gain
-    of the norms of left-out positions, which must exceed two standard errors.
+    The gain is the sum of the log gains of the drift. If the drifts are equal, the gain is the log
+    gain of the norms of left-out positions, which must exceed two standard errors.
     """
     positions, sections, norms = _gains(before, after)
     drift = [gain for gain in (positions, sections) if gain]

@@ -4,9 +4,9 @@
 Owns informative priors: an earlier calibration of the unit, or the population of its type.
 
 An informative prior is a calibration: mean and covariance of all parameters form the Gaussian
-prior of the regression, which has the calibration's columns. For a population these are the mean
-and the scatter over units of the parameters relative to the scale factors. The covariance of an
-earlier calibration of the unit is increased by the ageing of the unit.
+prior of the regression, which has the calibration's columns. A population's mean and covariance
+are the mean and the scatter over units of the parameters relative to the scale factors. The
+covariance of an earlier calibration of the unit is increased by the ageing of the unit.
 """
 
 from __future__ import annotations

@@ -250,9 +250,9 @@ def _with_shorter_cells(
     """
     Reduce a source of slow samples in shorter cells; None if cells of the usual length suffice.
 
-    `share`: the part of the bag at rest in cells of the usual length. Slow samples make these
-    cells so long that a bias which changes within minutes looks like a motion, and that short
-    rests are lost.
+    `share`: the part of the bag at rest in cells of the usual length. Slow samples make cells so
+    long that a bias which changes within minutes looks like a motion, and that short rests are
+    lost.
     """
     if share < 0.95 and source.force is None:
         # For interrupted rests: shorter cells are used if they add 5 % of the bag.

@@ -82,8 +82,8 @@ def learn_thermometer(
     if not with_ramps:
         return replace(base, noise_sd_c=noise, quantum_c=quantum)
     fastest = max(course.fastest for course in with_ramps)
-    # At the beginning of a ramp the lagged temperature has the second derivative ramp / lag. This
-    # derivative is estimated from the difference of two rates one minute apart.
+    # At the beginning of a ramp the lagged temperature has the second derivative ramp / lag. The
+    # second derivative is estimated from the difference of two rates one minute apart.
     lags = []
     for course in with_ramps:
         bend = np.abs(course.rate[_BINS_PER_SIDE:] - course.rate[:-_BINS_PER_SIDE])

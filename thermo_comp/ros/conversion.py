@@ -3,10 +3,10 @@
 """
 Owns the conversion of serialized samples to serialized Imu messages, without rclpy's classes.
 
-Samples are read, and an Imu is written, at fixed offsets of their plain form, little-endian CDR:
-4 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with
-its final NUL, the string, and, at the next multiple of 8 from the end of the encapsulation,
-float64 values. A message in any other form is first converted to this form by rclpy.
+Samples are read, and an Imu is written, at fixed offsets of their plain form, little-endian CDR: 4
+bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with its
+final NUL, the string, and, at the next multiple of 8 from the end of the encapsulation, float64
+values. A message in any other form is first converted to the plain form by rclpy.
 """
 
 import struct

@@ -90,8 +90,8 @@ class FlowEffect(Effect):
 
     With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent``: convection in a gap
     (1.25), the load of a heat pump (1), its losses (2); times the deviation of `cold` to the
-    `power`. If the pump's supply is limited, it saturates at 1, ``x^e / (1 + x^e)``. The second
-    signal is the first times the deviation of `cold`.
+    `power`. If the pump's supply is limited, the signal saturates at 1, ``x^e / (1 + x^e)``. The
+    second signal is the first times the deviation of `cold`.
     """
 
     hot: str

@@ -25,7 +25,7 @@ _STEP_S = 1.0  # time over which convection is held constant [s]
 class Link:
     """
     Heat path between two parts, or a part and the chamber's air, `AIR`: W/K (at 1 K). The flow is
-    proportional to the difference to the power `exponent`, 1.25 for free convection.
+    proportional to the temperature difference to the power `exponent`, 1.25 for free convection.
     """
 
     a: str
@@ -139,7 +139,7 @@ class ThermalResponse:
 
     `air` are the chamber's temperatures at the knots `time` [s], shape (m,); `power` is the
     dissipation between the knots in addition to the constant powers [W], shape (m - 1, n_parts).
-    At the start everything is on and in equilibrium.
+    At the start all powers are on, and all temperatures in equilibrium.
     """
 
     def __init__(

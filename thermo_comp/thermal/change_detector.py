@@ -55,7 +55,7 @@ class ChangeDetector:
         self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
         # Memory (1 / tracking frequency) of each filter [s]: the one that detects the filter's
         # acceleration soonest at readings of 1 Hz. The spectral density of the acceleration
-        # follows from this memory, and is used for any interval of readings.
+        # follows from the memory, and is used for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
         onset = smallest_rate / sensor.lag_s
         memories = [

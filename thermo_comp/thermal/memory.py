@@ -12,8 +12,8 @@ series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighte
 two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 
 A part may also exchange heat with both the board and another part, at a sensor s: it lags the
-temperature ``T + v g`` between them, with ``g = T_s - T``. The lag of this part is that of the
-board less v times the lag of the gradient.
+temperature ``T + v g`` between them, with ``g = T_s - T``. The lag behind this temperature is that
+of the board less v times the lag of the gradient.
 """
 
 import math
