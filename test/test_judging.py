@@ -256,7 +256,7 @@ class TestVerdict:
         assert seen.reason.startswith(
             '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
         )
-        # The claim is compared with the same positions; the limit holds for a new attitude.
+        # The claimed sd is that of the fitted positions; the tolerance applies to a new attitude.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
@@ -371,8 +371,8 @@ def test_thermometers_in_doubt_are_told_offline_too(root, tmp_path):
     """
     WHY: replay did not report exchanged thermometers, and evaluate called them valid.
 
-    WHAT: both print the node's message and no verdict is given; likewise outside the calibrated
-    range.
+    WHAT: replay and evaluate print the node's message and give no verdict; likewise outside the
+    calibrated range.
     """
     exchanged = Topics(board='temperature/case', case='temperature/board')
     for topics, text in ((Topics(), []), (exchanged, [SWAPPED])):

@@ -215,7 +215,7 @@ def test_diagnostics_tell_noise_and_bias_apart(peer, saved):
             assert bias > 0.0
             of_rate = float(values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'])
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
-            # The regime is unknown: the two sets of that gyroscope differ by about 30 urad/s.
+            # The regime is unknown: the two sets of the gyroscope differ by about 30 urad/s.
             assert 1e-5 < float(values[f'bias sd of rate {axis} [rad/s]']) < 1e-3
 
 

@@ -58,7 +58,7 @@ def thermal_test(path, imu=False, has_case=True):
         for topic, values, late_ns in (
             (TOPICS.board, board, 350_000_000),
             (TOPICS.case, case, 1_250_000_000),
-            # The third thermometer of that calibration.
+            # The third thermometer of `rich_calibration`.
             ('temperature/frame', 0.5 * (board + case) + 1.0, 700_000_000),
         ):
             if topic == TOPICS.case and not has_case:

@@ -142,7 +142,7 @@ class Point:
 
     @cached_property
     def reduced(self) -> Reduced:
-        """The normal equations of the unit, those of positions and bags eliminated."""
+        """The normal equations of the unit, with the unknowns of positions and bags eliminated."""
         return self._reduced(self.normal)
 
     @property

@@ -231,7 +231,8 @@ def select(
 ) -> Selected:
     """Choose the groups of columns by left-out data, and fit them."""
     growth = Growth(regression, candidates)
-    # Without a curve the drift is attributed to mountings or to noise: begin from both priors.
+    # Without a curve the drift is attributed to mountings or to noise: begin from a small and from
+    # a large prior sd of mounting offsets.
     priors = [prior]
     if prior.offset_scale > 0.0:
         priors.append(replace(prior, offset_sd=float(prior.sigma.mean())))

@@ -4,7 +4,7 @@
 Owns the settings of thermometers and detector estimated from the bags, and the thermal states.
 
 Rates are central differences over two minutes, which need a recording. The causal thermometers and
-the detector get the noise, lag and ramps of this chamber.
+the detector get the noise, lag and ramps of the recorded test.
 """
 
 from __future__ import annotations

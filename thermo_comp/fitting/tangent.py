@@ -16,10 +16,10 @@ class Normal(NamedTuple):
     """
     Normal equations of each axis without any prior, in the order of `Tangent`.
 
-    local: those of the unknowns of positions and bags, with all unknowns and with the residual,
-        shape (n_positions, 3, n_local, k + 1)
-    unit: those of the unknowns of the unit and of the residual with each other, sum over the
-        positions, shape (3, n, n)
+    local: products of the derivatives by the unknowns of positions and bags with all derivatives
+        and the residual, shape (n_positions, 3, n_local, k + 1)
+    unit: products of the derivatives by the unknowns of the unit and of the residual with each
+        other, sum over the positions, shape (3, n, n)
     """
 
     local: Floats

@@ -234,7 +234,7 @@ class State:
 @dataclass(frozen=True)
 class Layout:
     """
-    Places of the unknowns in the vector of parameters; those of the unit come first.
+    Places of the unknowns in the vector of parameters; the unknowns of the unit come first.
 
     axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
     weights, nonlinear: shapes (2, 3, m) and (3, 2 k); -1 for an inactive unknown

@@ -65,12 +65,12 @@ class Judgement:
 
     @property
     def is_valid(self) -> bool:
-        """Whether the calibration was shown to hold."""
+        """Whether the calibration was found valid."""
         return self.kind.is_valid
 
     @property
     def exit_code(self) -> int:
-        """0 for a calibration that was shown to hold, unless its gyroscope does not; else 1."""
+        """0 for a valid calibration whose gyroscope, if any, is not refuted; else 1."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 

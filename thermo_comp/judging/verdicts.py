@@ -16,7 +16,7 @@ from ..unit.prediction import SlowUncertainty
 from ..unit.rate_bias import MILLIDEGREE
 from .windows import Windows, means_by
 
-#: Largest ratio of RMS error to claimed RMS at which a calibration holds.
+#: Largest ratio of RMS error to claimed RMS at which a calibration is valid.
 LARGEST_RATIO = 2.0
 #: Ratio of claimed RMS to raw RMS above which a valid calibration is called wide.
 WIDE_PART = 0.5
@@ -41,7 +41,7 @@ class Verdict(Enum):
 
     @property
     def is_valid(self) -> bool:
-        """Whether the calibration was shown to hold."""
+        """Whether the calibration was found valid."""
         return self in (Verdict.VALID, Verdict.WIDE)
 
 

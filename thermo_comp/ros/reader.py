@@ -140,8 +140,8 @@ class Reader:
         if self._is_closed:
             raise EOFError
         self._pipe, theirs = Pipe()
-        # The process has the package path of this process; Ctrl-C goes to the node only, which
-        # ends this process.
+        # The reading process gets the package path of the node's process; Ctrl-C only reaches the
+        # node, which ends the reading process.
         code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve'
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603 - fixed interpreter and arguments

@@ -86,7 +86,7 @@ class Lag(_Lag, Quantity):
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
-        # The variance of the sum, by the covariance of the single lags: see `start_covariance`.
+        # The variance of the sum of both single lags follows from `start_covariance`.
         second = exp(-age_s / self.second_tau_s)
         a, b = self.shares
         tau, tau_2 = self.tau_s, self.second_tau_s
