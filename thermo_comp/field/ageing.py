@@ -156,7 +156,7 @@ class Model:
             np.where(is_same, along, 0.0),
             np.diag(rows.scatter),
         ]
-        # The lack of fit is correlated between temperatures over 10 K.
+        # The lack of fit is correlated between temperatures less than some 10 K apart.
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
