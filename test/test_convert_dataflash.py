@@ -151,7 +151,8 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
         # INS_TCAL1_ENABLE is switched on in flight, then off.
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log of the learning was refused, because ArduPilot sets 1 after it.
+        # WHY: a log of ArduPilot's learning was refused, because ArduPilot sets 1 after the
+        # learning.
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )

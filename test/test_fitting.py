@@ -249,7 +249,7 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach):
     moved = np.abs(weight[per_second:] - weight[:-per_second]) * size[per_second:]
     assert weight[0] == pytest.approx(0.0, abs=1e-6)
     assert weight.max() == pytest.approx(1.0, abs=1e-6)
-    # The difference drifts during the transition by far less than a hundredth.
+    # During the transition the difference of the sets changes by far less than a hundredth.
     assert moved.max() / MICRO_G < 1.01 * max(1.0, size.max() / MICRO_G / 300.0)
 
 

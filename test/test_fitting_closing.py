@@ -61,8 +61,7 @@ def test_evidence_says_when_the_regime_closes(closes, options):
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.closes == closes
-    # The remaining difference is when a set starts and ends, as the fit estimates the sensor
-    # settings.
+    # Sets of the fit start and end at slightly other times, as it estimates the sensor settings.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
 

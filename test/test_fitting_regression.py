@@ -85,7 +85,7 @@ class Dense:
             state.offset.ravel() / prior.offset_sd,
             state.tilt.ravel() / prior.tilt_sd,
             state.start.ravel() / np.sqrt(prior.start_share),
-            # The mean over all bags has a tenth of the sd of each start.
+            # The mean of the starts of all bags has a tenth of the sd of one start.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_share)),
         ]
         for weights, sd in zip(state.weights, prior.column_sd, strict=True):
@@ -292,8 +292,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
 def test_no_step_goes_uphill(seed):
-    # Bags that started far from rest, with little data to separate a start from a weight: a
-    # product.
+    # Bags that started far from rest, with little data: the product of start and weight matters.
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
     windows, up = table_of(truth, 4, rng, n_windows=12, step_s=400.0)
@@ -388,7 +387,7 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise):
     gain = max(gains) - posterior.log_evidence
     assert gain > 100.0
     assert inactive.gain(wide, asked) == pytest.approx(gain, rel=0.01)
-    # The columns that the data contain come one after another: no other column, none twice.
+    # The columns that the data contain are chosen one after another, no other column, none twice.
     chosen = inactive.chosen(wide, asked, 4.0, 9)
     assert np.array(GROUPS)[chosen].tolist() == ['board'] * (np.array(GROUPS) == 'board').sum()
     assert inactive.chosen(wide, asked, 4.0, 1).sum() == 1

@@ -69,7 +69,7 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; no single column equals the drift of its gyroscope."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # Heat flows in and between the parts; half of the columns, and half of the work.
+    # Groups of heat flows in and between the parts: half of the columns and of the work.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -77,7 +77,7 @@ def fitted(unit):
 @pytest.fixture(scope='module')
 def held_out(unit):
     stations = plan('held-out', 2)[:2]
-    # Two ramps up and two down with soaks, without the last way back.
+    # Two ramps up and two down with soaks; the last ramp does not return to the start.
     whole = stations[0].program
     program = replace(whole, time_s=whole.time_s[:10], temperature_c=whole.temperature_c[:10])
     stations = [replace(station, program=program) for station in stations]
@@ -256,7 +256,8 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     assert judged.exit_code == 0
     for name in ('static', 'dynamic', 'all'):
         section = rate.sections[name]
-        # Above the noise alone, and larger than necessary because of lags with unknown start.
+        # The claimed sd is above the noise, and larger than necessary as lags have an unknown
+        # start.
         assert 0.7 < section.ratio < 1.2
         assert section.rms < 1.3 * FLOOR
         assert section.raw_rms > 50.0 * FLOOR

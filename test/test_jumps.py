@@ -123,7 +123,7 @@ def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
 def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
-    # WHY: means over 10 s determine a level to 3 mg there, so 20 mg within one sample were missed.
+    # WHY: in such noise means over 10 s determine a level to 3 mg, so jumps of 20 mg were missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)

@@ -65,7 +65,7 @@ def test_what_is_not_known_of_a_lag():
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
-    # The uncertainty decays with the lag.
+    # The uncertainty decays with the lag's time constant.
     variance = bank.at(150 * SECOND_NS, 2.0)[1]
     assert variance == pytest.approx([lost**2 * math.exp(-2.0), 0.0])
     bank.note_jump(3.0)
@@ -174,7 +174,7 @@ def test_a_second_stage_adds_the_errors_of_both():
     memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
-    # (900 + 150) / (900 - 150): at most, were the errors of both stages of opposite sign.
+    # At most (900 + 150) / (900 - 150), if the errors of both stages had opposite signs.
     assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
 
 

@@ -219,7 +219,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # Each executed line of the building, the exchange and the setting.
+        # Raise at each executed line of the building, the exchange and the setting.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
             change.name: change.value for change in changes

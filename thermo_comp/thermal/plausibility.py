@@ -36,11 +36,11 @@ OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a frozen sensor [K].
 LARGEST_DOUBT: Final = 60.0
 
-#: Smallest temperature difference that counts as a lead: in K, and as a share of the movement ...
+#: Smallest temperature difference that counts as a lead: in K, and as a share of the movement.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
-#: ... in this number of consecutive readings, with at least this ratio of the slower rate to the
-#: faster; from the smaller ratio on a lead of the board adds to the variance.
+#: A lead lasts for this number of consecutive readings, with at least this ratio of the slower
+#: rate to the faster; from the smaller ratio on a lead of the board adds to the variance.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03

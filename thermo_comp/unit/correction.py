@@ -26,9 +26,9 @@ from .functions import hold
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection
 
-#: Largest rate of change of the output while the sets are blended [m/s^3]: 1 ug per second ...
+#: Largest rate of change of the output while the sets are blended [m/s^3]: 1 ug per second; to
+#: this end blending is lengthened up to a number of transition times.
 GENTLE_RATE = MICRO_G
-#: ... unless blending would then take more than this number of transition times.
 LONGEST_TRANSITION = 10.0
 #: Number of board temperatures at which curves and differences of the sets are evaluated.
 _GAP_TEMPERATURES = 33
