@@ -261,7 +261,7 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # Within a span only the part of the thermometer's variance changes: 30 counts/K, some mK.
+        # Within a span the variance changes only by the thermometer's part: 30 counts/K, some mK.
         part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - collected[0][0]) * 1e-9 + 1.0

@@ -120,8 +120,8 @@ def _may_have_sets(selected: Selected) -> bool:
     """
     Whether the chosen model has two sets, or a model with two sets is similarly good.
 
-    Similarly good: its left-out error is within one standard error of that of the chosen model,
-    and its white noise is less than 80 % of that of the chosen model, on every axis.
+    A model is similarly good if its left-out error is within one standard error of that of the
+    chosen model, and its white noise is less than 80 % of that of the chosen model, on every axis.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma

@@ -75,7 +75,7 @@ def claim_of(
     if candidates is not None:
         wider = _with_unseen(regression, posterior, candidates)
         wide = regression.solve(posterior.state, wider, n_steps=0)
-        # The covariance with unseen columns is that at the mounting sd of the mode. Add the excess
+        # The covariance with unseen columns is computed at the mode's mounting sd. Add the excess
         # of the mixture's covariance over that of the mode.
         at = _places(posterior.layout, wide.layout)
         excess = covariance - posterior.covariance

@@ -187,10 +187,10 @@ class Reduced:
         """
         Carry out the elimination for further unknowns of the unit, m of each axis.
 
-        `rows`: their normal equations with the unknowns of the fit and the residual, shape
-        (n_positions, 3, m, k + 1). Returns what the elimination subtracts from the Hessian of the
-        further unknowns, shape (3 m, 3 m), and, after the elimination, their cross block with the
-        unit and their gradient, shape (n + 1, 3 m).
+        `rows`: normal equations of the further unknowns with the unknowns of the fit and the
+        residual, shape (n_positions, 3, m, k + 1). Returns what the elimination subtracts from the
+        Hessian of the further unknowns, shape (3 m, 3 m), and, after the elimination, their cross
+        block with the unit and their gradient, shape (n + 1, 3 m).
         """
         layout, turned = self.layout, self.positions.turned
         n_positions, n_own, _ = turned.shape

@@ -178,7 +178,7 @@ def reduce_source(
     rests are shorter than a cell.
     """
     reading = _Pass(source, CellAccumulator(min(cell_s, window_s), full_scale, window_s, least))
-    # The norms at rest choose the thresholds only if they are those of gravity.
+    # The norms at rest determine the thresholds only if |f| at rest is gravity.
     cells = reading.cells if source.force is None else stillness.without_rotation(reading.cells)
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)

@@ -115,7 +115,7 @@ class Point:
         """-2 times the log density of the state, without the constants of the prior."""
         size = float(self.precision @ self.away**2)
         if self.prior.informative is not None:
-            # The precision of the unit's unknowns is 0 in the diagonal form.
+            # With an informative prior the diagonal `precision` is 0 for the unit's unknowns.
             root = self.prior.informative.root
             size += float(np.sum((root @ self.away[: self.layout.n_unit]) ** 2))
         if self._has_common_start:

@@ -47,7 +47,7 @@ REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
 #: Time at rest after a step of |f| from rest, after which the step is judged [ns].
 STEP_NS: Final = 300_000_000
-#: A residual refutes beyond the tolerance and this number of its standard deviations.
+#: A residual above the tolerance and above this number of its sd refutes the calibration.
 REFUTING_SIGMAS: Final = 5.0
 
 

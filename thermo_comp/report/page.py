@@ -296,7 +296,7 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             if evidence.residuals
             else '',
             'Red cross: the direction with the largest uncertainty, and the standard deviation '
-            'of |f| there. A position recorded there would improve the calibration most.'
+            'of |f| there. A position in its direction would improve the calibration most.'
             if evidence.least_known
             else '',
         )
