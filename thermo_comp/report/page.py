@@ -295,8 +295,8 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             else 'The area of a red ring is proportional to the residual there.'
             if evidence.residuals
             else '',
-            'Red cross: the direction with the largest uncertainty, and the standard deviation '
-            'of |f| there. A position in its direction would improve the calibration most.'
+            'Red cross: the direction with the largest standard deviation of |f|, which is given; '
+            'a position in this direction would improve the calibration most.'
             if evidence.least_known
             else '',
         )
