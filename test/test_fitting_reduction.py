@@ -169,7 +169,7 @@ def test_time_origin_does_not_matter(rng):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # Cells of half a second fill windows of ten; 30 samples at 4 Hz do not, and those at 1 Hz are
+    # Cells of half a second fill windows of 10 s; 30 samples at 4 Hz do not, and 30 at 1 Hz last
     # longer.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )

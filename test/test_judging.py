@@ -371,7 +371,7 @@ def test_thermometers_in_doubt_are_told_offline_too(root, tmp_path):
     """
     WHY: replay did not report exchanged thermometers, and evaluate called them valid.
 
-    WHAT: replay and evaluate print the node's message and give no verdict; likewise outside the
+    WHAT: replay and evaluate print the node's message and give no verdict, nor outside the
     calibrated range.
     """
     exchanged = Topics(board='temperature/case', case='temperature/board')

@@ -73,7 +73,7 @@ def test_a_part_between_board_and_case():
     parts = {one.part for one in calibration.response if one.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares = np.array(sorted(parts)).T
-    # Ramps determine a lag to 1 %, see above, and therefore the share of the case to 0.01.
+    # Ramps determine a lag to 1 %, and therefore the share of the case to 0.01.
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert judged(calibration, study).norm < 2.0

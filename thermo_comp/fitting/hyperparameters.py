@@ -280,8 +280,8 @@ def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
             usual = sliding_window_view(around, 2 * side + 1, axis=0)
             np.subtract(part, np.median(usual, axis=-1), out=part)
     size = np.abs(size)
-    # The window means of a charge-balancing converter often have few distinct values, with a
-    # median deviation of 0. The 80 % quantile of |x| is robust, too: 1.2816 sd of a normal.
+    # The 80 % quantile of |x| is 1.2816 sd of a normal. The median is not used: the window means
+    # of a charge-balancing converter often have few distinct values, with a median deviation of 0.
     usual = np.quantile(size, 0.8, axis=0) / 1.2816
     size = np.minimum(size / np.maximum(usual, 1e-300), 1e3).max(axis=1)
     return np.asarray((3.0 / np.maximum(size, 3.0)) ** 2)

@@ -114,7 +114,7 @@ class _PartCurves:
         ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
         knots = _even(np.append(0.0, self._taus))
         self._ratio = CubicSpline(knots, ratios, axis=1)
-        # The lag of the gradient is interpolated likewise; its limit at tau = 0 is the gradient.
+        # The lag L_tau(g) of the gradient g is interpolated over tau; its limit at tau = 0 is g.
         of_case = [
             [c.group == 'gradient_lag' and c.tau_s == tau and c.sensor == 'case' for c in columns]
             for tau in self._taus

@@ -172,8 +172,8 @@ class Prior:
     start_share: variance of the initial lag states over that of the run-time prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
         inactive one, shape (2 k,)
-    informative: replaces the above for the unit's parameters; column_sd then only gives the active
-        columns
+    informative: replaces all other sd of the unit's parameters; column_sd then only gives the
+        active columns
     """
 
     bias_mean: Floats

@@ -264,7 +264,7 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         yield (
             'Which bias of the angular rate is corrected?',
             of_unit.draw_rates,
-            'Bias of the gyroscope over temperature, in a soak and in ramps as above, less the '
+            'Bias of the gyroscope over temperature, in a soak and in ramps, less the '
             'value at the reference temperature and less a straight line, whose slope stands '
             'above each panel. Hatched: 95 % band, of the constant as well, which the Earth’s '
             'rate and the turn-on blur.',
