@@ -127,7 +127,7 @@ class Flights:
 
 
 def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> Flights:
-    """Level, stand with zero-velocity updates, then navigate freely; start in every minute."""
+    """Level, stand with zero-velocity updates, navigate freely; a flight starts every minute."""
     n_align = round(ALIGN_S / dt)
     n = round((zupts_s + (COAST_S if zupts_s else FREE_S)) / dt)
     starts = np.arange(0, len(model.force) - n_align - n, round(EVERY_S / dt))

@@ -141,8 +141,8 @@ def at_seconds(*events):
     ]
 
 
-# Which waiting readings are of another clock depends on their order of arrival, also across cuts:
-# after a reading from tomorrow, and after one that was applied in between.
+# The examples: a reading from tomorrow, or a reading that was applied before, decides which of the
+# waiting readings are of another clock, also if a cut separates them.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)

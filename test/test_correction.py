@@ -237,7 +237,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
         bias, scale = values[:, axis]
         for x in (-9.8, 0.0, 9.8):
             expected = np.var(bias / 300.0 + scale / 300.0 * x) / small**2
-            # 4000 draws: 2.2 %; 4 sigma.
+            # A variance from 4000 draws has a relative sd of 2.2 %: 4 sigma.
             assert a + b * x + c * x * x == pytest.approx(expected, rel=0.09)
 
 
@@ -347,7 +347,7 @@ def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
         response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
     )  # fmt: skip
     assert sd_at(unit, 35.0) == pytest.approx(1e-6, rel=1e-6)
-    # The sd of the slope times the factor for 6 K outside, of half a range of 15 K.
+    # The temperature is 6 K outside the range, whose half is 15 K.
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
 
@@ -407,8 +407,8 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
 
 def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng):
     # Correction and regressors are linear in the parameters: the change of the correction by any
-    # change of them must equal the regressors times it. The dynamic set ends first above, the
-    # static one below.
+    # change of them must equal the regressors times it. The range of the dynamic set ends first
+    # above, that of the static set below.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     one = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -451,7 +451,7 @@ def test_the_claim_grows_all_the_way_out_of_the_range():
             line = correction.line(state, state, np.array(slow.at(state, nobody)), 0.0)
             variances.append(line[12:].reshape(3, 3)[:, 0])
         assert (np.diff(variances, axis=0) > 0.0).all()
-        # At least the error of a curve that is constant from the edge on.
+        # The claimed sd is at least the error of a curve that is constant from the edge on.
         slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 

@@ -144,7 +144,7 @@ def test_the_evidence_is_complete(response):
     assert 'refusal' not in {finding.level for finding in response.findings}
     # The file contains the contribution of each group.
     judged = {(group.part, group.group) for group in calibration.evidence}
-    # Each axis of this unit is a curve of its part.
+    # The bias of each axis of this unit is a curve over the temperature of the axis' part.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
     # A term with zero weight is only needed for the covariance.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]

@@ -33,8 +33,8 @@ from thermo_comp.fitting.unknowns import Noise, State, inverse_misalignment, tan
 
 class Dense:
     """
-    The same posterior by a slow second route: one vector, dense covariances, numerical
-    derivatives.
+    The posterior of a `Regression` by a slow second route: all unknowns in one vector, dense
+    covariances, numerical derivatives.
     """
 
     def __init__(self, regression, prior, at):
@@ -212,9 +212,9 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: With LINEAR groups the problem is linear in everything except directions, which are determined
-#: to some urad: the result is exact except for rounding. With PRODUCTS the result is of first
-#: order (positions) or two steps (sections): the remainder is the product of the changes of start
-#: and weight.
+#: to some urad: the result is exact except for rounding. With PRODUCTS a score lacks the product
+#: of the changes of start and weight, as scores of positions are linear, and scores of sections
+#: are two linear steps.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 

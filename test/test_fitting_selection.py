@@ -337,7 +337,7 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
 
 
 def test_a_stiff_support_is_not_seen_tilting(calm):
-    # Less than the noise of the windows of a tilt, 2 ug / sqrt(60).
+    # The estimated tilt is below the noise of the mean of 60 windows of 2 ug.
     _, chosen, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)
     tilt = GRAVITY * chosen.posterior.state.tilt
@@ -361,7 +361,7 @@ def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting():
     for n in (9, 24):
         claim, fitted = claimed(n)
         assert np.linalg.eigvalsh(claim).min() > 0.0
-        # The biases, after kappa in each axis.
+        # The bias of each axis follows its kappa.
         k = (len(claim) - 3) // 3
         at = 1 + k * np.arange(3)
         ratios.append(np.sqrt(np.diag(claim)[at].mean() / np.diag(fitted)[at].mean()))

@@ -119,8 +119,7 @@ def test_reload_while_samples_flow(peer, tmp_path):
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 5.0
 
-        # The file of another unit while the serial is set, and a serial that differs from the
-        # file's.
+        # A file and a set serial that differ are refused, whichever of the two is set last.
         save_calibration(of_bias(4.0, unit=Unit('T-2', 'counts', 32767.0, 0.01)), third)
         (result,) = peer.set_parameters(serial='T-9')
         assert "unit.serial: must be 'T-9'" in result.reason

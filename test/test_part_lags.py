@@ -141,7 +141,7 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     # Another simulator: heads that lag the board, pendulums that lag the heads, and an error
     # proportional to the stress between board and pendulum.
     unit = second_simulator.unit_of('products', 2)
-    # Stages of the x axis that are equal are fitted as two of a ratio of 0.89.
+    # Two equal stages of the x axis are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
     _, program, *_, held = second_simulator.PLANS['mild']
     up = second_simulator.directions(9, 5)

@@ -154,7 +154,7 @@ def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
     least = result.least_known
     # Without a posterior there is no claimed sd.
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
-    # A corner, or a neighbour in the grid: the variance is flat there.
+    # The attitude is a corner, or a neighbour of a corner in the grid, as the variance is flat.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
     # d|f| = g (xy, xz, yz) . (three angles of 1 mrad); noise and curves of the faces add a little.

@@ -213,7 +213,7 @@ def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(tmp_path, unit, pee
     sent = 0
 
     def until(condition, what):
-        """Send second after second: the first may come before both ends know each other."""
+        """Send second after second: the node may not yet have discovered the driver."""
         nonlocal sent
         pause = threading.Event()
         for _ in range(len(samples) // RATE_HZ):

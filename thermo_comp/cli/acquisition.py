@@ -179,10 +179,10 @@ class Acquisition:
             self._first = means[0]
         ups = self._directions(means)
         up = self._directions(self._first[None])[0]
-        other = ups @ up < math.cos(math.radians(coverage.SAME_DIRECTION_DEG))
-        if not other.any():
+        is_elsewhere = ups @ up < math.cos(math.radians(coverage.SAME_DIRECTION_DEG))
+        if not is_elsewhere.any():
             return None
-        lower = ranges[int(np.argmax(other))][0]
+        lower = ranges[int(np.argmax(is_elsewhere))][0]
         return cells.start_ns + round(float(cells.index[lower]) * cells.cell_s * 1e9)
 
     def _close(self, end_ns: int) -> None:

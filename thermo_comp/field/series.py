@@ -218,8 +218,8 @@ def series_of(
     white = averaged(np.maximum((sd / K) ** 2, correction.noise) / n[:, np.newaxis])
     noise = (v**2 * white).sum(axis=1) / sizes
     bare = SlowUncertainty(replace(calibration, posterior=None), correction)
-    whole = SlowUncertainty(calibration, correction)
-    slow, claim = (_along(correction, states, shares, model, v, x) for model in (bare, whole))
+    full = SlowUncertainty(calibration, correction)
+    slow, claim = (_along(correction, states, shares, model, v, x) for model in (bare, full))
     unexplained = np.broadcast_to(correction.curves.unexplained(states[:, BOARD])[0].T, x.shape)
     slow -= (v**2 * unexplained).sum(axis=1)
     residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])

@@ -71,9 +71,9 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     model = fit.windows.model
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
-    other = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
+    early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
     # Left-out halves of the program limit the number of columns, which is equal in both models.
-    return other if is_better(fit.selected.score, other.selected.score, by_halves=False) else fit
+    return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
 def windows_of(

@@ -317,10 +317,10 @@ def file_parameters(
                 dynamic = both
             rows += [level, *static, level + delta, *dynamic, *response[used]]
     if regression.forces is not None:
-        every = regression.forces.kinds
-        at = [every.index(kind) for kind in kinds]
+        all_kinds = regression.forces.kinds
+        at = [all_kinds.index(kind) for kind in kinds]
         for places in layout.nonlinear:
-            rows += [*unknown[places[at]], *unknown[places[[len(every) + k for k in at]]]]
+            rows += [*unknown[places[at]], *unknown[places[[len(all_kinds) + k for k in at]]]]
     a, _, c = state.misalignment
     # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the elements (a, b, c) of its inverse.
     of_a, of_b, of_c = unknown[layout.misalignment]

@@ -85,8 +85,8 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     without_slow = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
     selected = select(regression, state, narrow, without_slow, report)
     chosen = selected.posterior
-    wide = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
-    selected = replace(selected, posterior=replace(chosen, prior=wide))
+    full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
+    selected = replace(selected, posterior=replace(chosen, prior=full_prior))
     return Fit(windows, regression, selected, candidates.typical)
 
 

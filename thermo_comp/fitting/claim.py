@@ -74,12 +74,12 @@ def claim_of(
         covariance, offset_sd = _over_mountings(regression, posterior)
     if candidates is not None:
         wider = _with_unseen(regression, posterior, candidates)
-        wide = regression.solve(posterior.state, wider, n_steps=0)
+        with_unseen = regression.solve(posterior.state, wider, n_steps=0)
         # The covariance with unseen columns is computed at the mode's mounting sd. Add the excess
         # of the mixture's covariance over that of the mode.
-        at = _places(posterior.layout, wide.layout)
+        at = _places(posterior.layout, with_unseen.layout)
         excess = covariance - posterior.covariance
-        layout, covariance = wide.layout, wide.covariance.copy()
+        layout, covariance = with_unseen.layout, with_unseen.covariance.copy()
         covariance[np.ix_(at, at)] += excess
     if gravity_sd and regression.gravity:
         # An error of gravity is the same relative error of all three scale factors.
@@ -160,8 +160,8 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
         _norm_evidence(regression, posterior, tried, fits[-1].root),
     ])  # fmt: skip
     nearest = int(np.argmin(np.abs(np.log(tried / prior.offset_sd))))
-    whole, norms = evidence - evidence[:, [nearest]]
-    weight = np.minimum(whole, norms + TRIAL_GAIN) + density
+    of_data, of_norms = evidence - evidence[:, [nearest]]
+    weight = np.minimum(of_data, of_norms + TRIAL_GAIN) + density
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
@@ -218,8 +218,8 @@ def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[La
     model_error = np.zeros_like(drift)
     for trial in selected.trials:
         if trial.is_near:
-            other = within_positions(regression.force(trial.posterior.state), position)
-            model_error = np.maximum(model_error, 0.5 * (other - drift) ** 2)
+            other_drift = within_positions(regression.force(trial.posterior.state), position)
+            model_error = np.maximum(model_error, 0.5 * (other_drift - drift) ** 2)
     static, dynamic = (
         _points(windows.temperature, excess, model_error, rows & np.isfinite(excess[:, 0]))
         for rows in (~windows.is_dynamic, windows.is_dynamic)

@@ -34,10 +34,10 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     root = np.sqrt(square)
     scaled = matrix / root[..., None, :]
     scaled /= root[..., :, None]
-    every = np.arange(matrix.shape[-1])
-    jitters = 1e-13, 1e-11, 1e-9, 1e-7  # tried in turn, each added to those before
+    index = np.arange(matrix.shape[-1])
+    jitters = 1e-13, 1e-11, 1e-9, 1e-7  # added one after another until a factor exists
     for jitter in jitters:
-        scaled[..., every, every] += jitter
+        scaled[..., index, index] += jitter
         try:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
@@ -227,11 +227,11 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -
         rows[:, :n_own, n_own:],
         rows[:, n_own:, n_own:],
     )
-    every = np.arange(n_own)
-    block[:, every, every] += precision[layout.own]
+    index = np.arange(n_own)
+    block[:, index, index] += precision[layout.own]
     cross[..., -1] -= (precision * away)[layout.own]
     # Attitudes without any information keep their value.
-    block[:, every, every] += np.einsum('pii->pi', block) <= 0.0
+    block[:, index, index] += np.einsum('pii->pi', block) <= 0.0
     positions = Blocks.of(block, cross)
     diagonal = np.einsum('pii->pi', starts[..., :r])
     starts = starts - np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned

@@ -13,7 +13,7 @@ attitude) and ``|f| - g`` of the position, if the other positions determine it.
 
 A model is better if it reduces the error by more than the standard error over the folds, both for
 positions and for sections of the program. A model that describes only one recording fails for
-positions, one of only one program fails for sections.
+positions, a model that describes only one program fails for sections.
 
 References
 ----------
@@ -76,14 +76,14 @@ class Folds:
         if not n:
             return None
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
-        whole = float(np.log(before.sum() / after.sum()))
+        of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
             # The scatter of one fold is unknown: its error is the smallest difference that counts.
-            return whole, _EQUAL
+            return of_sums, _EQUAL
         each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))
         spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
-        estimates = [(whole, spread), (float(each.mean()), float(each.std(ddof=1) / np.sqrt(n)))]
+        estimates = [(of_sums, spread), (float(each.mean()), float(each.std(ddof=1) / np.sqrt(n)))]
         if estimates[0][0] * estimates[1][0] < 0.0:
             return 0.0, max(error for _, error in estimates)
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
@@ -215,9 +215,9 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
     covariance, see `Posterior`.
     """
     step, factor = point.unit_step(matrix)
-    whole = np.zeros(point.layout.n)
-    whole[: point.layout.n_unit] = step
-    return point.moved(whole).state, inverse_root(factor)
+    full_step = np.zeros(point.layout.n)
+    full_step[: point.layout.n_unit] = step
+    return point.moved(full_step).state, inverse_root(factor)
 
 
 def _is_determined(by_others: float, by_all: float) -> bool:

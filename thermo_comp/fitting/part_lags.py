@@ -69,9 +69,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         searched = curves(500).lags(noise)
         if searched is None:
             continue
-        many, whole = curves(3000), curves(len(data.time))
-        lags = [many.near(lag, axis) for axis, lag in enumerate(searched)]
-        residual = np.column_stack([whole.residual(lag, axis) for axis, lag in enumerate(lags)])
+        subset, full = curves(3000), curves(len(data.time))
+        lags = [subset.near(lag, axis) for axis, lag in enumerate(searched)]
+        residual = np.column_stack([full.residual(lag, axis) for axis, lag in enumerate(lags)])
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
         x, y, z = (Part(round(lag[0], 1), round(lag[1], 1), round(lag[2], 4)) for lag in lags)
@@ -81,7 +81,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
             return parts
         # A larger residual has another cause, e.g. slow noise: the lags are then accepted only if
         # they reduce the RMS residual of each axis to an eighth or less of that without a lag.
-        if accepted is None and min(map(many.reduction, lags, range(3))) >= 8.0:
+        if accepted is None and min(map(subset.reduction, lags, range(3))) >= 8.0:
             accepted = parts
     return accepted
 
@@ -192,10 +192,10 @@ class _PartCurves:
         free = np.flatnonzero(steps)
 
         def lag_at(values: Floats) -> Part:
-            every = start.copy()
-            every[free] = values
-            second = float(np.exp(every[1])) if first.second_tau_s else 0.0
-            return _in_order(float(np.exp(every[0])), second, float(np.clip(every[2], -2.0, 2.0)))
+            point = start.copy()
+            point[free] = values
+            second = float(np.exp(point[1])) if first.second_tau_s else 0.0
+            return _in_order(float(np.exp(point[0])), second, float(np.clip(point[2], -2.0, 2.0)))
 
         simplex = start[free] + np.vstack((np.zeros(len(free)), np.diag(np.array(steps)[free])))
         options: Any = {'xatol': 2e-3, 'fatol': 1e-4, 'maxfev': 150, 'initial_simplex': simplex}
@@ -275,8 +275,8 @@ class _PartCurves:
 
     def _centred(self, values: Floats) -> Floats:
         """Subtract the weighted mean over each position; multiply by the root of the weight."""
-        every = np.hstack((values, np.ones_like(self._weight))) * self._weight
-        sums = np.add.reduceat(every, self._first, axis=0)
+        weighted = np.hstack((values, np.ones_like(self._weight))) * self._weight
+        sums = np.add.reduceat(weighted, self._first, axis=0)
         level = sums[:, :-1] / sums[:, -1:]
         return np.asarray((values - level[self._position]) * np.sqrt(self._weight))
 

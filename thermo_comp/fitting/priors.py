@@ -223,9 +223,9 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     Return the columns of the bank whose sum is a column, each with its share.
 
     The parts of two units of a type differ in their time constants. A lag is interpolated between
-    those of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages is a
-    sum of two lags, and one between board and sensor a sum of their lags; their powers are
-    approximated by those of one lag of the board with the sum of the time constants.
+    the lags of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages,
+    or behind a temperature between board and sensor, is a sum of single lags; its powers are
+    approximated by the powers of one lag of the board with the sum of the time constants.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE

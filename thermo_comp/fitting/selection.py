@@ -146,9 +146,9 @@ class Growth:
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
         """Fit a model with further groups, and then the same model with bends."""
-        more = tuple(group for group in groups if group in self.free)
-        typical = self._typical(before, more, self._candidates.typical)
-        smooth = self.extended(before, more, typical)
+        added = tuple(group for group in groups if group in self.free)
+        typical = self._typical(before, added, self._candidates.typical)
+        smooth = self.extended(before, added, typical)
         return [smooth, *(self.trials(smooth, [BEND]) if BEND in self.free else [])]
 
     def trials(self, chosen: Trial, absent: list[str]) -> list[Trial]:
@@ -206,8 +206,8 @@ def better_beginning(fits: Sequence[Trial]) -> Trial:
     """
     small, *others = fits
     for large in others:
-        more = log_density(large.posterior) - log_density(small.posterior)
-        is_likelier = more > TRIAL_GAIN and not is_better(large.score, small.score)
+        evidence_gain = log_density(large.posterior) - log_density(small.posterior)
+        is_likelier = evidence_gain > TRIAL_GAIN and not is_better(large.score, small.score)
         if is_likelier or is_better(small.score, large.score):
             return large
     return small
@@ -249,8 +249,8 @@ def select(
     if PART in growth.free:
         # Curves over the temperatures of parts take the place of the curve over that of the board.
         parts = better_beginning([growth.extended(fit, (PART,)) for fit in fits])
-    chosen, more = _grown(growth, first, parts, progress)
-    trials += more
+    chosen, tried = _grown(growth, first, parts, progress)
+    trials += tried
     if chosen is not constants and not is_better(constants.score, chosen.score):
         more_evidence = chosen.posterior.log_evidence - constants.posterior.log_evidence
         if not is_undecided(constants.score, chosen.score) or more_evidence < TRIAL_GAIN:
@@ -272,11 +272,11 @@ def _grown(
         trials = [parts, *growth.trials(parts, [BEND] if BEND in growth.free else [])]
         chosen = _best(chosen, trials)
     if growth.regression.windows.has_part_lags and not _is_complete(chosen):
-        more = growth.with_bends(first, PART_SUMS)
-        trials += more
-        chosen = _best(chosen, more)
-    chosen, more = growth.added(chosen, progress)
-    trials += more
+        tried = growth.with_bends(first, PART_SUMS)
+        trials += tried
+        chosen = _best(chosen, tried)
+    chosen, tried = growth.added(chosen, progress)
+    trials += tried
     is_without_bends = BEND in growth.free and BEND not in chosen.groups
     if is_without_bends and not _is_complete(chosen):
         # A change of slope of a part is visible only in a model with the lag of this part, not in
@@ -284,8 +284,8 @@ def _grown(
         # its drift is less than three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
-            last, more = growth.added(with_bends[0], progress)
-            trials += [*with_bends, *more]
+            last, tried = growth.added(with_bends[0], progress)
+            trials += [*with_bends, *tried]
             if is_better(chosen.score, last.score):
                 chosen = last
     return chosen, trials

@@ -183,15 +183,15 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
     for name in sensors:
         rate, gradient = [np.zeros(0)], [np.zeros(0)]
         for bag in bags:
-            board, other = bag.board, bag.temperatures.get(name, Readings())
-            if min(len(board.value), len(other.value)) < 30:
+            board, sensor = bag.board, bag.temperatures.get(name, Readings())
+            if min(len(board.value), len(sensor.value)) < 30:
                 continue
-            first = max(board.stamp_ns[0], other.stamp_ns[0])
-            last = min(board.stamp_ns[-1], other.stamp_ns[-1])
+            first = max(board.stamp_ns[0], sensor.stamp_ns[0])
+            last = min(board.stamp_ns[-1], sensor.stamp_ns[-1])
             grid = np.arange(0.0, (last - first) * 1e-9, 60.0)
             at, beside = (
                 np.interp(grid, (readings.stamp_ns - first) * 1e-9, readings.value)
-                for readings in (board, other)
+                for readings in (board, sensor)
             )
             if len(grid) > 2:
                 rate.append(np.gradient(at, 60.0))

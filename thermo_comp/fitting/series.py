@@ -96,8 +96,8 @@ class Whitener:
             level *= decay[k][:, None]
             innovation = series[rows] - level
             level += gain[k][:, None] * innovation
-            there = self._is_there[k]
-            result[rows[there]] = (innovation / root[k][:, None])[there]
+            is_present = self._is_there[k]
+            result[rows[is_present]] = (innovation / root[k][:, None])[is_present]
         return result
 
     def log_determinant(self, gains: tuple[Floats, Floats, Floats]) -> float:
@@ -136,7 +136,7 @@ class Whitener:
         level, variance = np.zeros((*shape, 3)), np.broadcast_to(ratio, shape)
         square, size = np.zeros((len(noises), 3)), np.zeros(len(noises))
         for k, rows in enumerate(self._row):
-            there = self._is_there[k]
+            is_present = self._is_there[k]
             decay = np.exp(-self._interval[k] / time_s)
             if k:
                 variance = ratio + decay**2 * (variance - ratio)
@@ -146,8 +146,8 @@ class Whitener:
             gain = variance / total
             level = level + gain[:, :, None] * innovation
             variance = variance * (1.0 - gain)
-            square += np.sum((innovation**2 / total[:, :, None])[:, there], axis=1)
-            size += np.log(total[:, there]).sum(axis=1)
+            square += np.sum((innovation**2 / total[:, :, None])[:, is_present], axis=1)
+            size += np.log(total[:, is_present]).sum(axis=1)
         spread = np.log(np.maximum(square, 1e-300) / self._n).sum(axis=1)
         return np.asarray(3.0 * size + self._n * spread)
 

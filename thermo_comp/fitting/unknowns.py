@@ -84,8 +84,8 @@ class Windows:
         Prior sd of the weights of each axis over that of their column, shape (3, m); 1e-6 for a
         weight that the column does not have.
         """
-        every = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
-        return np.where(every.T, 1.0, 1e-6)
+        acts = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
+        return np.where(acts.T, 1.0, 1e-6)
 
     @property
     def n_sections(self) -> int:

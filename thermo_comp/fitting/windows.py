@@ -304,8 +304,8 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    # Hysteresis and bends of the scale are not modelled, and it has no level of the dynamic set:
-    # Fc = 1 at the reference temperature in both regimes.
+    # The scale has no hysteresis, no bends and no level of the dynamic set: Fc = 1 at the
+    # reference temperature in both regimes.
     in_scale = [*[True] * n_curves, *(column.term.has_scale for column in columns)]
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))

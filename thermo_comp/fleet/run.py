@@ -101,12 +101,12 @@ def fit_fleet(
         rows = fitted(units, options)
         prior, no_prior = _common(list(rows.values()), results)
         if with_prior and prior is not None:
-            rest = [
+            others = [
                 unit
                 for unit in units
                 if not _in_prior(row := rows[unit.name]) and row['verdict'] != FAILED
             ]
-            again = fitted(rest, replace(options, fit=replace(options.fit, prior=prior)))
+            again = fitted(others, replace(options, fit=replace(options.fit, prior=prior)))
             for name, row in again.items():
                 notes = rows[name]['reservations'], f'not fitted with the prior: {row["problem"]}'
                 kept = {'reservations': '; '.join(map(str, filter(None, notes)))}

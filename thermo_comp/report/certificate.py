@@ -83,7 +83,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
         model = float(np.sqrt(max(claimed**2 - noise**2 - attitude**2, 0.0)))
-    rest = float(np.sqrt(max(judgement.headline_rms**2 - claimed**2, 0.0)))
+    excess = float(np.sqrt(max(judgement.headline_rms**2 - claimed**2, 0.0)))
     drift_k, drift, slope = info.thermometers.standard_uncertainty_k, None, ''
     if drift_k is not None:
         drift = drift_k * _slope(calibration)
@@ -99,7 +99,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
         Contribution('thermometers', 'B', drift, slope),
         Contribution('model', 'A', model, 'posterior of all parameters at the judged windows'),
-        Contribution('repeatability', 'A', rest, beyond),
+        Contribution('repeatability', 'A', excess, beyond),
     )
 
 

@@ -289,10 +289,10 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             'Direction of the specific force in the output frame, position by position, in an '
             'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '
             'of elevation. An outlier was moved, or is not of this unit.',
-            'The area of a red ring is proportional to the residual there of a fit to the other '
-            'positions alone, which is the error expected in a new attitude.'
+            'The area of a red ring is proportional to the residual of this position in a fit to '
+            'the other positions alone, which is the error expected in a new attitude.'
             if evidence.left_out
-            else 'The area of a red ring is proportional to the residual there.'
+            else 'The area of a red ring is proportional to the residual of this position.'
             if evidence.residuals
             else '',
             'Red cross: the direction with the largest standard deviation of |f|, which is given; '

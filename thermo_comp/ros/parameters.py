@@ -285,9 +285,11 @@ class ParameterRequests:
     def _set(self, prepared: Future[Any], results: list[SetParametersResult]) -> None:
         """Apply one group; an unexpected error refuses it and is logged by the loop."""
         try:
-            changes, found = prepared.result()
+            changes, preparation = prepared.result()
             news = [change for change in changes if not self._is_in_force(change)]
-            result = self._apply(news, found) if news else SetParametersResult(successful=True)
+            result = (
+                self._apply(news, preparation) if news else SetParametersResult(successful=True)
+            )
             results.append(result if result.successful else _refusal(result.reason))
         except (ThermoCompError, ParameterNotDeclaredException) as error:
             results.append(_refusal(str(error)))

@@ -103,9 +103,9 @@ class FlowEffect(Effect):
 
     def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
         at = [history.nodes.index(part) for part in (self.hot, self.cold)]
-        rest = history.origin[at[:1]] - history.origin[at[1:]]
-        difference = history.deviation[:, at[0]] - history.deviation[:, at[1]] + rest
-        flow, least = ((np.abs(d) / self.knee) ** self.exponent for d in (difference, rest))
+        at_rest = history.origin[at[:1]] - history.origin[at[1:]]
+        difference = history.deviation[:, at[0]] - history.deviation[:, at[1]] + at_rest
+        flow, least = ((np.abs(d) / self.knee) ** self.exponent for d in (difference, at_rest))
         if self.is_limited:
             flow, least = flow / (1.0 + flow), least / (1.0 + least)
         first = (flow - least) * history.of(self.cold) ** self.power

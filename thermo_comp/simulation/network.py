@@ -101,8 +101,8 @@ class ThermalNetwork:
         for link in self.links:
             i, j = index[link.a], index[link.b]
             away = at[i] - at[j]
-            more = link.conductance * (abs(away) ** (link.exponent - 1.0) - 1.0) * away
-            flow[[i, j]] += -more, more
+            extra = link.conductance * (abs(away) ** (link.exponent - 1.0) - 1.0) * away
+            flow[[i, j]] += -extra, extra
         flow[: len(self.nodes)] /= list(self.capacity.values())
         return flow[:-1]
 

@@ -143,7 +143,7 @@ class RegimeSet:
     lack_of_fit: Annotated[
         tuple[LackOfFit, ...],
         'Error of left-out data in excess of the posterior: variance linear between the '
-        'temperatures, held outside.',
+        'temperatures, constant outside.',
     ] = ()
 
     def __post_init__(self) -> None:

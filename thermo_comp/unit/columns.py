@@ -110,7 +110,9 @@ class Column:
         'g_s at rest, for gradient_even, size and square without lag.',
     ] = 0.0
     knee_k: Annotated[
-        float, QUANTITIES['gradient'], 'Where the slope of bend changes, from the reference.'
+        float,
+        QUANTITIES['gradient'],
+        'Temperature at which the slope of bend changes, from the reference.',
     ] = 0.0
     power: Annotated[int, QUANTITIES['power'], 'The value is multiplied by t to this power.'] = 0
     during: Annotated[

@@ -145,10 +145,12 @@ class Curves:
         sets.
         """
         function = self._functions.rows[regime][place]
-        span, other = (edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]])
+        own_range, other_range = (
+            edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]]
+        )
         here, edge = (
-            np.reshape(function.basis(hold(at, *span)), (-1, len(t)))
-            for at in (t, hold(t, *other))
+            np.reshape(function.basis(hold(at, *own_range)), (-1, len(t)))
+            for at in (t, hold(t, *other_range))
         )
         result = shares[1 - regime] * (here - edge)
         ends = zip(self._basis_slopes[regime][place], self._leads, self._beyond(t), strict=True)

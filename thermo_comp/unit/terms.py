@@ -141,7 +141,7 @@ class GradientLag(Term):
     kind, formula, positive = 'gradient_lag', 'lagged g_s', ('tau_s',)
     groups = (
         ('gradient_lag', 'parts between case and board'),
-        # Coefficients of this kind and those before it that change with temperature.
+        # Coefficients of the kinds from `gradient` to this one that change with temperature.
         ('product', 'lags, changing with temperature'),
         ('gradient_x_temperature', 'heat flow, changing with temperature'),
     )
@@ -213,7 +213,7 @@ class Bend(Board):
     centre_key, is_temperature, has_scale = 'knee_k', True, False
 
 
-#: All kinds by name, in the order of their classes: that of the names in the file's schema.
+#: All kinds by name, in the order of their classes, which is also the order in the file's schema.
 TERMS: Final[dict[str, Term]] = {cls.kind: cls() for cls in _CLASSES}
 #: All groups of columns, each with its name in a certificate.
 GROUPS: Final = {name: text for term in TERMS.values() for name, text in term.groups}
