@@ -61,7 +61,7 @@ PLANS: dict[str, tuple[str, Program, float, str, list[Program]]] = {
         ],
     ),
 }  # fmt: skip
-# Fitted from 5 to 35 degC, tested 5 to 20 K beyond.
+# The bags of the fit are from 5 to 35 degC, the held-out runs 5 to 20 K beyond.
 PLANS['beyond'] = (
     *PLANS['mild'][:3],
     'HB',

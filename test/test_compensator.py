@@ -77,7 +77,7 @@ def test_signed_counts_and_the_printed_equations():
 
 
 def test_every_term_by_hand():
-    # The formula by hand: static set at t = 10 K, T_case = T_board (no gradient), no rate.
+    # The expected values are the formula of the static set at t = 10 K without a gradient or rate.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=Axes(*[AxisReference(300.0, 7.0)] * 3),
@@ -315,7 +315,7 @@ def test_what_is_not_finite_is_never_published_whatever_led_to_it(monkeypatch, b
 
     def broken(self, start, end, slow, excess):
         corrected = line(self, start, end, slow, excess)
-        # The second and third of the whole seconds of the stamps.
+        # The correction is not finite while the board temperature is between 21 and 23 degC.
         at = np.asarray(start)[0]
         corrected[0] = np.where((at > 21.0) & (at < 23.0), bad, corrected[0])
         return corrected

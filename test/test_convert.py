@@ -329,7 +329,7 @@ class TestFreezer:
         assert len(block) == 24514
         assert block.temperatures['case'].celsius.min() == pytest.approx(-17.8, abs=0.1)
         assert block.temperatures['board'].celsius.min() == pytest.approx(3.6, abs=0.5)
-        # Three thermometers in three places.
+        # The three thermometers are in three places, so their ranges differ.
         assert block.temperatures['barometer'].celsius.min() == pytest.approx(-17.0, abs=0.1)
         n_barometer = len(block.temperatures['barometer'].celsius)
         assert report.messages['barometer'] == n_barometer

@@ -88,7 +88,7 @@ def test_new_instances(tmp_path, rng, imu, baro):
         bag.accel_stamp_ns, (2_000_000 + np.arange(N) * STEP_US + imu) * 1000
     )
     np.testing.assert_array_equal(bag.accel, force[imu])
-    # 0.3 rounded to float32.
+    # The tolerance is the rounding of 0.3 to float32.
     np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
     # The chip's temperature is constant for ten samples; only its changes are messages.
     np.testing.assert_array_equal(
@@ -227,7 +227,7 @@ def test_absurd_stamps_are_no_stamps(tmp_path, rng):
     path = tmp_path / 'jump.BIN'
     write_new(path, rng)
     body = bytearray(path.read_bytes())
-    # The time of the first IMU message, with all bits set: half a million years.
+    # The time of the first IMU message gets all bits set, which is half a million years.
     at = body.index(b'\xa3\x95\x81') + 3
     body[at : at + 8] = b'\xff' * 8
     path.write_bytes(body)

@@ -123,7 +123,7 @@ def test_columns_of_one_axis_leave_every_bit_of_the_others(rng):
     plain, _ = stream(Compensator(full_bank(rng, axes=()), UNCHECKED), events)
     moved, _ = stream(Compensator(full_bank(rng, axes=(0,)), UNCHECKED), events)
     assert (moved[:, 0] != plain[:, 0]).all()
-    # y, z and their (co)variances.
+    # Columns of x leave y, z and their (co)variances unchanged.
     for column in (1, 2, 6, 7, 8):
         np.testing.assert_array_equal(moved[:, column], plain[:, column])
 
@@ -396,7 +396,7 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # The difference of the sets at the last temperature within both.
+    # Beyond a range the difference of the sets is that at the last temperature within both ranges.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)

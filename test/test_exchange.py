@@ -142,7 +142,7 @@ def test_the_angular_rate_goes_both_ways(cubic):
         bias = sum(value[f'TC_G0_X{power}_{axis}'] * d**power for power in range(4))
         assert bias == pytest.approx(true[2, axis], rel=1e-6)
     np.testing.assert_allclose(again(px4.text), true, atol=1e-9)
-    # A gyroscope with another reference temperature than the accelerometer.
+    # The gyroscope gets another reference temperature than the accelerometer.
     shifted = Polynomial((0.02, *curves[0][1:]))
     moved = px4.text.replace('TC_G0_TREF\t20\t', 'TC_G0_TREF\t30\t')
     assert moved != px4.text
@@ -190,7 +190,7 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic):
     assert any(
         re.search(r'scale over temperature is lost: up to 2.5e\+03 ppm', n) for n in plain.notes
     )
-    # 100 ppm/K of 9.81 m/s^2 on z, nothing on x.
+    # A drift of the scale by 100 ppm/K changes the offset of z by 100 ppm/K of 9.81 m/s^2.
     slope = [numbers(export.text, '\t')['TC_A0_X1_2'] for export in (plain, level)]
     assert slope[1] - slope[0] == pytest.approx(9.81e-4, rel=1e-5)
     assert numbers(plain.text, '\t')['TC_A0_X1_0'] == numbers(level.text, '\t')['TC_A0_X1_0']
@@ -383,7 +383,7 @@ def test_kalibr_without_bias_and_with_several_imus():
     back = import_calibration(f'imu0:\n{imu}  update_rate: 200.0\n', serial='7')
     assert back.unit.input == 'm/s^2'
     assert 'no bias' in back.provenance.notes[0]
-    # M a by hand, with a = (1, 2, 3).
+    # The reading was computed by hand as M a, with a = (1, 2, 3).
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
     with pytest.raises(CalibrationError, match='choose one of the IMUs: there are imu0, imu1'):
         import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')

@@ -84,7 +84,7 @@ def pulls(found, unit):
 
 
 def test_truth_lies_within_the_claimed_sd(response):
-    # Nine numbers that share the reference temperature and the directions.
+    # The nine constants have correlated errors, so the largest may be at 4 sd.
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0
     assert np.sqrt(np.mean(pull**2)) < 2.0
@@ -97,7 +97,7 @@ def test_truth_lies_within_the_claimed_sd(response):
 
 def test_the_response_reaches_the_noise(response):
     row = response.residuals[-1]
-    # White noise of 5 ug / sqrt(Hz) over 60 s: 0.65 ug.
+    # White noise of 5 ug / sqrt(Hz) leaves 0.65 ug over 60 s.
     assert row.fitted.rms / MICRO_G < 0.8
     assert row.fitted.rms < row.left_out.rms < 1.5 * row.fitted.rms
     assert row.raw.rms / MICRO_G > 300.0
@@ -119,7 +119,7 @@ def test_the_paper_s_model_on_its_own_physics(golovach):
         # Each regime has a curve, so that the calibration has no single curve.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
-    # A linear static set and a quadratic dynamic set.
+    # The paper's model has a linear static set and a quadratic dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
     # The paper's model leaves an error in the unit's ramps, which shifts the estimated levels by

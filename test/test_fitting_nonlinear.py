@@ -116,7 +116,7 @@ def test_square_and_cube_are_found_within_their_claims(rng):
     sd = np.sqrt(posterior.variance[places])
     away = posterior.state.nonlinear[:, [0, 2, 3, 5]] - np.array([1e-5, -1e-6, 1e-7, -1e-8])
     assert np.abs(away / sd).max() < 4.0
-    # K2 and K3 to 2 %, as required.
+    # K2 and K3 are required to be right to 2 %.
     assert np.abs(away[:, :2] / [1e-5, 1e-6]).max() < 0.02
     assert all(term.left_out_gain > 1.0 and term.log_evidence_change > 100.0 for term in terms)
 
@@ -243,7 +243,7 @@ def source(run, spin, name):
 
 
 def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
-    # A single temperature, for speed: nine mountings at 1, 3 and 8 g.
+    # For speed the test has one temperature, and nine mountings at 1, 3 and 8 g.
     unit = replace(triad('plain', 3), bend=Bend((10.0, -10.0, 10.0), (1.0, 1.0, -1.0)))
     time, rate = steps((150.0,), tuple(np.sqrt([3.0 * G, 8.0 * G])), 150.0, 20.0)
     program = Cyclogram((0.0, 560.0), (20.0, 20.0))

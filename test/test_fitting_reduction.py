@@ -207,7 +207,7 @@ def test_fast_readings_are_averaged(rng):
 
 @pytest.mark.parametrize(
     ('latitude', 'height', 'expected'),
-    # Published for WGS 84: the equator, the pole, 45 degrees.
+    # These values of gravity are published for WGS 84 at the equator, the pole and 45 degrees.
     [(0.0, 0.0, 9.7803253359), (90.0, 0.0, 9.8321849379), (45.0, 0.0, 9.8061977694)],
 )
 def test_normal_gravity_of_the_tables(latitude, height, expected):

@@ -124,7 +124,7 @@ def test_the_mode_is_that_of_the_dense_problem(solved):
     dense = Dense(regression, prior, mode)
     at = dense.residual(np.zeros(dense.n))
     gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(mode.variance)
-    # In units of sd: Gauss-Newton is repeated until it converges.
+    # Gauss-Newton is repeated until the gradient, in units of sd, vanishes.
     assert np.abs(gradient).max() < 1e-4
     other = least_squares(
         dense.residual, np.zeros(dense.n), x_scale=np.sqrt(mode.variance), method='trf'
@@ -175,7 +175,7 @@ def test_truth_comes_out_without_noise(rng):
         weights = mode.weights[part] / regression.rms
         np.testing.assert_allclose(weights, truth.weights[part], atol=atol)
     np.testing.assert_allclose(mode.start, 0.0, atol=1e-2)
-    # As in the compensator: forward and back again.
+    # The regression corrects windows as the compensator does, which inverts the model.
     force = regression.force(mode)
     np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
 

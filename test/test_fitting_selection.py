@@ -96,7 +96,7 @@ def test_models_that_were_looked_at_show_their_left_out_errors(calm):
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
     assert chosen.score is selected.score
-    # Errors of left-out windows: white noise, plus the uncertainty of the fit to the others.
+    # Left-out windows have white noise, plus the uncertainty of the fit to the other windows.
     assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
@@ -226,7 +226,7 @@ def test_what_a_group_explains_is_what_it_adds(calm):
     evidence = group_evidence(regression, chosen.posterior)
     explains = {(group.part, group.group): group.explains_m_s2 for group in evidence}
     expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
-    # About 100 ug, with a noise of 2 ug.
+    # The effect is about 100 ug, the noise 2 ug.
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
@@ -328,7 +328,7 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
         return chosen, float(np.sqrt(np.mean((table.columns @ missed.T) ** 2)))
 
     chosen, left = drift_left(windows)
-    # 12 positions x 2 angles x 2 columns: a sd of 10 %.
+    # Tilts of 12 positions x 2 angles x 2 columns determine their sd to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
     # A tilt of 5 urad changes any axis by 5 ug; the noise of 720 windows is 0.1 ug for each
     # weight.

@@ -77,7 +77,7 @@ class TestRow:
         assert (row['problem'], row['left_out'], row['chosen']) == ('', '', '')
         assert (row['n_bags'], row['n_left_out'], row['n_positions']) == (6, 0, 6)
         calibration = parse_calibration(outcome.calibration.encode())
-        # Bias of x at the reference temperature, from the row and from the file.
+        # The bias of x at the reference temperature in the row follows from the file.
         x = calibration.axes.x
         bias = (x.bias + calibration.static.x.delta) / x.scale_factor
         assert row['bias_x_ug'] == pytest.approx(bias / 9.80665e-6)

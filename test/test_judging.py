@@ -185,7 +185,7 @@ class TestWindows:
         ]
         evaluation = evaluate(bags, [('it', CLAIMING)])
         whole = evaluation.judgements['it'].sections['all']
-        # +102 ug in one regime, -102 ug in the other: mean 0, RMS 102 ug.
+        # Residuals of +102 ug in one regime and -102 ug in the other have the mean 0.
         assert whole.n == sum(judged(bag, CLAIMING).sections['all'].n for bag in bags)
         assert whole.mean / MICRO_G == pytest.approx(0.0, abs=0.5)
         assert whole.rms == pytest.approx(0.3 / K, rel=1e-3)

@@ -55,7 +55,7 @@ def test_changes_and_their_sd_by_hand():
 
 def test_what_is_no_history():
     unit = dated('2026-01-01')
-    # No history: another model of the same bags, another unit, and a single calibration.
+    # A single calibration, models of the same bags, and another unit are no history.
     other = dataclasses.replace(unit, unit=dataclasses.replace(unit.unit, serial='other'))
     for calibrations in ([unit], [unit, unit], [unit, dataclasses.replace(other)]):
         assert drifts_of(history_of(calibrations)) == []

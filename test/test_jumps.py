@@ -31,7 +31,8 @@ def test_jump_along_gravity(rng, with_gyro):
     # The jump is located by the single sample between the levels.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # 10 s at 25 Hz on each side with a free drift: sd 2 * 3 mg * sqrt(2 / 250) = 0.5 mg; 4 sd.
+    # Samples of 3 mg for 10 s at 25 Hz on each side of the step determine the step, with a free
+    # drift, to 2 * 3 mg * sqrt(2 / 250) = 0.5 mg; the tolerance is 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
     # The board keeps cooling; 20 readings of 20 mK on each side of the step: 2 * 0.02 * sqrt(2 /
@@ -95,7 +96,7 @@ def test_cut_into_blocks_it_is_the_same(rng):
 
 
 def test_drift_with_temperature_is_no_step(rng):
-    # 2 mg/K at up to 6 K/min.
+    # The bias changes by 2 mg/K, at up to 6 K/min.
     rest = Rest(rng)
     rest.accel[:, 2] += 2.0 * MG * (rest.temperature(rest.time) - 20.0)
     assert look(rest) == ()

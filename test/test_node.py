@@ -240,7 +240,7 @@ def test_diagnostics_of_temperatures(peer, saved):
     unit = replace(thermal_calibration(), nonlinearity=Nonlinearity((1.0, 5.0), 1e-4))
     with node_in_thread(*saved(unit, 'temperature_timeout:=20', 'case_timeout:=10')) as node:
         driver = drive(peer, node)
-        # 50 degC: 15 K above the calibrated range.
+        # 50 degC are 15 K above the calibrated range.
         for k in range(5):
             driver.temperatures(START_NS + k * SECOND_NS, 50.0, 50.0)
             driver.counts(START_NS + k * SECOND_NS, *standing(k))

@@ -184,7 +184,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
     # WHY: a calibration was refused, and its bias was applied all the same.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    # Another detector, so that everything is rebuilt.
+    # The second calibration has another detector, so that everything is rebuilt.
     save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
     context = Context()
     rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)
@@ -218,7 +218,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # Raise at each executed line of the building, the exchange and the setting.
+        # The failure was raised at each executed line of the change, which are over 150.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
             change.name: change.value for change in changes

@@ -229,7 +229,7 @@ def driver_bag(path, *topics, metadata=None):
         # Two equivalent topics, and vectors that are not forces.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
-        # The node's output, recognised by the regime topics beside it.
+        # A topic is the node's output if it has the regime topics beside it.
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], None),
         ([('a/imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], '/a/imu/data_raw'),
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag'), ('d/imu', 'imu')], '/d/imu'),

@@ -69,7 +69,7 @@ def test_a_soak_measures_what_the_calibration_lacks():
 
 
 def test_metres_of_a_navigator_by_hand():
-    # 1 mg for 60 s: 9.80665e-3 * 1800 m; one micro-g at Schuler's frequency: 2 R 1e-6.
+    # 1 mg gives 9.80665e-3 * 1800 m in 60 s; one micro-g gives at most 2 R 1e-6 by Schuler.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
 
@@ -161,7 +161,7 @@ def test_rates_are_those_of_the_gyroscope():
         celsius, drawn = np.array(soak.get_data(), dtype=float)
         bias = np.degrees(curve.bias_function.value(celsius - 20.0)) * 1e3
         slope = np.polyfit(celsius, bias, 1)[0]
-        # Equal to rounding; no value in micro-g.
+        # The drawn values equal the bias less a line, in mdeg/s and not in micro-g.
         np.testing.assert_allclose(drawn, bias - slope * (celsius - 20.0), atol=1e-9)
         assert f'{slope:+.3g}'.replace('-', '\u2212') in axes.get_title(loc='left')
     names = [figure.name for figure in figures_of(replace(evidence(), calibration=unit))]

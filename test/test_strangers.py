@@ -235,7 +235,7 @@ def test_a_bias_at_the_reference_is_held_against_its_bound():
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
     bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
     study = cases.Study('', (), {}, bound=bound)
-    # An sd of 2e-3 m/s^2 that the calibration claims in addition to its white noise.
+    # The calibration claims an sd of 2e-3 m/s^2 in addition to its white noise.
     claimed = axis_set(residual_sd_m_s2=2e-3)
     known = regime_set(x=claimed, y=claimed, z=claimed)
     score = strangers.bias_score(calibration(axes=axes, static=known, dynamic=known), study)

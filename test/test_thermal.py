@@ -28,7 +28,7 @@ def feed(tracker, board, case=None, *, start_s=0, step_s=1):
 
 @pytest.mark.parametrize('step_s', [1, 10])
 def test_memory_of_a_ramp_is_the_closed_form(step_s):
-    # After a soak, a ramp of rate r: m = T - L = r tau (1 - exp(-t / tau)).
+    # A ramp of rate r after a soak gives m = T - L = r tau (1 - exp(-t / tau)).
     tracker = ThermalTracker(DetectorSettings(), LAG)
     soak_s, ramp_s, rate = 6000, 1800, 0.5 / 60.0
     t = np.arange(0, soak_s + ramp_s + 1, step_s)

@@ -83,10 +83,10 @@ PARTS = {
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_variances_are_honest(errors, sensor, part):
-    # Mean squared error over claimed variance, ideally 1. In soaks and ramps the claim includes
-    # changes that might have begun, and is up to a few times too large; at the onset and the end
-    # the change is real and not yet detected. Coarse sensors have few independent errors in three
-    # runs: their mean scatters by a factor of 2.
+    # The mean squared error over the claimed variance is ideally 1. In soaks and ramps the claim
+    # includes changes that might have begun, and is up to a few times too large; at the onset and
+    # the end the change is real and not yet detected. Coarse sensors have few independent errors
+    # in three runs: their mean scatters by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -106,8 +106,9 @@ def test_variances_are_honest(errors, sensor, part):
     ],
 )  # fmt: skip
 def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
-    # Limits at about 1.5 times the measured errors: noise averaged over the filter's memory. A
-    # sensor with steps of 1 K crosses an edge every two minutes and determines the rate to 10 %.
+    # The limits are about 1.5 times the measured errors, which are noise averaged over the
+    # filter's memory. A sensor with steps of 1 K crosses an edge every two minutes and determines
+    # the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
@@ -200,7 +201,7 @@ def test_a_blend_has_the_moments_of_the_mixture():
     out, back = mix(*states, 0.25), mix(*states[::-1], 0.75)
     np.testing.assert_allclose(back, out, rtol=1e-12)
     mixed = np.concatenate(samples)
-    # 400 000 samples with an sd of a few: 1 % of the covariances.
+    # 400 000 samples with an sd of a few determine the covariances to 1 %.
     np.testing.assert_allclose(out[:3], mixed.mean(axis=0), atol=0.02)
     np.testing.assert_allclose(out[3:], np.cov(mixed.T)[upper], atol=0.1)
 

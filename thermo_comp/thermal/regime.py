@@ -161,8 +161,9 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # A reading unchanged for longer than the relaxed rate takes to cross a cell, and than a
-        # reversal with the smallest ramp's acceleration stays in a cell, proves calm.
+        # A reading proves calm if it has been unchanged for longer than a change at the relaxed
+        # rate takes to cross a cell, and a reversal at the smallest ramp's acceleration stays in a
+        # cell.
         quantum = sensor.quantum_c
         bend = settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         self._still_ns = round(
