@@ -262,7 +262,7 @@ def main() -> int:
             0,
         )
         moved = float(np.abs([unit['moved'] for unit in plain]).max())
-        say('units without such terms: largest move of bias, scale / sd', moved, 0.0, 1.0)
+        say('units without nonlinearity: largest move of bias, scale / sd', moved, 0.0, 1.0)
     return int(wrong > 0)
 
 

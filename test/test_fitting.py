@@ -296,8 +296,8 @@ def test_saturated_samples_are_refused(rng):
 
 
 def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mountings():
-    # Misalignments of some mrad explain the norms of nine positions. Mountings of 5 mg would
-    # explain them, too, with constants wrong by 5 mg. The noise of a minute is 22 ug.
+    # Misalignments of some mrad explain the norms of nine positions. Mountings of 5 mg would also
+    # explain the norms, with constants wrong by 5 mg. The noise of a minute is 22 ug.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
     calibration = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY)).calibration

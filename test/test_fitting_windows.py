@@ -165,7 +165,7 @@ def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
 
 
 def test_the_lag_of_a_column_moves_it_as_its_slope_says():
-    # A lag that started a microkelvin higher, through the formula of the columns.
+    # The second route shifts the lags by a microkelvin, and evaluates the columns again.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
     layout, table = Layout(spec), ColumnTable(columns, spec, 20.0)

@@ -173,7 +173,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
     ]
     assert left[1] > 10.0 * left[0]
     # Parts with a lag of an hour started at an unknown temperature, which ten minutes do not
-    # separate from a bias: the claimed sd includes a few ug for it, and the error is within it.
+    # separate from a bias: the claimed sd includes some ug for this error.
     sd = float(sd_of_levels(new).max())
     assert sd < 10e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
