@@ -134,7 +134,8 @@ def test_a_bend_moves_with_the_board_and_its_lag():
     state = np.zeros((Layout(spec).width, 1))
     lag = Layout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
-    # Derivatives by the number that a column is computed from, and by the board at a given lag.
+    # The derivatives are by the number that a column is computed from, and by the board at a given
+    # lag.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
     assert not np.any(table.slopes(state))

@@ -91,7 +91,7 @@ def test_every_term_by_hand():
     bias = 7.0 + 2.0 + 0.5 * 10.0 + 0.01 * 100.0
     scale = 300.0 * (1.0 + 1e-4 * 10.0)
     a, b, c = ((n - bias) / scale for n in (1000.0, -500.0, 3000.0))
-    # Constant temperature: the thermometer is exact, only rounding remains.
+    # At constant temperature the thermometer is exact, and only rounding remains.
     assert (x, y, z) == pytest.approx((a, 1e-3 * a + b, 2e-3 * a - 3e-3 * b + c), abs=1e-12)
 
 

@@ -197,7 +197,7 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic):
 
 
 def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic):
-    # WHY: PX4 subtracts from m/s^2 as read; 0.5 % of the scale are 5 mg at rest.
+    # WHY: PX4 subtracts the offset from the reading in m/s^2; 0.5 % of the scale are 5 mg at rest.
     axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
     calibration = replace(cubic, axes=axes)
     plain = export_calibration(calibration, 'px4')
@@ -318,7 +318,7 @@ def test_imu_tk_formula_gives_our_correction(tumbled):
     assert np.all(np.tril(T, -1) == 0.0)
     assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
     theirs = (RAW - numbers[18:]) @ (T @ K).T
-    # Angles are written with six digits: 1e-6 of 90 m/s^2.
+    # Angles are written with six digits, which gives errors of 1e-6 of 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     np.testing.assert_allclose(
         np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12

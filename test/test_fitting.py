@@ -58,7 +58,7 @@ def claimed(calibration):
     return sd[bias], sd[scale], sd[layout.misalignment :]
 
 
-# A reading every four seconds: a ramp of 1.5 K/min changes the board by 0.1 K between them.
+# Readings come every four seconds, in which a ramp of 1.5 K/min changes the board by 0.1 K.
 OWN_LAGS, PAPER, PLAIN = (
     triad(name, 1).with_thermometers(rate_hz=0.25) for name in ('own-lags', 'paper', 'plain')
 )
@@ -183,7 +183,7 @@ def test_six_faces_leave_misalignment_at_its_prior():
     result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'))
     _, _, M = constants(result.calibration)
     _, scale_sd, M_sd = claimed(result.calibration)
-    # Six faces do not determine M: 0 within 1 mrad.
+    # Six faces do not determine M, which stays at 0 with an sd of 1 mrad.
     np.testing.assert_allclose(M, 0.0, atol=1e-5)
     np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
     finding = next(finding for finding in result.findings if finding.name == 'misalignment')

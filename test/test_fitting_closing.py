@@ -52,7 +52,7 @@ def weight(record, closes):
     [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],
 )
 def test_evidence_says_when_the_regime_closes(closes, options):
-    # A reading every four seconds: the case changes by 0.1 K between them.
+    # Readings come every four seconds, in which the case changes by 0.1 K.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
     plan = [Position(PROGRAM, up) for up in FACES]

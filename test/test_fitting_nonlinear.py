@@ -103,8 +103,8 @@ def test_derivatives_are_those_of_differences(rng):
                 )
                 expected = (below - above) / 2e-6
                 derived = derivatives[p, axis, :, column]
-                # Rounding errors of 1e-14 over a step of 1e-6, for forces up to 95 m/s^2 and their
-                # cubes.
+                # The tolerance is rounding of 1e-14 over a step of 1e-6, for cubes of forces up to
+                # 95 m/s^2.
                 scale = np.abs(expected).max()
                 np.testing.assert_allclose(derived, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)
 

@@ -274,7 +274,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
 
 
 def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
-    # Six faces: without one of them the bias of its axis is not separated from the scale.
+    # Without one of six faces the bias of the axis is not separated from the scale.
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
     regression, state = begin(windows, up)
@@ -309,7 +309,7 @@ def test_no_step_goes_uphill(seed):
 def test_what_takes_no_part_any_more_is_gone(solved):
     regression, prior, mode = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
-    # The result also holds for a state to which no step has been applied.
+    # The result is the same for a state to which no step has been applied.
     state = regression.solve(mode.state, narrow, n_steps=0).state
     assert not state.weights[0, :, 2:4].any()
     np.testing.assert_array_equal(state.weights[1], mode.state.weights[1])

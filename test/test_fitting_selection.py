@@ -146,13 +146,13 @@ def test_noises_come_out(noisy):
     _, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
-    # 1080 windows per axis: white noise is determined to 3 %, slightly worse with the slow noise.
+    # 1080 windows per axis determine the white noise to 3 %, slightly worse with the slow noise.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
     # Positions last six correlation times, and curves absorb a part of the slow noise.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
-    # 18 positions x 3 axes, of which directions, scale, bias and M use 36 + 9: nine degrees of
-    # freedom, a sd of 24 %.
+    # Of 18 positions x 3 axes directions, scale, bias and M use 36 + 9: the other nine determine
+    # the sd to 24 %.
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
 
 
@@ -191,7 +191,8 @@ def test_truth_lies_within_the_claimed_sd(noisy):
     errors = truth.errors(regression, chosen.posterior)
     # Pruned weights have no sd; the true weights of the idle columns are 0.
     every = np.concatenate([*errors.values()])
-    # About thirty numbers: their RMS is determined to 13 %, slightly less with estimated prior sd.
+    # About thirty numbers determine their RMS to 13 %, which is slightly less with estimated prior
+    # sd.
     assert len(every) > 20
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
     assert np.abs(every).max() < 4.0
@@ -313,7 +314,7 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
     chosen = fit_all(regression, state, prior, fixed, priors)
     assert chosen.posterior.prior.informative is priors[int(away > 0.0)]
     curve = unit_of(chosen.posterior.state, layout)[places]
-    # The same data: both results differ by less than their uncertainties.
+    # Both fits have the same data, so their results differ by less than their uncertainties.
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()
 
 

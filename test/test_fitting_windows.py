@@ -301,7 +301,8 @@ def test_sections_and_kelvins_by_hand(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # The kelvins of a line are its RMS; those of t^2 its RMS over the largest slope, 2 t.
+    # The kelvins of the column t are its RMS; those of t^2 are its RMS over the largest slope, 2
+    # t.
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

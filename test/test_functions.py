@@ -146,7 +146,7 @@ def test_sd_by_hand():
     assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
     assert scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
-    # An endless ramp of 0.6 K/min: 600 s behind are 6 K.
+    # In an endless ramp of 0.6 K/min a lag of 600 s is 6 K.
     bias, scale = sd_of_states(unit, ramp_states(unit, np.array([25.0]), 0.01, np.inf))
     assert bias[0, 0] == pytest.approx(np.sqrt(9e-4 + 36e-6) / 300.0, rel=1e-6)
     assert scale[0, 0] == pytest.approx(2e-6, rel=1e-6)

@@ -59,7 +59,7 @@ def test_the_sigma_is_that_of_white_noise(rng):
 
 
 def test_updates_find_a_bias_that_levelling_has_not_seen():
-    # An error at the start of the flight: after 25 minutes of ZUPT little of it is left.
+    # After 25 minutes of ZUPT little is left of an error at the start of the flight.
     dt, n_align = 0.5, 600
     force = np.tile(G * UP, (n_align + 3600 + 1, 1))
     force[n_align:, 0] += 1e-3

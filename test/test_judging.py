@@ -102,7 +102,8 @@ class TestWindows:
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
         judgements = evaluate([bag], models).judgements
         drift = SLOPE * 10.0 / K
-        # The estimate of a steady temperature is exact to 1e-7 K, 1e-9 m/s^2.
+        # The estimate of a steady temperature is exact to 1e-7 K, which change the result by 1e-9
+        # m/s^2.
         for name, expected in (('right', 0.0), ('half', drift / 2)):
             windows = judgements[name].windows
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
@@ -149,7 +150,7 @@ class TestWindows:
         assert not inside.any()
         assert len(windows) >= 55
         assert np.unique(windows.position).tolist() == [0, 1]
-        # 0.3 counts of noise over 100 samples: 0.1 mm/s^2 per window.
+        # 0.3 counts of noise over 100 samples are 0.1 mm/s^2 per window.
         assert np.sqrt(np.mean(windows.residual**2)) < 3.0 * 0.3 / K / 10.0
 
     def test_noise_is_claimed_as_it_is(self, tmp_path):

@@ -35,8 +35,8 @@ def test_jump_along_gravity(rng, with_gyro):
     # drift, to 2 * 3 mg * sqrt(2 / 250) = 0.5 mg; the tolerance is 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
-    # The board keeps cooling; 20 readings of 20 mK on each side of the step: 2 * 0.02 * sqrt(2 /
-    # 20).
+    # The board keeps cooling; 20 readings of 20 mK on each side determine its step to 2 * 0.02 *
+    # sqrt(2 / 20).
     assert event.temperature_change_sd == pytest.approx(0.0126, rel=0.4)
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 
@@ -52,7 +52,7 @@ def turned(rest, from_s, angle, with_rate):
 
 @pytest.mark.parametrize('seen', [True, False])
 def test_turn_is_told_by_the_gyro(rng, seen):
-    # 20 mrad in one sample: the norm does not change, so only a gyroscope shows it.
+    # A turn by 20 mrad in one sample does not change the norm, so only a gyroscope shows it.
     rest = Rest(rng)
     turned(rest, 250.0, 0.02, with_rate=seen)
     events = look(rest, with_gyro=True)
@@ -132,7 +132,7 @@ def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
     assert len(bag.intervals) == 2
     (event,) = find_jumps(bag)
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
-    # Limit of 4 sd of the innovation of a sample, which does not depend on earlier samples.
+    # The limit is 4 sd of the innovation of a sample, which does not depend on earlier samples.
     new = sd * np.sqrt(1.0 - np.exp(-2.0 / (rest.rate_hz * tau_s)))
     assert event.along / MG == pytest.approx(20.0, abs=4.0 * new)
 

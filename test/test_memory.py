@@ -149,7 +149,7 @@ def test_a_part_between_board_and_sensor(rng):
 
 
 def test_the_unknown_start_of_a_lag_of_two_stages(rng):
-    # A board in a long random walk, which then stands still.
+    # The board is in a long random walk, and then stands still.
     D, step, n = 0.005, 6.0, 4000
     tau = np.array([900.0, 150.0])
     parts = np.zeros((n, 2))
@@ -226,7 +226,7 @@ def test_start_prior():
 
 
 def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
-    # A board in a long random walk: its lags at the first reading scatter by P.
+    # The lags of a board in a long random walk scatter by P at the first reading.
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0

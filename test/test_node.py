@@ -122,7 +122,7 @@ def test_flag_is_latched_and_not_there_while_unknown(peer, saved):
         assert not flags
         n = 0
         while not flags and n < 4000:
-            # Two minutes of data at a time, until the detector knows that it is a soak.
+            # Two minutes of data at a time are sent, until the detector has recognised the soak.
             for _ in range(120):
                 n += 1
                 driver.temperatures(START_NS + n * SECOND_NS, 20.0, 20.0)

@@ -116,7 +116,8 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
 def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     real_data, work, length, n_sets, sets, drift, mg
 ):
-    # 1420 s after the last jump in parts: each set of parts is corrected by a fit of the others.
+    # The 1420 s after the last jump are cut into parts; each set of parts is corrected by a fit of
+    # the others.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [Part(start, start + length) for start in starts]
@@ -135,7 +136,7 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
                 raw += np.linalg.norm(windows.mean, axis=1).tolist()
                 left += windows.residual.tolist()
     assert len(raw) >= 17 * len(sets) // n_sets
-    # The drift about its mean, as a single attitude does not determine the constants.
+    # Drifts are about their mean, as a single attitude does not determine the constants.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
     # White noise of 1.5 mg per root hertz leaves 0.19 mg in a minute; longer parts are
     # interpolated over a wider range, and the first of five parts is extrapolated.

@@ -217,9 +217,9 @@ def driver_bag(path, *topics, metadata=None):
 @pytest.mark.parametrize(
     ('topics', 'taken'),
     [
-        # REP 145: the driver's topic; the magnetometer's vector is not a force.
+        # The driver's topic of REP 145 is chosen; the vector of the magnetometer is not a force.
         ([('imu/data_raw', 'imu'), ('imu/mag', 'vector')], '/imu/data_raw'),
-        # Xsens: free acceleration and rate are vectors.
+        # The free acceleration and the rate of an Xsens are vectors, but not its force.
         ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
         ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
         # With a filter's output in the bag, the filter's input is chosen.

@@ -54,7 +54,7 @@ def test_bias_and_scale_curves_by_hand():
 
 
 def test_a_soak_measures_what_the_calibration_lacks():
-    # A scale that is wrong by 30 ppm in all soaks, in any direction of gravity.
+    # The scale is wrong by 30 ppm in all soaks, in any direction of gravity.
     windows = evidence().windows
     up = np.array([position.up for position in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity

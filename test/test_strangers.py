@@ -221,7 +221,7 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
 
 
 def test_constants_by_hand_keep_the_scale_of_few_attitudes():
-    # One attitude and much scatter: the best fit is a scale that makes all forces equal.
+    # With one attitude and much scatter the best fit is a scale that makes all forces equal.
     rng = rng_of('few')
     samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
     few = Minutes(samples, np.full(200, 20.0), np.full((200, 3), np.nan))

@@ -219,8 +219,8 @@ def test_what_is_no_number_or_not_newer_changes_nothing(stamp_s, reading):
 
 
 def test_a_small_jump_counts_less_than_a_reading():
-    # 15 sigma: within five limits of 6 sigma, so the reading is used with the influence of one
-    # limit.
+    # An error of 15 sigma is within five limits of 6 sigma, so the reading has the influence of
+    # one limit.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004
