@@ -111,7 +111,6 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
     compensator = Compensator(calibration())
     n = 0
     target = Writer(output, version=9, storage_plugin=StoragePlugin.MCAP)
-    # Chunks are compressed as by `thermo_comp replay`.
     target.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with Reader(path) as reader, target as writer:
         out = writer.add_connection('/imu/data_raw', imu_type.__msgtype__, typestore=store)

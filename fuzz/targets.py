@@ -68,8 +68,7 @@ COMPENSATOR = Compensator(UNIT)
 
 def check_calibration(data: bytes) -> None:
     """
-    Read any bytes as a calibration: an error is one line, and a calibration is equal after writing
-    and reading.
+    Read any bytes as a calibration: an error is one line, a calibration stays equal when written.
     """
     try:
         value = parse_calibration(data, 'fuzz.yaml')

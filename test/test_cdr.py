@@ -125,7 +125,6 @@ def test_what_has_another_form_goes_through_rclpy(kind, override):
     assert deserialize_message(written, Imu) == deserialize_message(expected, Imu)
     assert doubles(written) == doubles(expected)
     assert slow.last_result == fast.last_result is not None
-    # Later messages use the fast path again.
     convert(slow, good)
     assert slow.traffic.n_fallback == 1
 

@@ -76,7 +76,6 @@ def test_change_is_even_about_rest():
 def test_what_the_bank_needs_remembered():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
-    # Separate lags for the plays that follow a lag.
     taus = {
         name: tuple(lag.tau_s for lag in spec.lags if lag.input == name) for name in spec.inputs
     }

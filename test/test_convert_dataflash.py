@@ -138,7 +138,6 @@ def test_corrected_log_is_refused(tmp_path, rng):
     with pytest.raises(RecordingError, match=r'INS_TCAL1_ENABLE was 1.*already'):
         read_autopilot(path)
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
-    # The drift of the second IMU was not corrected.
     assert len(read_autopilot(path, imu=1).stamp_ns) == N
 
 
@@ -148,7 +147,6 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
 @pytest.mark.parametrize(
     ('course', 'kept', 'share'),
     [
-        # INS_TCAL1_ENABLE is switched on in flight, then off.
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
         # WHY: a log of ArduPilot's learning was refused, because ArduPilot sets 1 after the

@@ -92,7 +92,6 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
     columns = guess_columns(path)
     assert columns.stamp.unit == unit
     assert columns.accel.unit == ('g' if one_g == 1.0 else 'm/s^2')
-    # Reading the printed map gives the guessed map.
     (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(columns)))
     assert load_column_map(tmp_path / 'map.yaml') == columns
     log = table_log(path, columns)

@@ -123,7 +123,6 @@ def test_columns_of_one_axis_leave_every_bit_of_the_others(rng):
     plain, _ = stream(Compensator(full_bank(rng, axes=()), UNCHECKED), events)
     moved, _ = stream(Compensator(full_bank(rng, axes=(0,)), UNCHECKED), events)
     assert (moved[:, 0] != plain[:, 0]).all()
-    # Columns of x leave y, z and their (co)variances unchanged.
     for column in (1, 2, 6, 7, 8):
         np.testing.assert_array_equal(moved[:, column], plain[:, column])
 
@@ -304,7 +303,6 @@ def test_a_swap_keeps_the_memory_where_the_same_is_remembered(rng):
     assert compensator.thermal.tracker.memory is tracker.memory
     compensator.swap(replace(unit, response=unit.response[:5]))
     assert compensator.thermal.tracker.memory is not tracker.memory
-    # The latest readings are kept.
     assert compensator.thermal.tracker.board.stamp_ns == tracker.board.stamp_ns
     assert compensator.process(61 * SECOND_NS, 0.0, 0.0, 2900.0) is not None
 

@@ -142,7 +142,6 @@ def test_the_angular_rate_goes_both_ways(cubic):
         bias = sum(value[f'TC_G0_X{power}_{axis}'] * d**power for power in range(4))
         assert bias == pytest.approx(true[2, axis], rel=1e-6)
     np.testing.assert_allclose(again(px4.text), true, atol=1e-9)
-    # The gyroscope gets another reference temperature than the accelerometer.
     shifted = Polynomial((0.02, *curves[0][1:]))
     moved = px4.text.replace('TC_G0_TREF\t20\t', 'TC_G0_TREF\t30\t')
     assert moved != px4.text
@@ -330,7 +329,6 @@ def test_imu_calib_and_kalibr_formulas_give_our_correction(tumbled):
     theirs = RAW @ np.reshape(data['SM'], (3, 3)).T - data['bias']
     np.testing.assert_allclose(theirs, ours(tumbled, RAW), rtol=1e-10)
     imu = yaml.safe_load(export_calibration(tumbled, 'kalibr', number=1).text)['imu1']
-    # Kalibr predicts the reading as M a + b.
     part = imu['accelerometers']
     reading = ours(tumbled, RAW) @ np.array(part['M']).T + part['bias']
     np.testing.assert_allclose(reading, RAW, rtol=1e-12)

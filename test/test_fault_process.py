@@ -140,7 +140,6 @@ def test_calibration_files_that_go_bad(path, tmp_path):
             assert result.reason.startswith(f'{bad}: ')
             assert reason in result.reason
             assert '\n' not in result.reason
-    # The calibration in use stays in use.
     n = sum(len(block.force) for block in heard)
     table = corrected(events)[1][:n, :3]
     np.testing.assert_allclose(

@@ -142,7 +142,6 @@ def test_the_evidence_is_complete(response):
     assert [row.section for row in provenance.residuals] == ['static', 'dynamic', 'all']
     assert {finding.level for finding in response.findings} <= {'advice', 'good'}
     assert 'refusal' not in {finding.level for finding in response.findings}
-    # The file contains the contribution of each group.
     judged = {(group.part, group.group) for group in calibration.evidence}
     # The bias of each axis of this unit is a curve over the temperature of the axis' part.
     assert {('bias', 'part'), ('scale', 'part')} <= judged

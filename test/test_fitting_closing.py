@@ -71,7 +71,6 @@ def uneven(rng):
     lengths = (7, 1, 12, 4)
     position = np.repeat(np.arange(len(lengths)), lengths)
     steps = rng.uniform(1.0, 9.0, len(position))
-    # A gap that is longer than the short correlation time.
     steps[12] = 4000.0
     time = np.concatenate(
         [100.0 * k + np.cumsum(steps[position == k]) for k in range(len(lengths))]

@@ -103,8 +103,7 @@ def test_derivatives_are_those_of_differences(rng):
                 )
                 expected = (below - above) / 2e-6
                 derived = derivatives[p, axis, :, column]
-                # The tolerance is rounding of 1e-14 over a step of 1e-6, for cubes of forces up to
-                # 95 m/s^2.
+                # The tolerance is rounding of 1e-14 over 1e-6, for forces up to 95 m/s^2.
                 scale = np.abs(expected).max()
                 np.testing.assert_allclose(derived, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)
 
@@ -136,7 +135,6 @@ def test_an_odd_square_joins_only_where_it_is(rng):
     _, posterior, terms = chosen(rng, kq=1e-5, share=0.0)
     assert [term.kind for term in terms] == ['odd_square']
     assert posterior.state.nonlinear[:, 1] == pytest.approx(1e-5, rel=0.02)
-    # The change with temperature was removed.
     assert not posterior.state.nonlinear[:, 4].any()
 
 

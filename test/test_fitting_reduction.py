@@ -182,7 +182,6 @@ def test_windows_are_as_long_as_stated(rate_hz, cell_s, window_s, rng):
     assert bag.window_s == window_s
     assert bag.n_cells == pytest.approx(150 / cell_s)
     assert interval.n_whole == len(interval.time) == 150 / window_s
-    # A sample is in exactly one window.
     np.testing.assert_allclose(interval.count, window_s * rate_hz, atol=1.0)
     np.testing.assert_allclose(np.diff(interval.time), window_s, atol=1.0 / rate_hz)
 
@@ -235,8 +234,7 @@ def test_gravity_is_that_of_the_earth(gravity):
 
 
 def course(quantum, noise, rng):
-    # The signal is a soak, a ramp of 1 K/min through a lag of 300 s, and a soak, at 1 Hz for three
-    # hours.
+    # Three hours at 1 Hz are a soak, a ramp of 1 K/min through a lag of 300 s, and a soak.
     time = np.arange(0.0, 10800.0)
     air = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
     celsius = np.empty_like(air)

@@ -309,7 +309,7 @@ def test_no_step_goes_uphill(seed):
 def test_what_takes_no_part_any_more_is_gone(solved):
     regression, prior, mode = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
-    # The result is the same for a state to which no step has been applied.
+    # The result is that of a state to which no step has been applied.
     state = regression.solve(mode.state, narrow, n_steps=0).state
     assert not state.weights[0, :, 2:4].any()
     np.testing.assert_array_equal(state.weights[1], mode.state.weights[1])

@@ -49,7 +49,6 @@ def selected_of(truth, windows, up, forced=()):
     candidates = candidates_of(windows, forced)
     parts = []
     selection = select(regression, state, constants(truth), candidates, parts.append)
-    # Progress rises.
     assert parts == sorted(parts)
     assert 0.0 < parts[0] <= parts[-1] <= 1.0
     return regression, selection
@@ -83,7 +82,6 @@ def test_what_explains_nothing_is_not_chosen(calm):
     assert {(group.part, group.group) for group in evidence} == {
         (part, group) for part in ('bias', 'scale') for group in ('curve', 'board')
     }
-    # The weights of a column left out are exactly 0.
     assert not chosen.posterior.state.weights[..., IDLE].any()
 
 
@@ -151,8 +149,7 @@ def test_noises_come_out(noisy):
     # Positions last six correlation times, and curves absorb a part of the slow noise.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
-    # Of 18 positions x 3 axes directions, scale, bias and M use 36 + 9: the other nine determine
-    # the sd to 24 %.
+    # Of 18 x 3 readings directions, scale, bias and M use 36 + 9: the others give the sd to 24 %.
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
 
 

@@ -286,7 +286,6 @@ def test_covariance_of_the_file_is_that_of_the_claim(fitted):
         assert by_file[bias] == pytest.approx(expected, rel=1e-4)
         expected = sd[claim.layout.kappa[axis]] / state.kappa[axis]
         assert by_file[scale] == pytest.approx(expected, rel=1e-4)
-        # The stated error of gravity is included.
         assert by_file[scale] > 1e-4 / STANDARD_GRAVITY
     places = claim.layout.misalignment[[0, 2]]
     np.testing.assert_allclose(by_file[-3:][[0, 2]], sd[places], rtol=1e-4)
@@ -296,13 +295,11 @@ def test_sections_and_kelvins_by_hand(bags):
     windows = windows_of(bags)
     data, t = windows.data, windows.temperature - 20.0
     for p in range(data.n_positions):
-        # Sections are equal parts of the program, in order.
         section = data.section[data.position == p]
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # The kelvins of the column t are its RMS; those of t^2 are its RMS over the largest slope, 2
-    # t.
+    # The kelvins of column t are its RMS; those of t^2 are its RMS over the largest slope, 2 t.
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

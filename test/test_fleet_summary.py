@@ -143,7 +143,6 @@ class TestPage:
         assert all(re.fullmatch(r"[\w./%'()~-]+", link) for link in links)
         assert re.findall(r'\ssrc="', page) == []
         assert "default-src 'none'" in page
-        # Residuals, and distances.
         assert page.count('<figure') == 2
 
     def test_a_fleet_without_a_calibration(self):

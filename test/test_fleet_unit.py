@@ -46,7 +46,6 @@ def test_the_fit_is_that_of_thermo_comp_fit(fleet, brief):
     ours = parse_calibration(brief.calibration.encode())
     theirs = fit(sources, replace(OPTIONS.fit, serial='mems-0001')).calibration
     assert ours.provenance.sources == theirs.provenance.sources
-    # Only the date of the fit differs.
     assert ours == replace(theirs, provenance=ours.provenance)
 
 

@@ -204,7 +204,6 @@ def test_nothing_to_count_gives_nan():
 def test_norm_residual_does_not_see_a_rotation(rng):
     force = rng.normal(size=(5, 3))
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    # A rotation moves each norm by rounding only.
     np.testing.assert_allclose(
         norm_residual(force @ turn.T, 9.8), norm_residual(force, 9.8), atol=1e-14
     )

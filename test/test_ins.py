@@ -44,8 +44,7 @@ def test_levelling_makes_the_force_vertical(rng):
 
 
 def test_the_sigma_is_that_of_white_noise(rng):
-    # The flight lasts a third of Schuler's period; its error is noise of levelling and integrated
-    # noise.
+    # In a third of Schuler's period the error is noise of levelling and integrated noise.
     density, dt = 1e-4, 0.5
     force = G * UP + rng.normal(0.0, density / np.sqrt(dt), (40_000, 3))
     free = fly(Model(force, density, 0.0), dt, UP, G, 0.0)

@@ -102,8 +102,7 @@ class TestWindows:
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
         judgements = evaluate([bag], models).judgements
         drift = SLOPE * 10.0 / K
-        # The estimate of a steady temperature is exact to 1e-7 K, which change the result by 1e-9
-        # m/s^2.
+        # The estimate of a steady temperature is exact to 1e-7 K, which are 1e-9 m/s^2.
         for name, expected in (('right', 0.0), ('half', drift / 2)):
             windows = judgements[name].windows
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
@@ -225,7 +224,6 @@ class TestVerdict:
         assert judgement.verdict == verdict
         assert judgement.is_valid == verdict.startswith('valid')
         assert judgement.exit_code == (0 if judgement.is_valid else 1)
-        # Residuals and claim are compared over the same windows.
         assert judgement.sections['all'].ratio == pytest.approx(residual / claimed)
         for value in (residual, raw, claimed):
             assert spoken(value * MICRO_G) in judgement.reason
@@ -356,7 +354,6 @@ class TestShifts:
     def test_a_unit_as_it_was_has_not_moved(self):
         judgement = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)
         assert (len(judgement.shifts), judgement.moved, judgement.verdict) == (3, (), 'valid')
-        # Five positions do not determine the shifts.
         judgement = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
         assert (judgement.shifts, judgement.n_positions) == ((), 5)
 

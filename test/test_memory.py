@@ -65,7 +65,6 @@ def test_what_is_not_known_of_a_lag():
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
-    # The uncertainty decays with the lag's time constant.
     variance = bank.at(150 * SECOND_NS, 2.0)[1]
     assert variance == pytest.approx([lost**2 * math.exp(-2.0), 0.0])
     bank.note_jump(3.0)
@@ -111,7 +110,6 @@ def test_a_lag_of_two_stages_is_that_of_two_parts_in_series(rng):
     # The solver steps over the corners of the input, with an error of some microkelvin.
     np.testing.assert_allclose(streamed[:, 0], board - part, atol=1e-5)
     np.testing.assert_allclose(streamed[:, 2], part, atol=1e-5)
-    # The play follows the part, and not the board.
     assert np.abs(streamed[:, 4]).max() <= 0.4 + 1e-12
     held = streamed[:, 4] + part
     is_inside = np.abs(streamed[:, 4]) < 0.4 - 1e-9

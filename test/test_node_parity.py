@@ -58,7 +58,6 @@ def thermal_test(path, imu=False, has_case=True):
         for topic, values, late_ns in (
             (TOPICS.board, board, 350_000_000),
             (TOPICS.case, case, 1_250_000_000),
-            # The third thermometer of `rich_calibration`.
             ('temperature/frame', 0.5 * (board + case) + 1.0, 700_000_000),
         ):
             if topic == TOPICS.case and not has_case:
@@ -68,7 +67,6 @@ def thermal_test(path, imu=False, has_case=True):
             writer.write_temperature(topic, reading_ns, noisy, reading_ns + late)
         if imu:
             rest = ImuColumns(*(rng.standard_normal((n, k)) for k in (4, 9, 3, 9, 9)))
-            # Every tenth message states that it has no angular rate.
             rest.angular_velocity_covariance[::10, 0] = -1.0
             covariance = rest.linear_acceleration_covariance
             force = accel / [300.0, -295.0, 310.0]

@@ -149,7 +149,6 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     tests = second_simulator.runs_of(unit, held[0], second_simulator.directions(1, 7), 7,
                                      soaked_s=21600.0, soaked_c=20.0)  # fmt: skip
     for record in (*records, *tests):
-        # Keep every fifth reading, one in 10 s.
         for name in ('board', 'case', 'board_stamp_ns', 'case_stamp_ns'):
             setattr(record, name, getattr(record, name)[::5])
     result = fit_and_correct(records, tests, full_scale=second_simulator.FULL_SCALE)

@@ -92,7 +92,6 @@ def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
     assert abs(off) < 4.0 * quantum + 2.0 + lead
     state = tracker.sample(second * SECOND_NS)
     assert math.sqrt(state[VAR_BOARD if frozen == 'board' else VAR_GRADIENT]) > 0.5
-    # The sensor is not used until its reading changes.
     assert not tracker.read(frozen, (second + 1) * SECOND_NS, last[frozen])
     assert tracker.read(frozen, (second + 2) * SECOND_NS, last[frozen] + 0.07)
     assert guard.fault == Fault.NONE

@@ -152,7 +152,6 @@ def said(result):
 def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
     result = fitted(rng, FACES)
     least = result.least_known
-    # Without a posterior there is no claimed sd.
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
     # The attitude is a corner, or a neighbour of a corner in the grid, as the variance is flat.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)

@@ -264,7 +264,6 @@ def test_any_messages_give_sound_numbers(of, config, sent):
     limit = bound(of) * (1.0 + 1e-9)
     now_ns, last_ns, n_jumps, n_counts = START_NS, -math.inf, 0, 0
     for topic, step, value in sent:
-        # Stamps that a message can contain.
         now_ns = min(max(now_ns + step, -(2**31) * 10**9), 2**31 * 10**9 - 1)
         if topic != 'counts':
             compensator.push(topic, now_ns, value)

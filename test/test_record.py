@@ -158,7 +158,6 @@ class TestGrowing:
         bags = numbered_bags(tmp_path / 'bags')
         assert [str(bag) for bag in bags] == result['bags']
         assert [bag.name for bag in bags] == [f'{k:02d}.mcap' for k in range(1, N_POSITIONS + 1)]
-        # No message is lost, repeated or moved.
         assert contents(bags) == contents([session])
         assert f'position {N_POSITIONS}: good' in finished.stderr
 
@@ -170,7 +169,6 @@ class TestGrowing:
                 'record', bag, '--positions', '3', '--soak', '80s', '-o', bags, '--json', code=None
             )
             result = json.loads(finished.stdout)
-            # The bag ends before the test is complete.
             assert finished.returncode == (0 if result['is_complete'] else 1)
             assert result['n_good'] == (2, 3)[number - 1]
         assert len(numbered_bags(bags)) == 3

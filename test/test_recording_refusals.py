@@ -77,7 +77,6 @@ def test_ros_1_messages_in_an_mcap_file(tmp_path):
     assert block.accel.tolist() == [[1.5, -2.5, 3.5]]
     assert block.accel_stamp_ns.tolist() == [12 * 10**9 + 34]
     assert block.frame_id == 'link'
-    # A raw message is CDR like any other.
     message = Message(ACCEL, 1, 12 * 10**9 + 34, 'link', (1.5, -2.5, 3.5))
     assert block.raw['accel'].data.tobytes() == serialize(message)
 
@@ -259,7 +258,6 @@ def test_what_is_corrected_already_is_explained(tmp_path):
     with pytest.raises(RecordingError, match=told):
         open_recording(path, require=('accel',))
     assert told in str(inspect_recording(path).chosen)
-    # The user's choice.
     with open_recording(path, Topics.named({'imu': 'imu/data_raw'}), require=('accel',)) as reader:
         assert reader.topics['accel'] == '/imu/data_raw'
 

@@ -205,8 +205,8 @@ def test_table_over_temperature(tmp_path):
             at = float(row.temperature.replace('−', '-'))
             bias, sd, scale, scale_sd = in_a_soak(calibration, at)
             numbers = [float(cell.replace('−', '-')) for cell in row[2:]]
-            # The tolerance is half a digit of each value, and half a tenth of a kelvin at the ends
-            # of the range.
+            # The tolerance is half a digit of each value, and half a tenth of a kelvin at either
+            # end.
             slack = 0.06 * abs(table.bias_slope) + 0.06 * numbers[1]
             assert numbers[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)
             assert numbers[1] == pytest.approx(2.0 * sd[k] / MICRO_G, rel=0.06)

@@ -126,7 +126,6 @@ def test_figures_are_legible_in_black_and_white(draw):
         for axes in figure.axes:
             looks = [look(line) for line in axes.get_legend_handles_labels()[0]]
             assert len(set(looks)) == len(looks)
-            # Axes over time or temperature have a unit.
             if axes.axison and axes.get_ylabel():
                 assert any(
                     unit in axes.get_ylabel()

@@ -352,7 +352,6 @@ def carried_bag():
 
 def test_rests_of_a_recording_are_its_long_stays():
     rows = rests_of(carried_bag())
-    # The blocks exclude a minute at each end.
     expected = [(60, 17940), (18060, 35940), (36180, 86340)]
     assert [(rest.start, rest.stop) for rest in rows] == expected
 

@@ -106,9 +106,8 @@ def test_variances_are_honest(errors, sensor, part):
     ],
 )  # fmt: skip
 def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
-    # The limits are about 1.5 times the measured errors, which are noise averaged over the
-    # filter's memory. A sensor with steps of 1 K crosses an edge every two minutes and determines
-    # the rate to 10 %.
+    # The limits are about 1.5 times the measured errors, noise averaged over the filter's memory.
+    # A sensor with steps of 1 K crosses an edge every two minutes and determines the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
@@ -219,8 +218,7 @@ def test_what_is_no_number_or_not_newer_changes_nothing(stamp_s, reading):
 
 
 def test_a_small_jump_counts_less_than_a_reading():
-    # An error of 15 sigma is within five limits of 6 sigma, so the reading has the influence of
-    # one limit.
+    # 15 sigma are within five limits of 6 sigma, so the reading has the influence of one limit.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004

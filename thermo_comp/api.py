@@ -247,7 +247,6 @@ def fit(
             options.setdefault('input', 'counts' if kind == 'counts' else 'm/s^2')
         for one in items:
             if isinstance(one, Columns):
-                # A thermometer that was not recorded has no readings.
                 nothing: Temperature = ([], [])
                 readings = {'board': nothing, 'case': nothing, **one.temperatures}
                 block = _block(one.time_s, one.counts, readings, one.start_ns)

@@ -75,7 +75,6 @@ def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
     # Slices of `_SPHERE`: faces, edges and corners of a cube, then all other directions.
     tiers = slice(0, 6), slice(6, 18), slice(18, 26), slice(26, None)
     tier = next(tier for tier in tiers if good[tier].any())
-    # Among directions of equal gain take the first.
     return np.asarray(_SPHERE[tier][np.argmax(gain[tier] >= 0.99 * gain[tier].max())])
 
 

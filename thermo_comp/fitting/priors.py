@@ -206,7 +206,6 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     share = 0.01
     scatter = (1.0 - share) * away.T @ away
     scatter[np.diag_indices_from(scatter)] += share * np.sum(away**2, axis=0)
-    # Add the variance of the mean.
     scatter *= 1.0 + 1.0 / len(vectors)
     # Parameters that none of the units determined keep the uncertainty of their own prior.
     scatter += np.mean([covariance for _, covariance in units], axis=0)

@@ -339,7 +339,6 @@ def _windows(
 ) -> StillInterval:
     """Average the cells of a still interval to windows of `per_window` cells."""
     n_whole, rest = divmod(upper - lower, per_window)
-    # A remainder below half a window is dropped.
     end = upper - rest if n_whole and 2 * rest < per_window else upper
     rows = slice(lower, end)
     offsets = np.arange(0, end - lower, per_window)

@@ -175,7 +175,6 @@ class Growth:
         likely.sort(key=gains.__getitem__, reverse=True)
         tried = likely[:3]
         if chosen.groups == (CURVE,) and (SET,) in likely[3:]:
-            # The paper's two sets are always tried.
             tried.append((SET,))
         return [
             self.extended(chosen, groups, self._typical(chosen, groups, typical))

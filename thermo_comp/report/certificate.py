@@ -129,7 +129,6 @@ def results(
         return []
     unit = 'counts' if calibration.unit.input == 'counts' else 'm/s²'
     bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
-    # Without a covariance there is no uncertainty to expand.
     known = COVERAGE if calibration.has_uncertainty else np.nan
     scale_sd = np.hypot(scale_sd, _gravity_part(evidence, info)) * np.abs(scale)
     below = ((1, 0), (2, 0), (2, 1))

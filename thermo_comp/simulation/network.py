@@ -148,7 +148,6 @@ class ThermalResponse:
         self.network, self._time = network, time
         heat = network.thermostat
         if heat is not None:
-            # Index of the thermostat's integral.
             n = len(network.nodes)
             watts = [network.settled(float(a))[n] for a in (air.max(), air.min())]
             if watts[0] < 0.0 or watts[1] > heat.max_power:
