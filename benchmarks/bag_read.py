@@ -134,7 +134,7 @@ def measure(
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description='Reading a bag to columns against its peers.')
+    parser = argparse.ArgumentParser(description='Reading a bag, against rosbags and mcap.')
     parser.add_argument(
         '--samples', type=int, default=2_000_000, help='messages that thermo_comp reads'
     )

@@ -226,7 +226,7 @@ def memory(folder: Path, gigabytes: float) -> None:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description='The offline run against its peers.')
+    parser = argparse.ArgumentParser(description='The offline run, against rosbags.')
     parser.add_argument('--samples', type=int, default=1_000_000, help='samples of the pipelines')
     parser.add_argument('--hours', type=float, default=2.0, help='length of the bag for reading')
     parser.add_argument('--compression', default='zstd', choices=('none', 'lz4', 'zstd'))

@@ -110,7 +110,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # With this normalisation the sum of n equal rests is sqrt(n) times a single rest.
+        # Q is orthogonal, so the sum of n equal rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
         mean = np.full(Q.shape[1], series.temperature[at].mean() - series.reference_temperature)
         parts.append(

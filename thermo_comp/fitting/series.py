@@ -10,9 +10,10 @@ the regression.
 The noise is white plus exponentially correlated (first-order Gauss-Markov). Within a position the
 error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a
 stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std 952,
-Annex B.4.3); a random walk is its limit for a long T. The innovations of a Kalman filter for this
-noise, divided by their standard deviations, are white and contain the same information, so samples
-and columns that are filtered alike can be treated by ordinary least squares [1]_.
+Annex B.4.3); a random walk is its limit for a long T. The innovations of a Kalman filter for white
+plus Gauss-Markov noise, divided by their standard deviations, are white and contain the same
+information, so samples and columns that are filtered alike can be treated by ordinary least
+squares [1]_.
 
 References
 ----------

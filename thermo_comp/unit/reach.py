@@ -4,8 +4,8 @@
 Owns the limits of a calibration's bias and scale over its temperatures, relative to full scale.
 
 A bias is within the converter's range, so level and curve stay within twice the full scale. The
-largest value of a column, and the uncertainty, stay within a million times this limit: far beyond
-any instrument, and without overflow.
+largest value of a column, and the uncertainty, stay within a million times the limit of a bias:
+far beyond any instrument, and without overflow.
 """
 
 from __future__ import annotations
