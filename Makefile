@@ -5,7 +5,7 @@
 # make test   sets up .venv, runs the whole test suite
 # make lint   ruff, mypy --strict and the layering test
 # make nightly  the properties, ten thousand examples each
-# make oldest  the suite under the oldest versions of what setup.py asks for, in .venv-oldest
+# make oldest  the suite with the oldest versions that setup.py allows, in .venv-oldest
 # make fuzz   the fuzz targets, FUZZ_SECONDS (60) each
 # make bench  installs the package beside it, in .venv-bench, and measures its speed (half an hour)
 # make docs   builds the documentation as a site, in site/

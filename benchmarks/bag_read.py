@@ -103,7 +103,7 @@ def measure(
     folder: Path, n: int, n_peers: int, repeats: int, chunk_bytes: int
 ) -> Iterator[dict[str, Any]]:
     """
-    Yield one row of results per compression; all readers take turns, the best of each counts.
+    Yield the best result of each reader, one row per compression; the readers take turns.
     """
     for compression in COMPRESSIONS:
         ours, peers = folder / f'{compression}.mcap', folder / f'{compression}_peers.mcap'
@@ -134,7 +134,7 @@ def measure(
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description='Reading a bag to columns against its peers.')
+    parser = argparse.ArgumentParser(description='Reading a bag, against rosbags and mcap.')
     parser.add_argument(
         '--samples', type=int, default=2_000_000, help='messages that thermo_comp reads'
     )

@@ -4,8 +4,8 @@
 Owns the table of every command on every degenerate input: exit code, seconds, peak memory.
 
 For any recording or table a command ends in time, in bounded memory, with a sentence instead of a
-traceback, and with exit code 0 only if no data are lost. A run that fails in any of these points
-is marked ``!`` and makes the exit code of the benchmark 1.
+traceback, and with exit code 0 only if no data are lost: else the run is marked ``!``, and the
+exit code of the benchmark is 1.
 
     python benchmarks/degenerate.py --only jump --json degenerate.json
 """

@@ -109,7 +109,7 @@ def imu(
 
 
 def _by_turns(force: np.ndarray) -> np.ndarray:
-    """Make every second row exactly zero, like a driver that sends gyroscope rows between."""
+    """Make every second row exactly zero, like a driver that alternates with gyroscope rows."""
     return force * (np.arange(len(force)) % 2)[:, None]
 
 

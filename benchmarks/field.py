@@ -80,14 +80,14 @@ def root_mean(values: Floats) -> float:
 
 def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     """
-    Say whether the update, and the best filter, are worse than the old file on a day: whether the
-    RMS over its n starts is larger by more than its standard error, the claim over sqrt(2 n).
+    Return whether the update, and the best filter, are worse than the old file on a day: by more
+    than the standard error of the RMS over n starts, which is the claimed sd over sqrt(2 n).
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K
     warmth = np.array([rest.state[0] for _, rest in after]) - REFERENCE_C
     of_best = np.linalg.norm(corrected(counts, warmth, kalman), axis=1) - G
-    # Windows of one attitude are averaged, as those of a series are.
+    # Average the windows of each attitude, as `series_of` does.
     group = np.repeat(np.arange(len(old)), old.n_windows)
     of_best = np.bincount(group, of_best) / old.n_windows
 
@@ -124,7 +124,9 @@ def best(history: History, process: Process, days: int) -> BestFilter:
 
 
 def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, float]:
-    """Age and update one unit: squared errors at the end, comparisons by day, time of the last."""
+    """
+    Age and update a unit: squared errors at the end, comparisons by day, time of the last update.
+    """
     shock_day = np.random.default_rng([seed, 7]).uniform(0.2, 0.8) * days
     process = Process(shock_day=float(shock_day))
     history = live(kind, seed, days, process)
@@ -146,7 +148,8 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
     kalman = filtered(history, process, days)
     f = corrected(counts, warmth, kalman)
     of_best = np.column_stack((np.linalg.norm(f, axis=1) - G, f - force))
-    # A claim is of one window of another start a day later: turn-on, noise, a day's walk.
+    # The claimed sd is that of a window of another start a day later, so add turn-on, noise and a
+    # day's walk to the error.
     rng = np.random.default_rng([seed, 9])
     of_bias = np.hypot(process.turn_on, process.bias)
     more = (series.direction * rng.normal(0.0, of_bias, (N_PROBES, 3))).sum(axis=1)
@@ -195,7 +198,7 @@ def simulated(kind: str, n_units: int, days: int) -> None:
 
 
 def log_size() -> None:
-    """Print the size of a month's log of these units."""
+    """Print the size of a month's log of an ageing unit."""
     history = live('carried', 0, 30, Process())
     size = sum(len(encode(rest)) for _, rest in history.rests)
     size += sum(len(encode(start)) for start in {start for start, _ in history.rests})

@@ -4,7 +4,7 @@
 Owns the ageing units of the benchmark `field.py`: physics, rests, reference filter.
 
 A unit leaves the laboratory with a calibration whose error is drawn from the covariance that the
-calibration states. From then on bias and scale walk at random, each start has another bias offset,
+calibration states. In the field bias and scale walk at random, each start has another bias offset,
 and one shock moves the biases. The forward model and the Kalman filter are written here in numpy
 and share no code with the update; the filter is given the true variances and the shock's start.
 """
@@ -123,7 +123,7 @@ def measured(force: Floats, warmth: Floats, state: Floats) -> Floats:
 
 
 def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Return the force that counts [K] mean to a file with deviations `state`."""
+    """Correct counts [K] with a calibration file of deviations `state`."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray((counts - bias) / scale @ M.T)
 

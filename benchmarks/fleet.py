@@ -7,7 +7,7 @@ Units are simulated and written to bags once (``--folder`` keeps them), and fitt
 command `fleet fit`. Workers are processes of one thread, as by `fleet fit`.
 
     python benchmarks/fleet.py scaling              strong and weak, 1 and 2 workers
-    python benchmarks/fleet.py overhead             500 small units, and 100 workers on paper
+    python benchmarks/fleet.py overhead             500 small units, and 100 computed workers
     python benchmarks/fleet.py kill --units 200     200 x 12 bags, a worker killed twice
 """
 
@@ -195,17 +195,17 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
     print('|---|---|---|---|---|---|---|')
     collected: list[tuple[float, float, float]] = []
     for number in range(repeats):
-        one, two, half = (
+        solo, pair, half = (
             measure(folder / 'fleet', units, workers, options)
             for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
         )
-        # Other programs on the processors slow two workers more than one. With a processor each,
-        # two workers only lose waiting time, and time by sharing caches and memory; neither
-        # depends on other programs.
-        free = 2.0 * two.busy(2) / one.busy(1) * one.cpu_s / two.cpu_s
-        collected.append((one.seconds / two.seconds, free, 2.0 * half.seconds / two.seconds))
+        # Other programs on the processors slow two workers more than one. Two workers with a
+        # processor each lose time only by waiting and by sharing caches and memory, which does not
+        # depend on other programs.
+        free = 2.0 * pair.busy(2) / solo.busy(1) * solo.cpu_s / pair.cpu_s
+        collected.append((solo.seconds / pair.seconds, free, 2.0 * half.seconds / pair.seconds))
         print(
-            f'| {number + 1} | {one.seconds:.1f} | {two.seconds:.1f} | {collected[-1][0]:.2f} '
+            f'| {number + 1} | {solo.seconds:.1f} | {pair.seconds:.1f} | {collected[-1][0]:.2f} '
             f'| {free:.2f} | {half.seconds:.1f} | {collected[-1][2]:.2f} |',
             flush=True,
         )

@@ -6,12 +6,12 @@ Owns the position error of an inertial navigator due to accelerometer drift, raw
 A platform stands in the chamber of the held-out bag, so that any motion that its navigator
 computes is an error. The navigator levels itself for five minutes, then navigates freely for half
 an hour; or it gets a zero-velocity update (ZUPT) every minute, and then coasts for five minutes.
-A flight of either kind begins in every minute of the run, with the raw accelerometer, with one set
+One flight of each kind begins in every minute of the run, with the raw accelerometer, with one set
 of coefficients, and compensated.
 
 The gyroscopes are ideal and the Earth does not rotate, so that only the accelerometer matters; the
-vertical channel, which needs a barometer, is held. The filter has four
-errors per level axis, position p, velocity v, tilt a and accelerometer b, as of [1]_ chapter 12::
+height, which needs a barometer, is kept constant. The filter has four errors per level axis,
+position p, velocity v, tilt a and accelerometer b, as of [1]_ chapter 12::
 
     p' = v      v' = b - g a      a' = v / R      b' = -b / tau + noise
 
@@ -127,7 +127,7 @@ class Flights:
 
 
 def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> Flights:
-    """Level, stand with zero-velocity updates, then navigate freely; start in every minute."""
+    """Level, stand with zero-velocity updates, navigate freely; a flight starts every minute."""
     n_align = round(ALIGN_S / dt)
     n = round((zupts_s + (COAST_S if zupts_s else FREE_S)) / dt)
     starts = np.arange(0, len(model.force) - n_align - n, round(EVERY_S / dt))

@@ -16,19 +16,19 @@ rate the node is measured once more while its `calibration_file` is set twice a 
 binds each relay to a core. `--floor` measures a third relay, too, which copies bytes with one wait
 set, one subscription and the node's profile, and computes nothing.
 
-The source keeps `--depth` samples to repeat them. With a reliable relay Fast DDS removes received
-samples from this store 859 at a time; with 2000 kept samples the removal delays the source by 1 to
+The source keeps `--depth` samples to repeat them. With a reliable relay Fast DDS removes samples
+from the source's store 859 at a time; with 2000 kept samples the removal delays the source by 1 to
 3 ms, which is no property of the relay.
 
 Processes that missed each other's first announcements discover each other at the next, 3 s later.
-A process that then opens another's shared memory may stand still for a third of a second, as Fast
-DDS waits for a reader there. The measurement begins when all processes have been discovered.
+A process that opens another's shared memory may stand still for a third of a second, as Fast DDS
+waits for a reader. The measurement begins when all processes have been discovered.
 
 An idle core sleeps and needs time to wake up, and an idle virtual core may be given away. If the
-system allows it (Linux, as root) all cores are therefore kept awake for all relays alike, by a
-request for no latency in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` they may sleep.
-The host may stop a virtual machine all the same, and all processes with it. The share of stolen
-time is at the end of each row ("stolen"): latencies are meaningful if it is small.
+system allows it (Linux, as root) all cores are kept awake for all relays alike, by a request for
+no latency in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` they may sleep. The host may
+stop a virtual machine with all its processes. The share of stolen time is at the end of each row
+("stolen"): latencies are meaningful if it is small.
 """
 
 from __future__ import annotations

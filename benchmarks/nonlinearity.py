@@ -204,9 +204,9 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
         result[f'{one.kind} ratio'] = (np.array(one.coefficient) - true) / of_terms[:, 0, k]
         slope = np.array(one.per_kelvin) - unit.share * true
         result[f'{one.kind} slope ratio'] = slope / of_terms[:, 1, k]
-    # Nearly along an axis, where the terms are largest.
-    other = np.eye(3)[seed % 3] * rng.choice((-1.0, 1.0)) + 0.1 * rng.standard_normal(3)
-    new = run(unit, other / np.linalg.norm(other), rng, (5.0,))
+    # The new mounting is nearly along an axis, where the terms are largest.
+    direction = np.eye(3)[seed % 3] * rng.choice((-1.0, 1.0)) + 0.1 * rng.standard_normal(3)
+    new = run(unit, direction / np.linalg.norm(direction), rng, (5.0,))
     result['after'] = np.array([left(calibration, new, 5.0)])
     result['before'] = np.array([left(without_terms(calibration), new, 5.0)])
     return result
@@ -220,7 +220,7 @@ def main() -> int:
     parser.add_argument('--processes', type=int, default=2)
     options = parser.parse_args()
     with ProcessPoolExecutor(options.processes) as pool:
-        found = list(pool.map(partial(figures, k2=1e-5, k3=1e-6), range(options.units)))
+        results = list(pool.map(partial(figures, k2=1e-5, k3=1e-6), range(options.units)))
         plain = list(pool.map(partial(figures, k2=0.0, k3=0.0), range(100, 100 + options.without)))
     wrong = 0
 
@@ -232,19 +232,26 @@ def main() -> int:
             f'{name:58} {value:9.3g}   goal {low:g} .. {high:g}   {"met" if is_met else "MISSED"}'
         )
 
-    for seed, one in enumerate(found):
+    for seed, one in enumerate(results):
         print(seed, *one['kinds'], f'before {one["before"][0]:.0f} after {one["after"][0]:.2f} ug')
     for kind in ('square', 'cube'):
-        has = [unit for unit in found if kind in unit]
-        say(f'{kind}: share of units that have it', len(has) / len(found), 1.0, 1.0)
+        has = [unit for unit in results if kind in unit]
+        say(f'{kind}: share of units that have it', len(has) / len(results), 1.0, 1.0)
         each = np.array([unit[kind] for unit in has])
         say(f'{kind}: RMS relative error', float(np.sqrt(np.mean(each**2))), 0.0, 0.02)
         say(f'{kind}: largest relative error', float(np.abs(each).max()), 0.0, 0.02)
         for name in (f'{kind} ratio', f'{kind} slope ratio'):
             ratio = np.array([unit[name] for unit in has])
             say(f'{name}: RMS error / claim', float(np.sqrt(np.mean(ratio**2))), 0.7, 1.4)
-    say('all terms are square and cube', float(all(len(one['kinds']) == 2 for one in found)), 1, 1)
-    rms = {k: float(np.sqrt(np.mean([one[k] ** 2 for one in found]))) for k in ('before', 'after')}
+    say(
+        'all terms are square and cube',
+        float(all(len(one['kinds']) == 2 for one in results)),
+        1,
+        1,
+    )
+    rms = {
+        k: float(np.sqrt(np.mean([one[k] ** 2 for one in results]))) for k in ('before', 'after')
+    }
     say('5 g in a new mounting without the terms, RMS [ug]', rms['before'], 200.0, 700.0)
     say('5 g in a new mounting, RMS [ug]', rms['after'], 0.0, 3.0)
     if plain:
@@ -255,7 +262,7 @@ def main() -> int:
             0,
         )
         moved = float(np.abs([unit['moved'] for unit in plain]).max())
-        say('units without such terms: largest move of bias, scale / sd', moved, 0.0, 1.0)
+        say('units without nonlinearity: largest move of bias, scale / sd', moved, 0.0, 1.0)
     return int(wrong > 0)
 
 

@@ -111,7 +111,6 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
     compensator = Compensator(calibration())
     n = 0
     target = Writer(output, version=9, storage_plugin=StoragePlugin.MCAP)
-    # Chunks are compressed as by `thermo_comp replay`.
     target.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with Reader(path) as reader, target as writer:
         out = writer.add_connection('/imu/data_raw', imu_type.__msgtype__, typestore=store)
@@ -227,7 +226,7 @@ def memory(folder: Path, gigabytes: float) -> None:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description='The offline run against its peers.')
+    parser = argparse.ArgumentParser(description='The offline run, against rosbags.')
     parser.add_argument('--samples', type=int, default=1_000_000, help='samples of the pipelines')
     parser.add_argument('--hours', type=float, default=2.0, help='length of the bag for reading')
     parser.add_argument('--compression', default='zstd', choices=('none', 'lz4', 'zstd'))

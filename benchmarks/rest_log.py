@@ -20,7 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
-# A domain that no user and no test has.
+# A ROS domain that no user and no test uses.
 os.environ |= {'ROS_DOMAIN_ID': '87', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
 import numpy as np

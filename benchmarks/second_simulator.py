@@ -7,9 +7,10 @@ Run ``python benchmarks/second_simulator.py`` for the table of docs/accuracy.md,
 ``python benchmarks/second_simulator.py --kinds own,even --plans wide --seeds 1``.
 
 Air, case, board, three heads and their pendulums are nodes of one ODE network, integrated in steps
-of 2 s; the board's own heat makes it warmer than the case. Bias and scale follow the pendulums.
-Samples come at 1 Hz with 5 ug of noise, thermometers at 0.5 Hz with 5 mK. Three runs are held out,
-with other attitudes, ramps, orders, and another temperature at which the unit has soaked.
+of 2 s; the board's own heat makes it warmer than the case. Bias and scale are functions of the
+pendulums' temperatures. Samples come at 1 Hz with 5 ug of noise, thermometers at 0.5 Hz with 5 mK.
+Three runs are held out, with other attitudes, ramps, orders, and another temperature at which the
+unit has soaked.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ PLANS: dict[str, tuple[str, Program, float, str, list[Program]]] = {
         ],
     ),
 }  # fmt: skip
-# Fitted from 5 to 35 degC, tested 5 to 20 K beyond.
+# The bags of the fit are from 5 to 35 degC, the held-out runs 5 to 20 K beyond.
 PLANS['beyond'] = (
     *PLANS['mild'][:3],
     'HB',

@@ -83,7 +83,7 @@ class Soak:
         self.process = node
         self.rate = rate
         self.node = rclpy.create_node('soak', context=context)
-        # The loop of the samples serves no clients.
+        # The client has a node of its own, as the loop that takes samples does not serve clients.
         self._operator = rclpy.create_node('operator', context=context)
         self.client = self._operator.create_client(SetParameters, 'thermo_comp/set_parameters')
         self._executor = SingleThreadedExecutor(context=context)
@@ -170,8 +170,8 @@ class Soak:
         while not self.n_heard and time.monotonic() < deadline:
             self.send(self.rate // READINGS_HZ)
             time.sleep(1.0 / READINGS_HZ)
-        # Samples before discovery are lost. A report may have arrived already, and be the last
-        # with a larger number than the previous one.
+        # Samples before discovery are lost. Wait until two reports, at least one period apart,
+        # have the same number of samples.
         self.wait_for(lambda: int(self.account.get('samples in', 0)) > 0, 'a report')
         n_in = -1
         while n_in != int(self.account['samples in']):

@@ -3,9 +3,9 @@
 """
 Owns the means of a minute and the curves by scipy of the benchmark `strangers.py`.
 
-Constants are nine numbers: bias, scale and misalignment. A cubic has in addition, for each axis, a
-cubic of the bias and a line of the scale over board temperature. Constants and cubic are fitted by
-scipy's least squares on ``|f| - g``.
+Constants are nine numbers: bias, scale and misalignment. A cubic has in addition to the constants,
+for each axis, a cubic of the bias and a line of the scale over board temperature. Constants and
+cubic are fitted by scipy's least squares on ``|f| - g``.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from strangers_units import GRAVITY, REFERENCE_C, Bag, Floats
 Ints = npt.NDArray[np.int64]
 
 WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
-#: Largest bias [g], error of the scale and misalignment of a plausible unit. Without this bound
-#: the best fit to few attitudes has scale factors that make the forces of all attitudes equal.
+#: Largest bias [g], error of the scale and misalignment of a plausible unit. Without a bound the
+#: best fit to few attitudes has scale factors that make the forces of all attitudes equal.
 LARGEST = 0.2
 SPAN_K = (
     15.0  # unit of the temperatures of a cubic, so that its powers have similar magnitudes [K]

@@ -111,7 +111,9 @@ class Unit:
     sensors: tuple[str, ...] = ('board', 'case')
 
     def bias_at(self, part_c: Floats, hidden_k: Floats | float = 0.0) -> Floats:
-        """Evaluate the bias [ug] of parts [degC], shape (n, 3); `hidden_k` is above the board."""
+        """
+        Evaluate the bias [ug] of parts [degC], shape (n, 3); `hidden_k`: hidden node less board.
+        """
         x = part_c - REFERENCE_C
         bias = self.bias + sum(c * x ** (k + 1) for k, c in enumerate(self.bias_curve))
         bias = bias + self.kink * np.maximum(part_c - self.kink_c, 0.0)

@@ -38,7 +38,7 @@ AXES = ('x', 'y', 'z')
 CALIBRATION_HEAD = """\
 # The calibration file
 
-A calibration file describes one unit. It is YAML, written by `thermo_comp fit`.
+A calibration file describes one unit in YAML, and is written by `thermo_comp fit`.
 `config/calibration.example.yaml` is an annotated example, `config/calibration.schema.json` the JSON
 Schema; this page is generated from the schema.
 
@@ -91,10 +91,10 @@ same order; the `gyroscope` uses the ranges, the reference temperature and the t
 BOUNDS = """\
 ## Bounds
 
-Each number in a calibration is one of these quantities. The bounds are wider than any instrument needs; a calibration
+Each number in a calibration is one of the quantities in the table. The bounds are wider than any instrument needs; a calibration
 within these bounds gives finite results and a positive definite covariance. Further bounds depend on the full scale of the unit.
 The bias including its curve must stay within twice the full scale over the whole temperature range. The largest
-contribution of a column, and of one standard deviation of a parameter, must stay within a million times this bound. The
+contribution of a column, and of one standard deviation of a parameter, must stay within a million times twice the full scale. The
 relative scale including the largest contributions of all columns must stay between 0.1 and 10.
 """
 
@@ -136,7 +136,7 @@ an output that is its input.
 ## Recording a test
 
 `thermo_comp record` is a separate node, `thermo_comp_record`: it subscribes to the inputs above, and to every other
-`temperature/<name>`, once they have a publisher, reliably if offered. This node publishes nothing. See
+`temperature/<name>`, once they have a publisher, reliably if offered. `thermo_comp_record` publishes nothing. See
 [Recording](recording.md#recording).
 
 ## Parameters
@@ -235,7 +235,7 @@ def _define(cls: Any, definitions: dict[str, Any]) -> None:
     if cls.__name__ in definitions:
         return
     hints, required = fields_of(cls)
-    # A schema comes before those of its fields.
+    # The schema of a dataclass comes before the schemas of its fields.
     result = definitions[cls.__name__] = {
         'type': 'object',
         'description': inspect.cleandoc(cls.__doc__),

@@ -68,7 +68,7 @@ COMPENSATOR = Compensator(UNIT)
 
 def check_calibration(data: bytes) -> None:
     """
-    Read any bytes as a calibration: an error is one line, a calibration survives its round trip.
+    Read any bytes as a calibration: an error is one line, a calibration stays equal when written.
     """
     try:
         value = parse_calibration(data, 'fuzz.yaml')

@@ -28,7 +28,7 @@ from hypothesis import settings
 ROOT = Path(__file__).resolve().parent.parent
 
 # One BLAS thread, as several threads for many small matrices wait for each other on a busy
-# machine. It is set before the import of numpy, which reads the variable.
+# machine. The variable is set before numpy is imported, which reads it.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
@@ -163,7 +163,9 @@ def _caught(name, descriptor):
 
 @contextmanager
 def _as_a_process(cwd):
-    """Give a command the state of a new process, and restore that of this process afterwards."""
+    """
+    Give a command the state of a new process, and restore the state of this process afterwards.
+    """
     folder, environment = Path.cwd(), dict(os.environ)
     log = logging.getLogger()
     handlers, log.handlers = log.handlers, []  # pytest's handlers keep log messages from stderr

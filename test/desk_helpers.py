@@ -41,7 +41,7 @@ def write_fit_of_the_readme(path, cli):
 
 
 class Desk:
-    """Prepares files once, and runs examples in folders where they lie ready."""
+    """Prepares files once, and runs examples in folders that contain these files."""
 
     def __init__(self, folder, cli, once):
         self._cli = cli
@@ -115,7 +115,6 @@ class Desk:
             rng = np.random.default_rng(5)
             rests = np.repeat(9.8154 * positions(12, 2) + (0.1, -0.2, 0.3), 500, axis=0)
             rests += 0.02 * rng.standard_normal(rests.shape)
-            # The unit is turned between two rests.
             moves = np.arange(len(rests)) % 500 < 100
             rests[moves] += 5.0 * rng.standard_normal((int(moves.sum()), 3))
             time = 0.01 * np.arange(len(rests))

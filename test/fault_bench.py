@@ -4,8 +4,8 @@
 Owns the fault bench: it sends messages over DDS to the real node process and collects the output.
 
 Messages are sent at full speed in lots of some hundred; after each lot the bench waits until the
-node's diagnostics account for every sample. Thereby no message is lost by accident, a fault shows
-in at least one report, and the result does not depend on the machine.
+node's diagnostics account for every sample. Because the bench waits, no message is lost by
+accident, a fault shows in at least one report, and the result does not depend on the machine.
 """
 
 import struct

@@ -3,8 +3,8 @@
 """
 Owns the outputs shown in the README and on the page of the command line, and their comparison.
 
-``python test/readme_helpers.py`` runs the commands of that page and writes their output into it,
-and the picture of the demonstration into docs/images.
+``python test/readme_helpers.py`` runs the commands of docs/cli.md and writes their output into the
+page, and the picture of the demonstration into docs/images.
 """
 
 import os

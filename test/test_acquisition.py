@@ -42,7 +42,6 @@ class Stream:
         size = round(seconds * RATE)
         for begin in range(0, len(accel), size):
             rows = slice(begin, begin + size)
-            # One reading per second.
             places = np.arange(begin, min(begin + size, len(accel)))
             at = places[places % round(RATE) == 0]
             board = Readings(stamp_ns[at], celsius[at], at - begin)

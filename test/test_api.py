@@ -84,7 +84,7 @@ def test_readings_beside_the_samples_are_those_at_times_of_their_own(arrays):
         for here in [~np.isnan(arrays[name])]
     }
     again = unit.correct(arrays['time_s'], arrays['counts'], **pairs)
-    # Values held between the readings, as in a merged table.
+    # The values are held between the readings, as in a merged table.
     filled = {
         name: np.repeat(arrays[name][~np.isnan(arrays[name])], 10) for name in ('board', 'case')
     }

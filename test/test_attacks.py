@@ -211,7 +211,7 @@ def test_a_calibration_killed_at_any_line_of_its_writing_is_the_old_or_the_new(t
     lines = [line.split() for line in done.stdout.splitlines()]
     *killed, last = lines
     assert last == ['0', 'new']
-    # At every line of the writing, before and after the rename.
+    # The writing was killed at every line, before and after the rename.
     assert len(killed) > 30
     assert {code for code, _ in killed} == {str(signal.SIGKILL.value)}
     assert [name for name, _ in itertools.groupby(name for _, name in killed)] == ['old', 'new']

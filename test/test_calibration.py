@@ -27,9 +27,9 @@ from thermo_comp.unit.functions import CubicSpline, Exponential
 from thermo_comp.unit.provenance import GroupEvidence
 
 REPOSITORY = Path(__file__).parents[1]
-# Within twice the full scale of 32767.
+# A bias must be within twice the full scale of 32767.
 number = st.floats(-6.5e4, 6.5e4)
-# The fourth power of 15 K times this is far from making a scale function 0.
+# With these coefficients the fourth power of 15 K is far from making a scale function 0.
 small = st.floats(-1e-6, 1e-6)
 RICH = rich_calibration()
 

@@ -125,7 +125,6 @@ def test_what_has_another_form_goes_through_rclpy(kind, override):
     assert deserialize_message(written, Imu) == deserialize_message(expected, Imu)
     assert doubles(written) == doubles(expected)
     assert slow.last_result == fast.last_result is not None
-    # Later messages use the fast path again.
     convert(slow, good)
     assert slow.traffic.n_fallback == 1
 
@@ -148,7 +147,7 @@ def test_unreadable_bytes_are_counted_and_the_stream_goes_on(bad):
 
 def test_the_first_message_may_be_any_bytes():
     # WHY: found by fuzzing: a first message of one byte matched the initial empty layout. PROMISE:
-    # it is counted, and the stream goes on.
+    # a message of one byte is counted, and the stream goes on.
     for n in range(40):
         converter = SampleConverter(Vector3Stamped)
         good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])

@@ -134,7 +134,6 @@ class TestBags:
         path = bag(tmp_path / 'bag', board=False)
         self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--topic board=')
         refused(cli, 1, r'temperature/board', 'evaluate', path, '-c', unit)
-        # A fit recognises a bag without a board temperature.
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.8')
         assert 'no temperature was recorded' in cli('fit', path, *arguments).stdout
 

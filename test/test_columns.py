@@ -64,7 +64,7 @@ def test_change_is_even_about_rest():
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((Layout(MemorySpec(('case', 'tip'))).width, 3))
-    # At the gradient at rest, and equally far on either side.
+    # The gradients are that at rest, and two equally far from it on either side.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -76,7 +76,6 @@ def test_change_is_even_about_rest():
 def test_what_the_bank_needs_remembered():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
-    # Separate lags for the plays that follow a lag.
     taus = {
         name: tuple(lag.tau_s for lag in spec.lags if lag.input == name) for name in spec.inputs
     }
@@ -134,7 +133,8 @@ def test_a_bend_moves_with_the_board_and_its_lag():
     state = np.zeros((Layout(spec).width, 1))
     lag = Layout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
-    # Derivatives by the number that a column is computed from, and by the board at a given lag.
+    # The derivatives are by the number that a column is computed from, and by the board at a given
+    # lag.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
     assert not np.any(table.slopes(state))

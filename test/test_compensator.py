@@ -67,7 +67,7 @@ def assert_same(blocks, rows, index):
 
 def test_signed_counts_and_the_printed_equations():
     # Signed counts of +g and -g: the offset is half their sum, the scale is of half their
-    # difference. Eq. (3) and (4) as printed exchange the two.
+    # difference. Eq. (3) and (4) as printed exchange sum and difference.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -77,7 +77,7 @@ def test_signed_counts_and_the_printed_equations():
 
 
 def test_every_term_by_hand():
-    # The formula by hand: static set at t = 10 K, T_case = T_board (no gradient), no rate.
+    # The expected values are the formula of the static set at t = 10 K without a gradient or rate.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=Axes(*[AxisReference(300.0, 7.0)] * 3),
@@ -91,7 +91,7 @@ def test_every_term_by_hand():
     bias = 7.0 + 2.0 + 0.5 * 10.0 + 0.01 * 100.0
     scale = 300.0 * (1.0 + 1e-4 * 10.0)
     a, b, c = ((n - bias) / scale for n in (1000.0, -500.0, 3000.0))
-    # Constant temperature: the thermometer is exact, only rounding remains.
+    # At constant temperature the thermometer is exact, and only rounding remains.
     assert (x, y, z) == pytest.approx((a, 1e-3 * a + b, 2e-3 * a - 3e-3 * b + c), abs=1e-12)
 
 
@@ -141,8 +141,8 @@ def at_seconds(*events):
     ]
 
 
-# Which waiting readings are of another clock depends on their order of arrival, also across cuts:
-# after a reading from tomorrow, and after one that was applied in between.
+# The examples: a reading from tomorrow, or a reading that was applied before, decides which of the
+# waiting readings are of another clock, also if a cut separates them.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -315,7 +315,7 @@ def test_what_is_not_finite_is_never_published_whatever_led_to_it(monkeypatch, b
 
     def broken(self, start, end, slow, excess):
         corrected = line(self, start, end, slow, excess)
-        # The second and third of the whole seconds of the stamps.
+        # The correction is not finite while the board temperature is between 21 and 23 degC.
         at = np.asarray(start)[0]
         corrected[0] = np.where((at > 21.0) & (at < 23.0), bad, corrected[0])
         return corrected

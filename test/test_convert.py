@@ -94,7 +94,7 @@ def test_counts_become_an_imu_with_a_sensitivity(tmp_path):
     )
     block = read_recording(tmp_path / 'bag').columns
     np.testing.assert_allclose(block.accel[:, 0], columns['ax'] * STANDARD_GRAVITY / 2048.0)
-    # The sensitivity is checked as a unit is.
+    # A stated sensitivity is compared with |a| at rest, like a stated unit.
     wrong = table_log(path, column_map(accel={**accel, 'counts_per_g': 16384.0}))
     with pytest.raises(RecordingError, match=r'16384 per g are stated$'):
         write_log(wrong, tmp_path / 'other')
@@ -255,7 +255,7 @@ class TestColumnMap:
             ({'board': {'column': 'b', 'publish': 'all'}}, 'board.publish', 'unknown key'),
             ({'accel': {'columns': [0, 1, 2], 'unit': 'counts', 'output': 'counts'},
              'gyro': {'columns': [3, 4, 5], 'unit': 'rad/s'}}, None,
-             'a gyro travels in an Imu message'),
+             'a gyro is part of an Imu message'),
             ({'accel': {'columns': ['x', 'x', 'z'], 'unit': 'g', 'output': 'imu'}}, None,
              "column 'x' is given twice"),
             ({'board': {'column': 'b'}, 'case': {'column': 'b'}}, None,
@@ -329,7 +329,7 @@ class TestFreezer:
         assert len(block) == 24514
         assert block.temperatures['case'].celsius.min() == pytest.approx(-17.8, abs=0.1)
         assert block.temperatures['board'].celsius.min() == pytest.approx(3.6, abs=0.5)
-        # Three thermometers in three places.
+        # The three thermometers are in three places, so their ranges differ.
         assert block.temperatures['barometer'].celsius.min() == pytest.approx(-17.0, abs=0.1)
         n_barometer = len(block.temperatures['barometer'].celsius)
         assert report.messages['barometer'] == n_barometer

@@ -199,7 +199,7 @@ def test_movement_is_found_in_any_unit(rng, scale):
     n = 5000
     stamp_ns = np.arange(1, n + 1) * 10_000_000
     stillness = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
-    # 50 s in cells of half a second: the middle fifth is 20..30 s, on the edges of cells.
+    # The middle fifth of 50 s is 20..30 s, which are edges of cells of half a second.
     assert [(t0 * 1e-9, t1 * 1e-9) for t0, t1 in stillness.moving_ns] == [
         (pytest.approx(20.01), pytest.approx(30.01))
     ]

@@ -88,7 +88,7 @@ def test_new_instances(tmp_path, rng, imu, baro):
         bag.accel_stamp_ns, (2_000_000 + np.arange(N) * STEP_US + imu) * 1000
     )
     np.testing.assert_array_equal(bag.accel, force[imu])
-    # 0.3 rounded to float32.
+    # The tolerance is the rounding of 0.3 to float32.
     np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
     # The chip's temperature is constant for ten samples; only its changes are messages.
     np.testing.assert_array_equal(
@@ -138,7 +138,6 @@ def test_corrected_log_is_refused(tmp_path, rng):
     with pytest.raises(RecordingError, match=r'INS_TCAL1_ENABLE was 1.*already'):
         read_autopilot(path)
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
-    # The drift of the second IMU was not corrected.
     assert len(read_autopilot(path, imu=1).stamp_ns) == N
 
 
@@ -148,10 +147,10 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
 @pytest.mark.parametrize(
     ('course', 'kept', 'share'),
     [
-        # INS_TCAL1_ENABLE is switched on in flight, then off.
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log of the learning was refused, because ArduPilot sets 1 after it.
+        # WHY: a log of ArduPilot's learning was refused, because ArduPilot sets 1 after the
+        # learning.
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )
@@ -226,7 +225,7 @@ def test_absurd_stamps_are_no_stamps(tmp_path, rng):
     path = tmp_path / 'jump.BIN'
     write_new(path, rng)
     body = bytearray(path.read_bytes())
-    # The time of the first IMU message, with all bits set: half a million years.
+    # The time of the first IMU message gets all bits set, which is half a million years.
     at = body.index(b'\xa3\x95\x81') + 3
     body[at : at + 8] = b'\xff' * 8
     path.write_bytes(body)

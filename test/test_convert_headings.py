@@ -92,7 +92,6 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
     columns = guess_columns(path)
     assert columns.stamp.unit == unit
     assert columns.accel.unit == ('g' if one_g == 1.0 else 'm/s^2')
-    # The printed map gives the same when it is read back.
     (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(columns)))
     assert load_column_map(tmp_path / 'map.yaml') == columns
     log = table_log(path, columns)
@@ -105,7 +104,7 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
 
 @pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])
 def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
-    # WHY: Parquet needed a column map, although it contains more information than text.
+    # WHY: Parquet once needed a column map, although it contains more information than text.
     pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
     import pyarrow.parquet as pq
 

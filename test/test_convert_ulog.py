@@ -184,7 +184,7 @@ def write_combined(path, rng, later=None, **parameters):
         now = 7_000_000 + k * STEP_US
         rows = [(-200, vector)]
         if k == 3:
-            # A log without an accelerometer, and one whose reading has been logged already.
+            # Messages without an accelerometer sample, and with a sample that was logged before.
             rows += [(2**31 - 1, vector), (-200 - 50, vector)]
         for j, (relative, (x, y, z)) in enumerate(rows):
             at = now + (50 if j == 2 else 0)

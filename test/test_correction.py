@@ -123,7 +123,6 @@ def test_columns_of_one_axis_leave_every_bit_of_the_others(rng):
     plain, _ = stream(Compensator(full_bank(rng, axes=()), UNCHECKED), events)
     moved, _ = stream(Compensator(full_bank(rng, axes=(0,)), UNCHECKED), events)
     assert (moved[:, 0] != plain[:, 0]).all()
-    # y, z and their (co)variances.
     for column in (1, 2, 6, 7, 8):
         np.testing.assert_array_equal(moved[:, column], plain[:, column])
 
@@ -237,7 +236,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
         bias, scale = values[:, axis]
         for x in (-9.8, 0.0, 9.8):
             expected = np.var(bias / 300.0 + scale / 300.0 * x) / small**2
-            # 4000 draws: 2.2 %; 4 sigma.
+            # A variance from 4000 draws has a relative sd of 2.2 %: 4 sigma.
             assert a + b * x + c * x * x == pytest.approx(expected, rel=0.09)
 
 
@@ -261,7 +260,7 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # Within a span only the thermometer's part changes, 30 counts/K of some mK.
+        # Within a span the variance changes only by the thermometer's part: 30 counts/K, some mK.
         part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - collected[0][0]) * 1e-9 + 1.0
@@ -304,7 +303,6 @@ def test_a_swap_keeps_the_memory_where_the_same_is_remembered(rng):
     assert compensator.thermal.tracker.memory is tracker.memory
     compensator.swap(replace(unit, response=unit.response[:5]))
     assert compensator.thermal.tracker.memory is not tracker.memory
-    # The latest readings are kept.
     assert compensator.thermal.tracker.board.stamp_ns == tracker.board.stamp_ns
     assert compensator.process(61 * SECOND_NS, 0.0, 0.0, 2900.0) is not None
 
@@ -347,7 +345,7 @@ def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
         response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
     )  # fmt: skip
     assert sd_at(unit, 35.0) == pytest.approx(1e-6, rel=1e-6)
-    # The sd of the slope times the factor for 6 K outside, of half a range of 15 K.
+    # The temperature is 6 K outside the range, whose half is 15 K.
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
 
@@ -396,7 +394,7 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # The difference of the sets at the last temperature within both.
+    # Beyond a range the difference of the sets is that at the last temperature within both ranges.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -407,8 +405,8 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
 
 def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng):
     # Correction and regressors are linear in the parameters: the change of the correction by any
-    # change of them must equal the regressors times it. The dynamic set ends first above, the
-    # static one below.
+    # change of them must equal the regressors times it. The range of the dynamic set ends first
+    # above, that of the static set below.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     one = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -451,7 +449,7 @@ def test_the_claim_grows_all_the_way_out_of_the_range():
             line = correction.line(state, state, np.array(slow.at(state, nobody)), 0.0)
             variances.append(line[12:].reshape(3, 3)[:, 0])
         assert (np.diff(variances, axis=0) > 0.0).all()
-        # At least the error of a curve that is constant from the edge on.
+        # The claimed sd is at least the error of a curve that is constant from the edge on.
         slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 

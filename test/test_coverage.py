@@ -56,13 +56,13 @@ def test_columns_are_the_derivatives_of_the_measured_force(rng):
 def test_without_positions_the_prior_is_left():
     covariance = constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
-    # Bias and scale of one vertical axis: their variances add.
+    # With one axis vertical the variances of bias and scale of this axis add.
     assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
 
 
 def test_two_opposite_faces_tell_bias_and_scale_of_their_axis():
     sd = np.sqrt(np.diag(constants_covariance(FACES[:2], np.full(2, SD))))
-    # Half the difference and half the sum of two numbers.
+    # Bias and scale of x are half the difference and half the sum of two readings.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
     np.testing.assert_allclose(sd[[1, 2, 4, 5, 6, 7, 8]], PRIOR_SD[[1, 2, 4, 5, 6, 7, 8]])
 
@@ -73,7 +73,7 @@ def test_the_covariance_is_the_scatter_of_estimates(rng):
     truth = rng.standard_normal((n, 9)) * PRIOR_SD
     columns = norm_columns(up)
     seen = truth @ columns.T + SD * rng.standard_normal((n, 12))
-    # The conditional mean of a Gaussian, from its joint covariance.
+    # The estimate is the conditional mean of a Gaussian, from its joint covariance.
     joint = columns * PRIOR_SD**2 @ columns.T + SD**2 * np.eye(12)
     estimate = seen @ np.linalg.solve(joint, columns * PRIOR_SD**2)
     # 4000 trials determine a standard deviation to 1.1 %.

@@ -52,7 +52,7 @@ COMMANDS = commands()
 @pytest.mark.parametrize(('page', 'command', 'output'), COMMANDS, ids=[c for _, c, _ in COMMANDS])
 def test_the_command_does_what_the_page_says(page, command, output, desk):
     if '--install-completion' in command:
-        pytest.skip('writes into the home of who runs it')
+        pytest.skip('writes into the home folder of the user')
     finished = desk.run(command)
     if '--json' in command:
         assert parsed(finished.stdout)

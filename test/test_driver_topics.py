@@ -72,7 +72,6 @@ def test_the_node_finds_the_type_while_it_runs(peer, unit, is_file):
         return look
 
     with node_in_thread(*node_arguments(unit, f'topics:={topics}')):
-        # Each publisher finds a subscriber of its type.
         board = peer.publisher(BatteryState, '/pack')
         case = peer.publisher(Float64, '/case_t')
         samples = peer.publisher(Vector3Stamped, 'accel/counts')

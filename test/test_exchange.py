@@ -142,7 +142,6 @@ def test_the_angular_rate_goes_both_ways(cubic):
         bias = sum(value[f'TC_G0_X{power}_{axis}'] * d**power for power in range(4))
         assert bias == pytest.approx(true[2, axis], rel=1e-6)
     np.testing.assert_allclose(again(px4.text), true, atol=1e-9)
-    # A gyroscope with another reference temperature than the accelerometer.
     shifted = Polynomial((0.02, *curves[0][1:]))
     moved = px4.text.replace('TC_G0_TREF\t20\t', 'TC_G0_TREF\t30\t')
     assert moved != px4.text
@@ -190,14 +189,14 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic):
     assert any(
         re.search(r'scale over temperature is lost: up to 2.5e\+03 ppm', n) for n in plain.notes
     )
-    # 100 ppm/K of 9.81 m/s^2 on z, nothing on x.
+    # A drift of the scale by 100 ppm/K changes the offset of z by 100 ppm/K of 9.81 m/s^2.
     slope = [numbers(export.text, '\t')['TC_A0_X1_2'] for export in (plain, level)]
     assert slope[1] - slope[0] == pytest.approx(9.81e-4, rel=1e-5)
     assert numbers(plain.text, '\t')['TC_A0_X1_0'] == numbers(level.text, '\t')['TC_A0_X1_0']
 
 
 def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic):
-    # WHY: PX4 subtracts from m/s^2 as read; 0.5 % of the scale are 5 mg at rest.
+    # WHY: PX4 subtracts the offset from the reading in m/s^2; 0.5 % of the scale are 5 mg at rest.
     axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
     calibration = replace(cubic, axes=axes)
     plain = export_calibration(calibration, 'px4')
@@ -318,7 +317,7 @@ def test_imu_tk_formula_gives_our_correction(tumbled):
     assert np.all(np.tril(T, -1) == 0.0)
     assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
     theirs = (RAW - numbers[18:]) @ (T @ K).T
-    # Angles are written with six digits: 1e-6 of 90 m/s^2.
+    # Angles are written with six digits, which gives errors of 1e-6 of 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     np.testing.assert_allclose(
         np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12
@@ -330,7 +329,6 @@ def test_imu_calib_and_kalibr_formulas_give_our_correction(tumbled):
     theirs = RAW @ np.reshape(data['SM'], (3, 3)).T - data['bias']
     np.testing.assert_allclose(theirs, ours(tumbled, RAW), rtol=1e-10)
     imu = yaml.safe_load(export_calibration(tumbled, 'kalibr', number=1).text)['imu1']
-    # Kalibr predicts the reading as M a + b.
     part = imu['accelerometers']
     reading = ours(tumbled, RAW) @ np.array(part['M']).T + part['bias']
     np.testing.assert_allclose(reading, RAW, rtol=1e-12)
@@ -383,7 +381,7 @@ def test_kalibr_without_bias_and_with_several_imus():
     back = import_calibration(f'imu0:\n{imu}  update_rate: 200.0\n', serial='7')
     assert back.unit.input == 'm/s^2'
     assert 'no bias' in back.provenance.notes[0]
-    # M a by hand, with a = (1, 2, 3).
+    # The reading was computed by hand as M a, with a = (1, 2, 3).
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
     with pytest.raises(CalibrationError, match='choose one of the IMUs: there are imu0, imu1'):
         import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')

@@ -140,7 +140,6 @@ def test_calibration_files_that_go_bad(path, tmp_path):
             assert result.reason.startswith(f'{bad}: ')
             assert reason in result.reason
             assert '\n' not in result.reason
-    # The calibration in use stays in use.
     n = sum(len(block.force) for block in heard)
     table = corrected(events)[1][:n, :3]
     np.testing.assert_allclose(
@@ -208,8 +207,8 @@ def test_slope_and_its_error(rng):
     # The slope leaves out the first 300 s.
     values[:300] += 50.0
     slope, sd = soak.slope(list(zip(time.tolist(), values.tolist(), strict=True)), 60.0)
-    # Sd of a slope: that of a mean of 60, divided by sqrt(sum of squared hours) of 54 windows over
-    # 0.9 h.
+    # The sd of the slope is the sd of a mean of 60 values, divided by the root of the sum of
+    # squares of the hours of 54 windows over 0.9 h about their mean.
     assert sd == pytest.approx(1.0 / 60**0.5 / (54 * 0.9**2 / 12) ** 0.5, rel=0.3)
     assert abs(slope - 7.0) < 4.0 * sd
     assert soak.slope([(0.0, 1.0), (1.0, 1.0)], 60.0) is None

@@ -41,7 +41,8 @@ def left_by(pair, **options):
 @pytest.mark.parametrize('pair', [(1, 2), (3, 9)])
 def test_two_positions_tell_the_thermal_response(pair):
     # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine their sd to 6 %, and a few
-    # superfluous columns may add a tenth. Half of all 36 pairs are as good (docs/accuracy.md).
+    # superfluous columns may add a tenth. Half of all 36 pairs of positions leave as little
+    # (docs/accuracy.md).
     assert left_by(pair) == pytest.approx([1.2] * 3, rel=0.3)
 
 
@@ -78,16 +79,16 @@ def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
     at = np.array([-3.0, 12.0])
     for axis, slope in zip(one_position.calibration.static.axes(), SLOPE, strict=True):
         fitted = np.diff(axis.bias_function.value(at))[0] / 15.0 / MG
-        # 15000 samples of 3 mg over 16 K: some hundredths of a mg/K.
+        # 15000 samples of 3 mg over 16 K determine a slope to some hundredths of a mg/K.
         assert fitted == pytest.approx(slope, abs=0.2)
 
 
 def test_one_position_leaves_the_scale_at_its_prior(one_position):
     calibration = one_position.calibration
     for axis in calibration.static.axes():
-        # Three powers, 1e-4 each where the column has unit RMS.
+        # Each of the three powers has a prior sd of 1e-4 at the RMS of its column.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
-    # Prior of any unit: scale 5 %, misalignment 1 mrad.
+    # The prior sd of any unit are 5 % of the scale and 1 mrad of misalignment.
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     for block in parameter_layout(calibration).scale:
         assert sd[block.static] == pytest.approx(0.05, rel=0.3)
@@ -111,7 +112,7 @@ def test_positions_without_temperature(rng):
     result = fit([turned(rng, positions(12, 3))], OPTIONS)
     calibration = result.calibration
     axes = calibration.axes
-    # 12 rests of 20 s, 2 mg a sample: the noise averages to 50 ug.
+    # The noise of 2 mg a sample averages to 50 ug over 12 rests of 20 s.
     np.testing.assert_allclose([axis.bias for axis in axes], (0.1, -0.2, 0.3), atol=0.005)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.001)
     assert calibration.response == ()
@@ -127,7 +128,7 @@ def test_positions_without_temperature(rng):
     out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
-    # Noise of a sample, 0.02 m/s^2, plus the uncertainty of the tumble.
+    # The covariance is the noise of a sample, 0.02 m/s^2, plus the uncertainty of the tumble.
     np.testing.assert_allclose(
         np.sqrt(np.diagonal(out.covariance[0])), np.hypot(left, 0.02), rtol=0.05
     )
@@ -136,7 +137,7 @@ def test_positions_without_temperature(rng):
 def test_short_rests_have_windows_enough_to_learn_the_noise_from(rng):
     # WHY: one window per rest is fitted exactly by its attitude, and the estimated noise was 0.
     calibration = fit([turned(rng, positions(12, 3), rest_s=5.0)], OPTIONS).calibration
-    # 0.02 m/s^2 per sample at 100 Hz.
+    # The noise is 0.02 m/s^2 per sample at 100 Hz.
     np.testing.assert_allclose(calibration.noise_density_m_s2_sqrt_hz, 0.002, rtol=0.3)
 
 

@@ -125,7 +125,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
 
 
 def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave():
-    # Walks, turn-on and one shock over 30 days, level and carried.
+    # The units age for 30 days by walks, turn-on and one shock, on a level and a carried platform.
     squares, ratios = [], []
     for kind, seed in (('level', 1), ('level', 2), ('level', 4), ('carried', 1)):
         process = field_units.Process(shock_day=11.5)
@@ -192,7 +192,7 @@ def test_a_jump_is_told_from_ageing(rng):
 
 
 def test_a_curve_that_has_changed_is_found_and_mended():
-    # 5 ug/K of the z bias, and temperatures of 15 to 25 degC in the log.
+    # The z bias changes by 5 ug/K, and the log has temperatures of 15 to 25 degC.
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )
@@ -230,13 +230,14 @@ def test_too_few_starts_are_refused():
 
 
 def test_the_first_passage_is_that_of_the_reflection_principle():
-    # Inside (-c, c): sum (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)] with s^2 = rate t.
+    # The probability to be inside (-c, c) is the sum over k of
+    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = rate t.
     rate, bound = 4.0, 50.0
     for probability, days in zip((0.1, 0.5, 0.9), passage(0.0, 0.0, rate, bound), strict=True):
         s, k = np.sqrt(rate * days), np.arange(-40, 41)
         inside = norm.cdf((2 * k + 1) * bound / s) - norm.cdf((2 * k - 1) * bound / s)
         assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.005)
-    # From nearer to a bound the passage is earlier; a unit that does not age never reaches it.
+    # A walk from nearer to a bound passes earlier; a unit that does not age never reaches a bound.
     assert passage(30.0, 0.0, rate, bound)[1] < passage(0.0, 0.0, rate, bound)[1]
     assert passage(0.0, 0.0, 1e-12, bound) == (np.inf,) * 3
 

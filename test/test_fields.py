@@ -20,7 +20,7 @@ from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.serialized import Messages
 from thermo_comp.recording.topics import Topics
 
-# As in px4_msgs: no header, and the temperature beside the samples.
+# PX4's messages have no header, and the temperature beside the samples.
 PX4 = {
     'px4_msgs/msg/SensorAccel': (
         'uint64 timestamp\nuint64 timestamp_sample\nuint32 device_id\nfloat32 x\nfloat32 y\n'

@@ -105,7 +105,7 @@ def test_a_bag_of_another_environment_takes_no_part_and_is_claimed():
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'took no part' in note
-        # The other bag is off by 5 times 20 ug/K over the 11 K above the knee, or half of it (z).
+        # The other bag is off by 5 times 20 ug/K over the 11 K above the knee; z by half as much.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 600.0
     # One more bag of the same environment is no contradiction.

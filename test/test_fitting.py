@@ -58,7 +58,7 @@ def claimed(calibration):
     return sd[bias], sd[scale], sd[layout.misalignment :]
 
 
-# A reading every four seconds: a ramp of 1.5 K/min changes the board by 0.1 K between them.
+# Readings come every four seconds, in which a ramp of 1.5 K/min changes the board by 0.1 K.
 OWN_LAGS, PAPER, PLAIN = (
     triad(name, 1).with_thermometers(rate_hz=0.25) for name in ('own-lags', 'paper', 'plain')
 )
@@ -84,7 +84,7 @@ def pulls(found, unit):
 
 
 def test_truth_lies_within_the_claimed_sd(response):
-    # Nine numbers that share the reference temperature and the directions.
+    # The nine constants have correlated errors, so the largest may be at 4 sd.
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0
     assert np.sqrt(np.mean(pull**2)) < 2.0
@@ -97,7 +97,7 @@ def test_truth_lies_within_the_claimed_sd(response):
 
 def test_the_response_reaches_the_noise(response):
     row = response.residuals[-1]
-    # White noise of 5 ug / sqrt(Hz) over 60 s: 0.65 ug.
+    # White noise of 5 ug / sqrt(Hz) leaves 0.65 ug over 60 s.
     assert row.fitted.rms / MICRO_G < 0.8
     assert row.fitted.rms < row.left_out.rms < 1.5 * row.fitted.rms
     assert row.raw.rms / MICRO_G > 300.0
@@ -119,11 +119,11 @@ def test_the_paper_s_model_on_its_own_physics(golovach):
         # Each regime has a curve, so that the calibration has no single curve.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
-    # A linear static set and a quadratic dynamic set.
+    # The paper's model has a linear static set and a quadratic dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # The residual of the model in this unit's ramps changes its levels, which are as good as the
-    # model.
+    # The paper's model leaves an error in the unit's ramps, which shifts the estimated levels by
+    # as much.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)
@@ -142,9 +142,8 @@ def test_the_evidence_is_complete(response):
     assert [row.section for row in provenance.residuals] == ['static', 'dynamic', 'all']
     assert {finding.level for finding in response.findings} <= {'advice', 'good'}
     assert 'refusal' not in {finding.level for finding in response.findings}
-    # The file contains the contribution of each group.
     judged = {(group.part, group.group) for group in calibration.evidence}
-    # Each axis of this unit is a curve of its part.
+    # The bias of each axis of this unit is a curve over the temperature of the axis' part.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
     # A term with zero weight is only needed for the covariance.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
@@ -183,7 +182,7 @@ def test_six_faces_leave_misalignment_at_its_prior():
     result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'))
     _, _, M = constants(result.calibration)
     _, scale_sd, M_sd = claimed(result.calibration)
-    # Six faces do not determine M: 0 within 1 mrad.
+    # Six faces do not determine M, which stays at 0 with an sd of 1 mrad.
     np.testing.assert_allclose(M, 0.0, atol=1e-5)
     np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
     finding = next(finding for finding in result.findings if finding.name == 'misalignment')
@@ -195,7 +194,8 @@ def test_six_faces_leave_misalignment_at_its_prior():
 
 
 def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng):
-    # WHY: both were fitted without a message. The triad without drift has constants only.
+    # WHY: compensated samples, and samples of a triad without drift, were both fitted without a
+    # message.
     records = records_of(PLAIN, positions(9, 1), 4)
     bias, scale, M = PLAIN.bias_at_reference, PLAIN.scale_factor, np.array(PLAIN.M)
 
@@ -248,7 +248,7 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach):
     moved = np.abs(weight[per_second:] - weight[:-per_second]) * size[per_second:]
     assert weight[0] == pytest.approx(0.0, abs=1e-6)
     assert weight.max() == pytest.approx(1.0, abs=1e-6)
-    # The difference drifts during the transition by far less than a hundredth.
+    # During the transition the difference of the sets changes by far less than a hundredth.
     assert moved.max() / MICRO_G < 1.01 * max(1.0, size.max() / MICRO_G / 300.0)
 
 
@@ -295,8 +295,8 @@ def test_saturated_samples_are_refused(rng):
 
 
 def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mountings():
-    # Misalignments of some mrad explain the norms of nine positions. Mountings of 5 mg would
-    # explain them, too, with constants wrong by 5 mg. The noise of a minute is 22 ug.
+    # Misalignments of some mrad explain the norms of nine positions. Mountings of 5 mg would also
+    # explain the norms, with constants wrong by 5 mg. The noise of a minute is 22 ug.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
     calibration = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY)).calibration

@@ -52,7 +52,7 @@ def weight(record, closes):
     [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],
 )
 def test_evidence_says_when_the_regime_closes(closes, options):
-    # A reading every four seconds: the case changes by 0.1 K between them.
+    # Readings come every four seconds, in which the case changes by 0.1 K.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
     plan = [Position(PROGRAM, up) for up in FACES]
@@ -61,8 +61,7 @@ def test_evidence_says_when_the_regime_closes(closes, options):
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.closes == closes
-    # The remaining difference is when a set starts and ends, as the fit estimates the sensor
-    # settings.
+    # Sets of the fit start and end at slightly other times, as it estimates the sensor settings.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
 
@@ -72,7 +71,6 @@ def uneven(rng):
     lengths = (7, 1, 12, 4)
     position = np.repeat(np.arange(len(lengths)), lengths)
     steps = rng.uniform(1.0, 9.0, len(position))
-    # A gap that is longer than the short correlation time.
     steps[12] = 4000.0
     time = np.concatenate(
         [100.0 * k + np.cumsum(steps[position == k]) for k in range(len(lengths))]
@@ -128,7 +126,7 @@ def test_ratio_and_time_are_found(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # The threshold has a false alarm rate of 1 % per series; none of these exceeds it.
+    # The threshold has a false alarm rate of 1 % per series; none of these series exceeds it.
     assert [
         whitener.estimate(series, weight)
         for whitener, weight, series in (drawn(rng, 5, 100, Noise()) for _ in range(10))

@@ -13,7 +13,7 @@ from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, ResidualRow
 from thermo_comp.fitting.data_checks import (
     Finding,
-    can_tell_misalignment,
+    determines_misalignment,
     distinct_directions,
     enforce,
     geometry,
@@ -96,7 +96,7 @@ def test_a_missing_case_is_said(good):
 def test_six_faces_tell_no_misalignment(good):
     windows, _ = good
     faces = np.vstack((np.eye(3), -np.eye(3)))
-    assert not can_tell_misalignment(faces)
+    assert not determines_misalignment(faces)
     assert 'the misalignment keeps its prior' in (
         findings_of(windows, faces)['misalignment'].message
     )
@@ -104,7 +104,7 @@ def test_six_faces_tell_no_misalignment(good):
     tilted = faces + 0.03
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
-    assert not can_tell_misalignment(np.vstack((faces, tilted)))
+    assert not determines_misalignment(np.vstack((faces, tilted)))
 
 
 def test_few_and_badly_spread_positions_are_said(good):
@@ -119,7 +119,7 @@ def test_few_and_badly_spread_positions_are_said(good):
 
 
 def test_geometry_is_the_scatter_of_the_parameters(rng):
-    # By Monte Carlo: least squares of pure noise of the norm on the nine parameters.
+    # The second route is Monte Carlo: least squares of noise of the norm on the nine parameters.
     up = positions(12, 5)
     x, y, z = up.T
     jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))
@@ -162,7 +162,7 @@ def test_what_the_fit_left_is_said():
     [
         ((500.0, 400.0, 300.0, 500.0), 'misfit', 'temperature does not explain'),
         # Temperatures an hour late by another clock.
-        ((692.0, 520.0, 9.0, 878.0), 'left out', 'left out are worse than raw'),
+        ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw error'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
         ((100.0, 1.0, 0.2, 1.5), 'units', 'expected near 1'),
     ],

@@ -103,7 +103,7 @@ def test_derivatives_are_those_of_differences(rng):
                 )
                 expected = (below - above) / 2e-6
                 derived = derivatives[p, axis, :, column]
-                # Rounding of 1e-14 over 1e-6 of forces up to 95 m/s^2, and of cubes.
+                # The tolerance is rounding of 1e-14 over 1e-6, for forces up to 95 m/s^2.
                 scale = np.abs(expected).max()
                 np.testing.assert_allclose(derived, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)
 
@@ -115,7 +115,7 @@ def test_square_and_cube_are_found_within_their_claims(rng):
     sd = np.sqrt(posterior.variance[places])
     away = posterior.state.nonlinear[:, [0, 2, 3, 5]] - np.array([1e-5, -1e-6, 1e-7, -1e-8])
     assert np.abs(away / sd).max() < 4.0
-    # K2 and K3 to 2 %, as required.
+    # K2 and K3 are required to be right to 2 %.
     assert np.abs(away[:, :2] / [1e-5, 1e-6]).max() < 0.02
     assert all(term.left_out_gain > 1.0 and term.log_evidence_change > 100.0 for term in terms)
 
@@ -135,7 +135,6 @@ def test_an_odd_square_joins_only_where_it_is(rng):
     _, posterior, terms = chosen(rng, kq=1e-5, share=0.0)
     assert [term.kind for term in terms] == ['odd_square']
     assert posterior.state.nonlinear[:, 1] == pytest.approx(1e-5, rel=0.02)
-    # The change with temperature was removed.
     assert not posterior.state.nonlinear[:, 4].any()
 
 
@@ -242,7 +241,7 @@ def source(run, spin, name):
 
 
 def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
-    # A single temperature, for speed: nine mountings at 1, 3 and 8 g.
+    # For speed the test has one temperature, and nine mountings at 1, 3 and 8 g.
     unit = replace(triad('plain', 3), bend=Bend((10.0, -10.0, 10.0), (1.0, 1.0, -1.0)))
     time, rate = steps((150.0,), tuple(np.sqrt([3.0 * G, 8.0 * G])), 150.0, 20.0)
     program = Cyclogram((0.0, 560.0), (20.0, 20.0))
@@ -283,7 +282,7 @@ def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
         replace(again, unit=replace(again.unit, serial=f'{k}'), gyroscope=None) for k in range(3)
     ]
     assert population(siblings).nonlinearity is None
-    # From a tumble alone a bound of the data sheet stays, and the fit says so.
+    # A tumble alone leaves the term at the bound of the data sheet, which the fit reports.
     alone = fit(tumble, FitOptions(gravity=G, model='golovach', k2_sd=5e-5))
     assert [finding.name for finding in alone.findings].count('nonlinearity') == 1
     (square, *_) = nonlinear_coefficients(alone.calibration)

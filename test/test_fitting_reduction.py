@@ -62,7 +62,7 @@ def test_chunks_do_not_matter(rng):
         other = reduced(split(whole, n_parts))
         for a, b in zip(at_once.intervals, other.intervals, strict=True):
             np.testing.assert_array_equal(a.count, b.count)
-            # The same sums in another order of addition: only rounding differs.
+            # The order of addition differs, and therefore the rounding of the sums.
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
         np.testing.assert_array_equal(at_once.board.value, other.board.value)
@@ -133,7 +133,8 @@ def test_a_knock_starts_a_new_position(rng):
 
 
 def test_a_drift_is_no_motion(rng):
-    # 100 ppm/K at 3 K/min: 0.015 counts per second, some 0.02 sd of a cell mean per cell.
+    # A drift of 100 ppm/K at 3 K/min is 0.015 counts per second, or 0.02 sd of a cell mean per
+    # cell.
     accel = still(rng, 300.0, (0.0, 0.0, 3000.0))
     accel[:, 2] += 0.015 * np.arange(len(accel)) / RATE_HZ
     assert len(reduced([block(accel)]).intervals) == 1
@@ -169,7 +170,7 @@ def test_time_origin_does_not_matter(rng):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # Cells of half a second fill windows of ten; 30 samples at 4 Hz do not, and those at 1 Hz are
+    # Cells of half a second fill windows of 10 s; 30 samples at 4 Hz do not, and 30 at 1 Hz last
     # longer.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
@@ -181,7 +182,6 @@ def test_windows_are_as_long_as_stated(rate_hz, cell_s, window_s, rng):
     assert bag.window_s == window_s
     assert bag.n_cells == pytest.approx(150 / cell_s)
     assert interval.n_whole == len(interval.time) == 150 / window_s
-    # A sample is in exactly one window.
     np.testing.assert_allclose(interval.count, window_s * rate_hz, atol=1.0)
     np.testing.assert_allclose(np.diff(interval.time), window_s, atol=1.0 / rate_hz)
 
@@ -207,7 +207,7 @@ def test_fast_readings_are_averaged(rng):
 
 @pytest.mark.parametrize(
     ('latitude', 'height', 'expected'),
-    # Published for WGS 84: the equator, the pole, 45 degrees.
+    # These values of gravity are published for WGS 84 at the equator, the pole and 45 degrees.
     [(0.0, 0.0, 9.7803253359), (90.0, 0.0, 9.8321849379), (45.0, 0.0, 9.8061977694)],
 )
 def test_normal_gravity_of_the_tables(latitude, height, expected):
@@ -234,7 +234,7 @@ def test_gravity_is_that_of_the_earth(gravity):
 
 
 def course(quantum, noise, rng):
-    # Soak, ramp of 1 K/min through a lag of 300 s, soak: 1 Hz for three hours.
+    # Three hours at 1 Hz are a soak, a ramp of 1 K/min through a lag of 300 s, and a soak.
     time = np.arange(0.0, 10800.0)
     air = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
     celsius = np.empty_like(air)
@@ -253,7 +253,7 @@ def test_a_thermometer_is_known_from_its_readings(quantum, noise, rng):
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
     # Noise below a tenth of the quantum is invisible; a tenth is assumed.
     assert learned.noise_sd_c == pytest.approx(max(noise, 0.1 * quantum), rel=0.1)
-    # An onset through the lag, in means of a minute: determined to a third.
+    # Means of a minute determine the onset through the lag to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
     assert learned.fastest_ramp_k_min >= 1.0
 

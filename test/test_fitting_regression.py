@@ -33,8 +33,8 @@ from thermo_comp.fitting.unknowns import Noise, State, inverse_misalignment, tan
 
 class Dense:
     """
-    The same posterior by a slow second route: one vector, dense covariances, numerical
-    derivatives.
+    The posterior of a `Regression` by a slow second route: all unknowns in one vector, dense
+    covariances, numerical derivatives.
     """
 
     def __init__(self, regression, prior, at):
@@ -85,7 +85,7 @@ class Dense:
             state.offset.ravel() / prior.offset_sd,
             state.tilt.ravel() / prior.tilt_sd,
             state.start.ravel() / np.sqrt(prior.start_share),
-            # The mean over all bags has a tenth of the sd of each start.
+            # The mean of the starts of all bags has a tenth of the sd of one start.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_share)),
         ]
         for weights, sd in zip(state.weights, prior.column_sd, strict=True):
@@ -124,7 +124,7 @@ def test_the_mode_is_that_of_the_dense_problem(solved):
     dense = Dense(regression, prior, mode)
     at = dense.residual(np.zeros(dense.n))
     gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(mode.variance)
-    # In units of sd: Gauss-Newton is repeated until it converges.
+    # Gauss-Newton is repeated until the gradient, in units of sd, vanishes.
     assert np.abs(gradient).max() < 1e-4
     other = least_squares(
         dense.residual, np.zeros(dense.n), x_scale=np.sqrt(mode.variance), method='trf'
@@ -155,7 +155,8 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # Except for the number of bags: the bound is a fixed part of the sd of a start.
+    # The bound on the mean of all starts, a tenth of the sd of a start, depends on the number of
+    # bags: allow for this difference.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
@@ -174,7 +175,7 @@ def test_truth_comes_out_without_noise(rng):
         weights = mode.weights[part] / regression.rms
         np.testing.assert_allclose(weights, truth.weights[part], atol=atol)
     np.testing.assert_allclose(mode.start, 0.0, atol=1e-2)
-    # As in the compensator: forward and back again.
+    # The regression corrects windows as the compensator does, which inverts the model.
     force = regression.force(mode)
     np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
 
@@ -211,9 +212,9 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: With LINEAR groups the problem is linear in everything except directions, which are determined
-#: to some urad: the result is exact except for rounding. With PRODUCTS it is of first order
-#: (positions) or two steps (sections): the remainder is the product of the changes of start and
-#: weight.
+#: to some urad: the result is exact except for rounding. With PRODUCTS a score lacks the product
+#: of the changes of start and weight, as scores of positions are linear, and scores of sections
+#: are two linear steps.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -273,7 +274,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
 
 
 def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
-    # Six faces: without one of them the bias of its axis is not separated from the scale.
+    # Without one of six faces the bias of the axis is not separated from the scale.
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
     regression, state = begin(windows, up)
@@ -291,8 +292,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
 def test_no_step_goes_uphill(seed):
-    # Bags that started far from rest, with little data to separate a start from a weight: a
-    # product.
+    # Bags that started far from rest, with little data: the product of start and weight matters.
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
     windows, up = table_of(truth, 4, rng, n_windows=12, step_s=400.0)
@@ -309,7 +309,7 @@ def test_no_step_goes_uphill(seed):
 def test_what_takes_no_part_any_more_is_gone(solved):
     regression, prior, mode = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
-    # The result also holds for a state to which no step has been applied.
+    # The result is that of a state to which no step has been applied.
     state = regression.solve(mode.state, narrow, n_steps=0).state
     assert not state.weights[0, :, 2:4].any()
     np.testing.assert_array_equal(state.weights[1], mode.state.weights[1])
@@ -387,7 +387,7 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise):
     gain = max(gains) - posterior.log_evidence
     assert gain > 100.0
     assert inactive.gain(wide, asked) == pytest.approx(gain, rel=0.01)
-    # The columns that the data contain come one after another: no other column, none twice.
+    # The columns that the data contain are chosen one after another, no other column, none twice.
     chosen = inactive.chosen(wide, asked, 4.0, 9)
     assert np.array(GROUPS)[chosen].tolist() == ['board'] * (np.array(GROUPS) == 'board').sum()
     assert inactive.chosen(wide, asked, 4.0, 1).sum() == 1

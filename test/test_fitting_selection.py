@@ -49,7 +49,6 @@ def selected_of(truth, windows, up, forced=()):
     candidates = candidates_of(windows, forced)
     parts = []
     selection = select(regression, state, constants(truth), candidates, parts.append)
-    # Progress rises.
     assert parts == sorted(parts)
     assert 0.0 < parts[0] <= parts[-1] <= 1.0
     return regression, selection
@@ -83,7 +82,6 @@ def test_what_explains_nothing_is_not_chosen(calm):
     assert {(group.part, group.group) for group in evidence} == {
         (part, group) for part in ('bias', 'scale') for group in ('curve', 'board')
     }
-    # The weights of a column left out are exactly 0.
     assert not chosen.posterior.state.weights[..., IDLE].any()
 
 
@@ -96,7 +94,7 @@ def test_models_that_were_looked_at_show_their_left_out_errors(calm):
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
     assert chosen.score is selected.score
-    # Errors of left-out windows: white noise, plus the uncertainty of the fit to the others.
+    # Left-out windows have white noise, plus the uncertainty of the fit to the other windows.
     assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
@@ -146,13 +144,12 @@ def test_noises_come_out(noisy):
     _, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
-    # 1080 windows per axis: white noise is determined to 3 %, slightly worse with the slow noise.
+    # 1080 windows per axis determine the white noise to 3 %, slightly worse with the slow noise.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
     # Positions last six correlation times, and curves absorb a part of the slow noise.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
-    # 18 positions x 3 axes, of which directions, scale, bias and M use 36 + 9: nine degrees of
-    # freedom, a sd of 24 %.
+    # Of 18 x 3 readings directions, scale, bias and M use 36 + 9: the others give the sd to 24 %.
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
 
 
@@ -191,7 +188,8 @@ def test_truth_lies_within_the_claimed_sd(noisy):
     errors = truth.errors(regression, chosen.posterior)
     # Pruned weights have no sd; the true weights of the idle columns are 0.
     every = np.concatenate([*errors.values()])
-    # About thirty numbers: their RMS is determined to 13 %, slightly less with estimated prior sd.
+    # About thirty numbers determine their RMS to 13 %, which is slightly less with estimated prior
+    # sd.
     assert len(every) > 20
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
     assert np.abs(every).max() < 4.0
@@ -199,7 +197,7 @@ def test_truth_lies_within_the_claimed_sd(noisy):
 
 def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
     # Savage-Dickey against brute force: solve without the group, with the same prior for all other
-    # groups. Exact in a linear problem; the directions are linear to noise / g.
+    # groups. The ratio is exact in a linear problem; the directions are linear to noise / g.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
@@ -226,7 +224,7 @@ def test_what_a_group_explains_is_what_it_adds(calm):
     evidence = group_evidence(regression, chosen.posterior)
     explains = {(group.part, group.group): group.explains_m_s2 for group in evidence}
     expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
-    # About 100 ug, with a noise of 2 ug.
+    # The effect is about 100 ug, the noise 2 ug.
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
@@ -313,7 +311,7 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
     chosen = fit_all(regression, state, prior, fixed, priors)
     assert chosen.posterior.prior.informative is priors[int(away > 0.0)]
     curve = unit_of(chosen.posterior.state, layout)[places]
-    # The same data: both results differ by less than their uncertainties.
+    # Both fits have the same data, so their results differ by less than their uncertainties.
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()
 
 
@@ -328,7 +326,7 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
         return chosen, float(np.sqrt(np.mean((table.columns @ missed.T) ** 2)))
 
     chosen, left = drift_left(windows)
-    # 12 positions x 2 angles x 2 columns: a sd of 10 %.
+    # Tilts of 12 positions x 2 angles x 2 columns determine their sd to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
     # A tilt of 5 urad changes any axis by 5 ug; the noise of 720 windows is 0.1 ug for each
     # weight.
@@ -337,7 +335,7 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
 
 
 def test_a_stiff_support_is_not_seen_tilting(calm):
-    # Less than the noise of the windows of a tilt, 2 ug / sqrt(60).
+    # The estimated tilt is below the noise of the mean of 60 windows of 2 ug.
     _, chosen, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)
     tilt = GRAVITY * chosen.posterior.state.tilt
@@ -361,7 +359,7 @@ def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting():
     for n in (9, 24):
         claim, fitted = claimed(n)
         assert np.linalg.eigvalsh(claim).min() > 0.0
-        # The biases, after kappa in each axis.
+        # The bias of each axis follows its kappa.
         k = (len(claim) - 3) // 3
         at = 1 + k * np.arange(3)
         ratios.append(np.sqrt(np.diag(claim)[at].mean() / np.diag(fitted)[at].mean()))

@@ -76,12 +76,12 @@ def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng):
             bank_.step(stamp, float(gradient[k]))
         row = memory.at(stamp, float(board[k]), [float(g[k]) for g in gradients])
         if k % 100 == 99:
-            # The same recursion in another order of additions.
+            # The results differ by rounding only, as both add the same terms in another order.
             np.testing.assert_allclose(on_grid[k], row, atol=1e-9)
 
 
 def test_columns_are_those_of_the_tracker(bags):
-    # Window by window against a tracker with full memory, with readings and samples as online.
+    # The second route is a tracker with full memory that gets readings and samples as online.
     windows = windows_of(bags)
     spec = memory_of(bank())
     table = ColumnTable(bank(), spec, 20.0)
@@ -105,12 +105,12 @@ def test_columns_are_those_of_the_tracker(bags):
     phi = table.values(np.array(states).T).T
     seconds = (grid - bag.start_ns) * 1e-9
     n_sets = rows.shape[1] - phi.shape[1]
-    # Means over the windows of a minute.
+    # The expected columns are means over the windows of a minute.
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # Here the lags follow the tracker's estimates, there its readings; plays turn at once, or a
-    # part of a window later.
+    # The lags here follow the tracker's estimates, those of the fit its readings, so that plays
+    # turn up to a part of a window apart.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
@@ -153,8 +153,8 @@ def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     message = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([message])
-    # Silence: the time-out of 60 s, five intervals of 4 s, and a window. A constant reading is
-    # detected when the other thermometer changes.
+    # A silent thermometer is missing after the time-out of 60 s, five intervals of 4 s, and a
+    # window. A constant reading is detected when the other thermometer changes.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])
@@ -165,7 +165,7 @@ def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
 
 
 def test_the_lag_of_a_column_moves_it_as_its_slope_says():
-    # A lag that started a microkelvin higher, through the formula of the columns.
+    # The second route shifts the lags by a microkelvin, and evaluates the columns again.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
     layout, table = Layout(spec), ColumnTable(columns, spec, 20.0)
@@ -202,7 +202,7 @@ def test_curves(bags, options, static, dynamic, is_shared):
     weight = np.linspace(0.0, 1.0, 9)
     columns = sets.columns(t, weight)
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    # No effect at the reference temperature, and no effect of the dynamic set in the static
+    # Columns are 0 at the reference temperature, and those of the dynamic set in the static
     # regime.
     nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):
@@ -250,8 +250,8 @@ def states_of(windows, calibration):
 
 
 def test_the_file_corrects_as_the_regression(fitted):
-    # Curves, sets and linear columns through the calibration's correction. Windows are means over
-    # a minute; powers of means differ from means of powers by some ppm at 1 K/min.
+    # Curves, sets and linear columns of the fit give the correction by the calibration. Windows
+    # are means over a minute; powers of means differ from means of powers by some ppm at 1 K/min.
     result, _ = fitted
     windows, calibration = result.fit.windows, result.calibration
     state, prior = result.fit.posterior.state, result.fit.posterior.prior
@@ -270,8 +270,7 @@ def test_the_file_corrects_as_the_regression(fitted):
 
 
 def test_covariance_of_the_file_is_that_of_the_claim(fitted):
-    # The variance of levels by the file's parameters and by the regression's: the same linear
-    # form.
+    # The parameters of the file and of the regression give the same variance of levels.
     result, claim = fitted
     calibration = result.calibration
     layout = parameter_layout(calibration)
@@ -287,7 +286,6 @@ def test_covariance_of_the_file_is_that_of_the_claim(fitted):
         assert by_file[bias] == pytest.approx(expected, rel=1e-4)
         expected = sd[claim.layout.kappa[axis]] / state.kappa[axis]
         assert by_file[scale] == pytest.approx(expected, rel=1e-4)
-        # The stated error of gravity is included.
         assert by_file[scale] > 1e-4 / STANDARD_GRAVITY
     places = claim.layout.misalignment[[0, 2]]
     np.testing.assert_allclose(by_file[-3:][[0, 2]], sd[places], rtol=1e-4)
@@ -297,12 +295,11 @@ def test_sections_and_kelvins_by_hand(bags):
     windows = windows_of(bags)
     data, t = windows.data, windows.temperature - 20.0
     for p in range(data.n_positions):
-        # Equal parts of the program, in order.
         section = data.section[data.position == p]
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # A line has its own RMS; t^2 is steepest, 2 t, at the largest distance from the reference.
+    # The kelvins of column t are its RMS; those of t^2 are its RMS over the largest slope, 2 t.
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

@@ -63,7 +63,6 @@ class TestElsewhere:
             process_unit(there, url, OPTIONS),
         )
         first, second = (parse_calibration(text.calibration.encode()) for text in (one, other))
-        # Only the date of the fit differs.
         assert replace(first, provenance=second.provenance) == second
         assert first.provenance.sources == second.provenance.sources
         assert other.hashes == {name: digest(unit.parent / name) for name in here.bags}

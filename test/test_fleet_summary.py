@@ -69,7 +69,7 @@ class TestOutliers:
     @pytest.mark.parametrize('n', [10, 40])
     def test_a_fleet_without_oddities_alarms_once_in_twenty(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
-        # 60 x 0.05 = 3 on average; twelve happens once in 30000.
+        # 60 fleets with a false alarm rate of 0.05 give 3 alarms on average, and 12 once in 30000.
         assert n_alarms < 12
 
     def test_a_small_fleet_has_no_outliers(self, rng):
@@ -143,7 +143,6 @@ class TestPage:
         assert all(re.fullmatch(r"[\w./%'()~-]+", link) for link in links)
         assert re.findall(r'\ssrc="', page) == []
         assert "default-src 'none'" in page
-        # Residuals, and distances.
         assert page.count('<figure') == 2
 
     def test_a_fleet_without_a_calibration(self):

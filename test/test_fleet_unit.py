@@ -46,7 +46,6 @@ def test_the_fit_is_that_of_thermo_comp_fit(fleet, brief):
     ours = parse_calibration(brief.calibration.encode())
     theirs = fit(sources, replace(OPTIONS.fit, serial='mems-0001')).calibration
     assert ours.provenance.sources == theirs.provenance.sources
-    # Only the date of the fit differs.
     assert ours == replace(theirs, provenance=ours.provenance)
 
 
@@ -77,7 +76,7 @@ class TestRow:
         assert (row['problem'], row['left_out'], row['chosen']) == ('', '', '')
         assert (row['n_bags'], row['n_left_out'], row['n_positions']) == (6, 0, 6)
         calibration = parse_calibration(outcome.calibration.encode())
-        # Bias of x at the reference temperature, from the row and from the file.
+        # The bias of x at the reference temperature in the row follows from the file.
         x = calibration.axes.x
         bias = (x.bias + calibration.static.x.delta) / x.scale_factor
         assert row['bias_x_ug'] == pytest.approx(bias / 9.80665e-6)

@@ -28,7 +28,7 @@ temperatures = st.floats(-15.0, 15.0)
 
 
 def test_polynomial_by_hand():
-    # 1 + 2*3 + 0.5*9 + 0.25*27: the fourth term of Eq. (10) is a4 t^4, not a4 t.
+    # The paper prints the fourth term of Eq. (10) as a4 t, which should be a4 t^4.
     assert Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
 
 
@@ -85,7 +85,7 @@ def test_value_is_linear_in_the_free_coefficients(function, t, data):
     expected = function.value(t) + sum(
         b * d for b, d in zip(function.basis(t), change, strict=True)
     )
-    # Powers up to 15^4 times coefficients of order 1.
+    # The tolerance is the rounding of powers up to 15^4 with coefficients of order 1.
     assert other.value(t) == pytest.approx(expected, rel=1e-12, abs=1e-9)
     assert other.value(0.0) == pytest.approx(function.value(0.0), abs=1e-15)
 
@@ -146,7 +146,7 @@ def test_sd_by_hand():
     assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
     assert scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
-    # An endless ramp of 0.6 K/min: 600 s behind are 6 K.
+    # In an endless ramp of 0.6 K/min a lag of 600 s is 6 K.
     bias, scale = sd_of_states(unit, ramp_states(unit, np.array([25.0]), 0.01, np.inf))
     assert bias[0, 0] == pytest.approx(np.sqrt(9e-4 + 36e-6) / 300.0, rel=1e-6)
     assert scale[0, 0] == pytest.approx(2e-6, rel=1e-6)
@@ -184,7 +184,7 @@ def test_ramp_is_what_the_memory_makes_of_one(rate):
 
 
 def test_statistics_of_scalars_by_hand():
-    # 3 and -4: mean -0.5, mean square 12.5.
+    # The values 3 and -4 have the mean -0.5 and the mean square 12.5.
     statistics = residual_statistics(np.array([3.0, -4.0]))
     assert (statistics.n, statistics.mean, statistics.peak) == (2, -0.5, 4.0)
     assert statistics.rms == pytest.approx(12.5**0.5, rel=1e-15)
@@ -204,7 +204,6 @@ def test_nothing_to_count_gives_nan():
 def test_norm_residual_does_not_see_a_rotation(rng):
     force = rng.normal(size=(5, 3))
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    # A rotation moves each norm by rounding only.
     np.testing.assert_allclose(
         norm_residual(force @ turn.T, 9.8), norm_residual(force, 9.8), atol=1e-14
     )

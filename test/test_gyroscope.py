@@ -69,7 +69,7 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; no single column equals the drift of its gyroscope."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # Heat flows in and between the parts; half of the columns, and half of the work.
+    # Groups of heat flows alone have half of the columns, and take half of the time.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -77,7 +77,7 @@ def fitted(unit):
 @pytest.fixture(scope='module')
 def held_out(unit):
     stations = plan('held-out', 2)[:2]
-    # Two ramps up and two down with soaks, without the last way back.
+    # Two ramps up and two down with soaks; the last ramp does not return to the start.
     whole = stations[0].program
     program = replace(whole, time_s=whole.time_s[:10], temperature_c=whole.temperature_c[:10])
     stations = [replace(station, program=program) for station in stations]
@@ -105,7 +105,7 @@ def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
         claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
         assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
     np.testing.assert_allclose(gyroscope.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
-    # Claimed sd from 9 positions with a turn-on of 2 mdeg/s, and the prior of the Earth's rate.
+    # The claimed sd follows from 9 positions with a turn-on of 2 mdeg/s.
     assert np.mean(gyroscope.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
 
 
@@ -173,7 +173,7 @@ def test_file_and_triad_round_trip():
     np.testing.assert_array_equal(scale, 1.0)
     sd_bias, sd_scale = sd_of_states(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
-    # Bias at the reference; variance of its level and of the turn-on.
+    # At the reference the bias is its level, and its variance that of level and turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     np.testing.assert_allclose(
         sd_bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5
@@ -223,11 +223,11 @@ def test_the_rate_is_corrected_by_hand_numbers():
     assert compensator.process(0, 300.0, 600.0, 2900.0) is not None
     x, y, z, *variances = compensator.correct_rate(0, 1.0, 1.0, 1.0)
     assert (x, y, z) == pytest.approx((0.98 - 1e-5, 1.03, 0.99 - 1e-5), abs=1e-12)
-    # While the regime is unknown: noise of a message, slow error, and difference of the sets.
+    # While the regime is unknown the variance is noise, slow error, and difference of the sets.
     least = np.square((1e-4, 2e-4, 1e-4)) / 0.01 + np.square((1e-5, 2e-5, 1e-5))
     assert (np.array(variances) >= least).all()
     assert variances == pytest.approx(least, rel=0.05)
-    # The bias sd for an INS: the same without the noise of a message.
+    # The bias sd for an INS does not contain the noise of a message.
     sd = compensator.status().rate_bias_sd
     noise = np.square((1e-4, 2e-4, 1e-4)) / 0.01
     np.testing.assert_allclose(np.square(sd), variances - noise, rtol=1e-6)
@@ -256,7 +256,8 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     assert judged.exit_code == 0
     for name in ('static', 'dynamic', 'all'):
         section = rate.sections[name]
-        # Above the noise alone, and larger than necessary because of lags with unknown start.
+        # The claimed sd is above the noise, and larger than necessary as lags have an unknown
+        # start.
         assert 0.7 < section.ratio < 1.2
         assert section.rms < 1.3 * FLOOR
         assert section.raw_rms > 50.0 * FLOOR

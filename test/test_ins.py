@@ -12,7 +12,8 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.mark.parametrize('axis', [0, 1])
 def test_a_bias_makes_schuler_s_oscillation(axis):
-    # Bias b on one level axis after levelling without it: p = b R / g (1 - cos(w t)), w^2 = g / R.
+    # A bias b of a level axis that begins after levelling gives the position error
+    # b R / g (1 - cos(w t)), w^2 = g / R.
     bias, dt, minutes = 1e-4, 0.5, 84
     force = G * UP
     force[axis] += bias
@@ -43,7 +44,7 @@ def test_levelling_makes_the_force_vertical(rng):
 
 
 def test_the_sigma_is_that_of_white_noise(rng):
-    # Over half an hour, a third of Schuler's period: noise of levelling, and integrated noise.
+    # In a third of Schuler's period the error is noise of levelling and integrated noise.
     density, dt = 1e-4, 0.5
     force = G * UP + rng.normal(0.0, density / np.sqrt(dt), (40_000, 3))
     free = fly(Model(force, density, 0.0), dt, UP, G, 0.0)
@@ -57,7 +58,7 @@ def test_the_sigma_is_that_of_white_noise(rng):
 
 
 def test_updates_find_a_bias_that_levelling_has_not_seen():
-    # An error at the start of the flight: after 25 minutes of ZUPT little of it is left.
+    # After 25 minutes of ZUPT little is left of an error at the start of the flight.
     dt, n_align = 0.5, 600
     force = np.tile(G * UP, (n_align + 3600 + 1, 1))
     force[n_align:, 0] += 1e-3

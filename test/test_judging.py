@@ -102,7 +102,7 @@ class TestWindows:
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
         judgements = evaluate([bag], models).judgements
         drift = SLOPE * 10.0 / K
-        # The estimate of a steady temperature is exact to 1e-7 K, 1e-9 m/s^2.
+        # The estimate of a steady temperature is exact to 1e-7 K, which are 1e-9 m/s^2.
         for name, expected in (('right', 0.0), ('half', drift / 2)):
             windows = judgements[name].windows
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
@@ -149,7 +149,7 @@ class TestWindows:
         assert not inside.any()
         assert len(windows) >= 55
         assert np.unique(windows.position).tolist() == [0, 1]
-        # 0.3 counts of noise over 100 samples: 0.1 mm/s^2 per window.
+        # 0.3 counts of noise over 100 samples are 0.1 mm/s^2 per window.
         assert np.sqrt(np.mean(windows.residual**2)) < 3.0 * 0.3 / K / 10.0
 
     def test_noise_is_claimed_as_it_is(self, tmp_path):
@@ -185,7 +185,7 @@ class TestWindows:
         ]
         evaluation = evaluate(bags, [('it', CLAIMING)])
         whole = evaluation.judgements['it'].sections['all']
-        # +102 ug in one regime, -102 ug in the other: mean 0, RMS 102 ug.
+        # Residuals of +102 ug in one regime and -102 ug in the other have the mean 0.
         assert whole.n == sum(judged(bag, CLAIMING).sections['all'].n for bag in bags)
         assert whole.mean / MICRO_G == pytest.approx(0.0, abs=0.5)
         assert whole.rms == pytest.approx(0.3 / K, rel=1e-3)
@@ -224,7 +224,6 @@ class TestVerdict:
         assert judgement.verdict == verdict
         assert judgement.is_valid == verdict.startswith('valid')
         assert judgement.exit_code == (0 if judgement.is_valid else 1)
-        # Residuals and claim are compared over the same windows.
         assert judgement.sections['all'].ratio == pytest.approx(residual / claimed)
         for value in (residual, raw, claimed):
             assert spoken(value * MICRO_G) in judgement.reason
@@ -256,7 +255,7 @@ class TestVerdict:
         assert seen.reason.startswith(
             '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
         )
-        # The claim is compared with the same positions; the limit holds for a new attitude.
+        # The claimed sd is that of the fitted positions; the tolerance applies to a new attitude.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
@@ -355,7 +354,6 @@ class TestShifts:
     def test_a_unit_as_it_was_has_not_moved(self):
         judgement = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)
         assert (len(judgement.shifts), judgement.moved, judgement.verdict) == (3, (), 'valid')
-        # Five positions do not determine the shifts.
         judgement = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
         assert (judgement.shifts, judgement.n_positions) == ((), 5)
 
@@ -371,8 +369,8 @@ def test_thermometers_in_doubt_are_told_offline_too(root, tmp_path):
     """
     WHY: replay did not report exchanged thermometers, and evaluate called them valid.
 
-    WHAT: both print the node's message and no verdict is given; likewise outside the calibrated
-    range.
+    WHAT: replay and evaluate print the node's message and give no verdict, nor outside the
+    calibrated range.
     """
     exchanged = Topics(board='temperature/case', case='temperature/board')
     for topics, text in ((Topics(), []), (exchanged, [SWAPPED])):

@@ -55,11 +55,10 @@ def test_changes_and_their_sd_by_hand():
 
 def test_what_is_no_history():
     unit = dated('2026-01-01')
-    # No history: another model of the same bags, another unit, and a single calibration.
+    # A single calibration, models of the same bags, and another unit are no history.
     other = dataclasses.replace(unit, unit=dataclasses.replace(unit.unit, serial='other'))
     for calibrations in ([unit], [unit, unit], [unit, dataclasses.replace(other)]):
         assert drifts_of(history_of(calibrations)) == []
-    # Without a claimed sd a change is never significant.
     import_ = dataclasses.replace(dated('2026-03-01', 500.0, sd_ug=0.0))
     silent = drifts_of(history_of([unit, import_]))
     assert np.isnan([drift.sd for drift in silent]).all()

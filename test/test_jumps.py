@@ -31,11 +31,12 @@ def test_jump_along_gravity(rng, with_gyro):
     # The jump is located by the single sample between the levels.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # 10 s at 25 Hz on each side with a free drift: sd 2 * 3 mg * sqrt(2 / 250) = 0.5 mg; 4 sd.
+    # Samples of 3 mg for 10 s at 25 Hz on each side of the step determine the step, with a free
+    # drift, to 2 * 3 mg * sqrt(2 / 250) = 0.5 mg; the tolerance is 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
-    # The board keeps cooling; 20 readings of 20 mK on each side of the step: 2 * 0.02 * sqrt(2 /
-    # 20).
+    # The board keeps cooling; 20 readings of 20 mK on each side determine its step to 2 * 0.02 *
+    # sqrt(2 / 20).
     assert event.temperature_change_sd == pytest.approx(0.0126, rel=0.4)
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 
@@ -51,7 +52,7 @@ def turned(rest, from_s, angle, with_rate):
 
 @pytest.mark.parametrize('seen', [True, False])
 def test_turn_is_told_by_the_gyro(rng, seen):
-    # 20 mrad in one sample: the norm does not change, so only a gyroscope shows it.
+    # A turn by 20 mrad in one sample does not change the norm, so only a gyroscope shows it.
     rest = Rest(rng)
     turned(rest, 250.0, 0.02, with_rate=seen)
     events = look(rest, with_gyro=True)
@@ -95,7 +96,7 @@ def test_cut_into_blocks_it_is_the_same(rng):
 
 
 def test_drift_with_temperature_is_no_step(rng):
-    # 2 mg/K at up to 6 K/min.
+    # The bias changes by 2 mg/K, at up to 6 K/min.
     rest = Rest(rng)
     rest.accel[:, 2] += 2.0 * MG * (rest.temperature(rest.time) - 20.0)
     assert look(rest) == ()
@@ -123,7 +124,7 @@ def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
 def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
-    # WHY: means over 10 s determine a level to 3 mg there, so 20 mg within one sample were missed.
+    # WHY: in such noise means over 10 s determine a level to 3 mg, so jumps of 20 mg were missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)
@@ -131,7 +132,7 @@ def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
     assert len(bag.intervals) == 2
     (event,) = find_jumps(bag)
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
-    # Limit of 4 sd of the innovation of a sample, which does not depend on earlier samples.
+    # The limit is 4 sd of the innovation of a sample, which does not depend on earlier samples.
     new = sd * np.sqrt(1.0 - np.exp(-2.0 / (rest.rate_hz * tau_s)))
     assert event.along / MG == pytest.approx(20.0, abs=4.0 * new)
 

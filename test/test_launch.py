@@ -106,7 +106,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
     some = [{}, {'frame_id': 'body'}, {'serial': '0042', **counts}]
     for arguments in some:
         files = []
-        # In the order of launch: the user's file, then the values of the launch file.
+        # Launch passes the user's file first, then the values of the launch file.
         for name, values in (('mine', mine), ('launch', parameters_set(arguments))):
             path = tmp_path / f'{name}.yaml'
             path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))

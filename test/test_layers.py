@@ -115,7 +115,7 @@ def test_imports_go_down_only(path):
             wrong.append(f'{path.name}:{line} imports {name} of layer {LAYERS[target]}')
         library = name.split('.')[0]
         if library in HOMES and unit not in HOMES[library]:
-            wrong.append(f'{path.name}:{line} imports {library}, at home in {HOMES[library]}')
+            wrong.append(f'{path.name}:{line} imports {library}, as only {HOMES[library]} may')
         if library in CLOCKS and unit in PURE and file not in CLOCK_EXCEPTIONS:
             wrong.append(f'{path.name}:{line} imports {library}: the arithmetic has no clock')
     assert not wrong

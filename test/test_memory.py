@@ -26,8 +26,8 @@ TAUS = (60.0, 900.0, 7680.0)
 
 @pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
 def test_a_lag_of_a_ramp(step_s):
-    # u = r t from rest: u - L = r tau (1 - exp(-t / tau)) for any reading interval (first-order
-    # hold).
+    # A ramp u = r t from rest gives u - L = r tau (1 - exp(-t / tau)) for any reading interval, as
+    # the input is linear between readings.
     rate, n = 0.01, 200
     bank = LagBank(TAUS)
     for k in range(n + 1):
@@ -40,7 +40,7 @@ def test_a_lag_of_a_ramp(step_s):
 
 
 def test_a_lag_of_a_step():
-    # Within one reading interval of 1 ms from 0 to 5 K, then constant: u - L = 5 exp(-t / tau).
+    # The input rises from 0 to 5 K in 1 ms, and is then constant: u - L = 5 exp(-t / tau).
     bank = LagBank(TAUS)
     bank.step(0, 0.0)
     bank.step(1_000_000, 5.0)
@@ -65,7 +65,6 @@ def test_what_is_not_known_of_a_lag():
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
-    # The uncertainty decays with the lag.
     variance = bank.at(150 * SECOND_NS, 2.0)[1]
     assert variance == pytest.approx([lost**2 * math.exp(-2.0), 0.0])
     bank.note_jump(3.0)
@@ -111,7 +110,6 @@ def test_a_lag_of_two_stages_is_that_of_two_parts_in_series(rng):
     # The solver steps over the corners of the input, with an error of some microkelvin.
     np.testing.assert_allclose(streamed[:, 0], board - part, atol=1e-5)
     np.testing.assert_allclose(streamed[:, 2], part, atol=1e-5)
-    # The play follows the part, and not the board.
     assert np.abs(streamed[:, 4]).max() <= 0.4 + 1e-12
     held = streamed[:, 4] + part
     is_inside = np.abs(streamed[:, 4]) < 0.4 - 1e-9
@@ -141,7 +139,7 @@ def test_a_part_between_board_and_sensor(rng):
     # An error of the case's lag moves the part in the opposite direction.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
-    # The unknown start is that of the younger input.
+    # A part with two inputs starts unknown at the first value of the later input.
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)
@@ -149,7 +147,7 @@ def test_a_part_between_board_and_sensor(rng):
 
 
 def test_the_unknown_start_of_a_lag_of_two_stages(rng):
-    # A board in a long random walk, which then stands still.
+    # The board is in a long random walk, and then stands still.
     D, step, n = 0.005, 6.0, 4000
     tau = np.array([900.0, 150.0])
     parts = np.zeros((n, 2))
@@ -159,7 +157,7 @@ def test_the_unknown_start_of_a_lag_of_two_stages(rng):
         parts[:, 0] *= math.exp(-step / tau[0])
         parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
     P = start_covariance([TWO_STAGES])
-    # n draws: relative sd sqrt(2 / n) = 2.2 %; a step is 4 % of 150 s.
+    # A variance from n draws has a relative sd of sqrt(2 / n) = 2.2 %; a step is 4 % of 150 s.
     assert np.mean(parts[:, 1] ** 2) == pytest.approx(P[0, 0], rel=0.11)
     for age in (150.0, 900.0, 2700.0):
         first = parts[:, 0] * math.exp(-age / tau[0])
@@ -174,7 +172,7 @@ def test_a_second_stage_adds_the_errors_of_both():
     memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
-    # (900 + 150) / (900 - 150): at most, were the errors of both stages of opposite sign.
+    # At most (900 + 150) / (900 - 150), if the errors of both stages had opposite signs.
     assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
 
 
@@ -183,7 +181,8 @@ def plays(*widths):
 
 
 def test_the_loop_of_a_play():
-    # Half-width 1 on 0 -> 5 -> 0 -> 5: rising at v - 1, constant over 2, falling at v + 1.
+    # A play of half-width 1 is v - 1 while v rises, v + 1 while v falls, and constant over 2 K
+    # after each reversal.
     memory = plays(1.0)
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []
@@ -225,7 +224,7 @@ def test_start_prior():
 
 
 def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
-    # A board in a long random walk: its lags at the first reading scatter by P.
+    # The lags of a board in a long random walk scatter by P at the first reading.
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0
@@ -235,7 +234,7 @@ def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
         e = np.exp(-step / tau)
         m = m * e + walk * (tau / step) * (1.0 - e)
     P = start_covariance([('board', t) for t in tau])
-    # n draws: relative sd sqrt(2 / n) = 2.2 %; the steps of the walk are a tenth of 60 s.
+    # A variance from n draws has a relative sd of sqrt(2 / n) = 2.2 %; a step is a tenth of 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
 
 

@@ -103,7 +103,6 @@ def wakes_per_sample(peer, drivers, node_arguments):
         # One driver for all nodes, as samples of two sources are not published.
         drivers[:] = drivers or [Driver(peer)]
         first = 0
-        # Wait until node and peer have discovered each other.
         while not heard:
             assert first < N_TRIED, node.said
             send(drivers[0], first, first + 100, 0.001)

@@ -122,7 +122,7 @@ def test_flag_is_latched_and_not_there_while_unknown(peer, saved):
         assert not flags
         n = 0
         while not flags and n < 4000:
-            # Two minutes of data at a time, until the detector knows that it is a soak.
+            # Two minutes of data at a time are sent, until the detector has recognised the soak.
             for _ in range(120):
                 n += 1
                 driver.temperatures(START_NS + n * SECOND_NS, 20.0, 20.0)
@@ -215,7 +215,7 @@ def test_diagnostics_tell_noise_and_bias_apart(peer, saved):
             assert bias > 0.0
             of_rate = float(values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'])
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
-            # The regime is unknown: the two sets of that gyroscope differ by about 30 urad/s.
+            # The regime is unknown: the two sets of the gyroscope differ by about 30 urad/s.
             assert 1e-5 < float(values[f'bias sd of rate {axis} [rad/s]']) < 1e-3
 
 
@@ -240,7 +240,7 @@ def test_diagnostics_of_temperatures(peer, saved):
     unit = replace(thermal_calibration(), nonlinearity=Nonlinearity((1.0, 5.0), 1e-4))
     with node_in_thread(*saved(unit, 'temperature_timeout:=20', 'case_timeout:=10')) as node:
         driver = drive(peer, node)
-        # 50 degC: 15 K above the calibrated range.
+        # 50 degC are 15 K above the calibrated range.
         for k in range(5):
             driver.temperatures(START_NS + k * SECOND_NS, 50.0, 50.0)
             driver.counts(START_NS + k * SECOND_NS, *standing(k))

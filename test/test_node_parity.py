@@ -52,13 +52,12 @@ def thermal_test(path, imu=False, has_case=True):
     case = np.interp(seconds, [0.0, 600.0, 1200.0], [15.0, 15.0, 25.0])
     board = np.interp(seconds - 100.0, [0.0, 600.0, 1200.0], [16.0, 16.0, 26.0])
     reading_ns = START_NS + (seconds * 1e9).astype(np.int64)
-    # Scale factors near those of `rich_calibration`: at rest, level, z up, with a little noise.
+    # The unit rests with z up; the counts follow from the scale factors of `rich_calibration`.
     accel = np.array([5.0, -3.0, 310.0 * 9.80665]) + rng.integers(-4, 5, (n, 3))
     with BagWriter(path) as writer:
         for topic, values, late_ns in (
             (TOPICS.board, board, 350_000_000),
             (TOPICS.case, case, 1_250_000_000),
-            # The third thermometer of that calibration.
             ('temperature/frame', 0.5 * (board + case) + 1.0, 700_000_000),
         ):
             if topic == TOPICS.case and not has_case:
@@ -68,7 +67,6 @@ def thermal_test(path, imu=False, has_case=True):
             writer.write_temperature(topic, reading_ns, noisy, reading_ns + late)
         if imu:
             rest = ImuColumns(*(rng.standard_normal((n, k)) for k in (4, 9, 3, 9, 9)))
-            # Every tenth message states that it has no angular rate.
             rest.angular_velocity_covariance[::10, 0] = -1.0
             covariance = rest.linear_acceleration_covariance
             force = accel / [300.0, -295.0, 310.0]

@@ -119,8 +119,7 @@ def test_reload_while_samples_flow(peer, tmp_path):
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 5.0
 
-        # The file of another unit while the serial is set, and a serial that differs from the
-        # file's.
+        # A file and a set serial that differ are refused, whichever of the two is set last.
         save_calibration(of_bias(4.0, unit=Unit('T-2', 'counts', 32767.0, 0.01)), third)
         (result,) = peer.set_parameters(serial='T-9')
         assert "unit.serial: must be 'T-9'" in result.reason
@@ -185,7 +184,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
     # WHY: a calibration was refused, and its bias was applied all the same.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    # Another detector, so that everything is rebuilt.
+    # The second calibration has another detector, so that everything is rebuilt.
     save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
     context = Context()
     rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)
@@ -219,7 +218,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # Each executed line of the building, the exchange and the setting.
+        # The failure was raised at each executed line of the change, which are over 150.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
             change.name: change.value for change in changes

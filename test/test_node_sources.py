@@ -70,7 +70,7 @@ def test_samples_of_a_second_publisher_never_go_out(peer, unit):
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
         peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
-        # After the other driver has left, the first samples may still be from it.
+        # The first samples after the end of the other driver may still be from that driver.
         samples.send(20)
         before = len(samples.heard)
         peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')

@@ -81,7 +81,7 @@ def test_a_correction_undoes_the_terms_at_their_temperature():
 def test_stream_and_batch_have_the_same_bits(rng):
     bent = replace(rich_calibration(), posterior=None, nonlinearity=BENT)
     unit = with_covariance(bent, rng)
-    # Up to 10 g on an axis, beyond the 6 g of the fit.
+    # The forces are up to 10 g on an axis, beyond the 6 g of the fit.
     events = [
         (kind, stamp, tuple(9.0 * count for count in value) if kind == 'accel' else value)
         for kind, stamp, value in run_of(rng, seconds=60)
@@ -103,7 +103,7 @@ def test_without_terms_every_bit_is_that_of_a_file_without_a_nonlinearity(rng):
 
 
 def test_the_variance_is_that_of_all_parameters_together(rng):
-    # No |f| f: its correlation with other terms is left out, on the safe side.
+    # The term |f| f is absent, as the correction overstates its variance.
     unit = calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE)))
     unit = with_covariance(unit, rng)
     layout, correction = parameter_layout(unit), Correction(unit)

@@ -74,14 +74,15 @@ def test_a_part_between_board_and_case():
     parts = {one.part for one in calibration.response if one.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares = np.array(sorted(parts)).T
-    # As without a case: ramps determine the lag of 1 K of the case, and so its share, within 0.01.
+    # Ramps determine a lag to 1 %, and therefore the share of the case to 0.01.
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert judged(calibration, study).norm < 2.0
 
 
 def test_bags_of_one_warm_up_predict_another():
-    # Thawed from a freezer, always alike: the board's temperature determines its lags.
+    # Every bag is the same thaw from a freezer, in which the board's temperature determines its
+    # lags.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
     rng = rng_of('thaw')
     unit = navigation(rng, part_s=PARTS_S / 4.0)
@@ -141,7 +142,7 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     # Another simulator: heads that lag the board, pendulums that lag the heads, and an error
     # proportional to the stress between board and pendulum.
     unit = second_simulator.unit_of('products', 2)
-    # Stages of the x axis that are equal are fitted as two of a ratio of 0.89.
+    # Two equal stages of the x axis are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
     _, program, *_, held = second_simulator.PLANS['mild']
     up = second_simulator.directions(9, 5)
@@ -149,7 +150,6 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     tests = second_simulator.runs_of(unit, held[0], second_simulator.directions(1, 7), 7,
                                      soaked_s=21600.0, soaked_c=20.0)  # fmt: skip
     for record in (*records, *tests):
-        # A reading every 10 s, of which there is one every 2 s.
         for name in ('board', 'case', 'board_stamp_ns', 'case_stamp_ns'):
             setattr(record, name, getattr(record, name)[::5])
     result = fit_and_correct(records, tests, full_scale=second_simulator.FULL_SCALE)

@@ -85,14 +85,13 @@ def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # When the fault is found the error is the change of the other sensor: some quanta and a
-    # kelvin. A frozen case shows in the board, which is 10 K behind.
+    # When the fault is detected the error is the change of the other sensor: some quanta and a
+    # kelvin. A frozen case is detected by the board, which lags by 10 K.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead
     state = tracker.sample(second * SECOND_NS)
     assert math.sqrt(state[VAR_BOARD if frozen == 'board' else VAR_GRADIENT]) > 0.5
-    # The sensor is not used until its reading changes.
     assert not tracker.read(frozen, (second + 1) * SECOND_NS, last[frozen])
     assert tracker.read(frozen, (second + 2) * SECOND_NS, last[frozen] + 0.07)
     assert guard.fault == Fault.NONE

@@ -100,7 +100,7 @@ def test_layout_by_hand():
         response=(term('gradient'), term('board', tau_s=60.0)),
     )
     layout = parameter_layout(value)
-    # x: level t t^2 | level three knots | two weights.
+    # The bias of x has a level, t and t^2, then a level and three knots, then two weights.
     assert layout.bias[0] == Block(0, 3, 7, 9)
     assert layout.scale[0] == Block(9, 10, 11, 13)
     assert layout.bias[1] == Block(13, 14, 15, 17)
@@ -152,19 +152,18 @@ def said(result):
 def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
     result = fitted(rng, FACES)
     least = result.least_known
-    # Without a posterior there is no claimed sd.
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
-    # A corner, or a neighbour in the grid: the variance is flat there.
+    # The attitude is a corner, or a neighbour of a corner in the grid, as the variance is flat.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
-    # d|f| = g (xy, xz, yz) . (three angles of 1 mrad); noise and curves of the faces add a little.
+    # Three angles of 1 mrad change |f| by g times (xy, xz, yz); noise and curves add a little.
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-3 / 3.0**0.5, rel=0.2)
 
 
 def test_a_side_that_was_never_up_is_named(rng):
     ups = positions(30, 4)
     result = fitted(rng, ups[ups[:, 2] > 0.2])
-    # Or a neighbour in the grid.
+    # The attitude may also be a neighbour in the grid.
     np.testing.assert_allclose(result.least_known.up, (0.0, 0.0, -1.0), atol=0.06)
     assert '-z up' in said(result)
     assert said(result) in ' '.join(result.calibration.provenance.notes)

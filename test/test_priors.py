@@ -26,12 +26,12 @@ from thermo_comp.unit.posterior import Posterior
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: The groups of this kind of unit: a third of all columns, and half of the time.
+#: Only the groups of the unit's physics, a third of all columns, take half of the time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
 def source(record):
-    # A reading every eight seconds: a ramp of 1 K/min is still detected, eight times faster.
+    # Readings every eight seconds are enough for ramps of 1 K/min, and take an eighth of the time.
     arrays = arrays_of(record, 8)
     later = [array + 10**18 if array.dtype == np.int64 else array for array in arrays]
     return source_of(*later)
@@ -173,7 +173,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
     ]
     assert left[1] > 10.0 * left[0]
     # Parts with a lag of an hour started at an unknown temperature, which ten minutes do not
-    # separate from a bias: the claimed sd includes a few ug for it, and the error is within it.
+    # separate from a bias: the claimed sd includes some ug for this error.
     sd = float(sd_of_levels(new).max())
     assert sd < 10e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)

@@ -152,7 +152,7 @@ def whole_range(of):
     now_ns = START_NS
     for k, (celsius, step_s) in enumerate(zip(temperatures, steps_s, strict=True)):
         for m in range(6):
-            # Six readings between, so that none is taken for a jump.
+            # Each temperature is read six times, so that it is not taken for a wrong reading.
             now_ns += round(step_s / 6.0 * 1e9)
             sent.append(('board', now_ns, celsius))
             sent += [(name, now_ns, celsius + 0.1 * m) for name in of.sensors]
@@ -264,7 +264,6 @@ def test_any_messages_give_sound_numbers(of, config, sent):
     limit = bound(of) * (1.0 + 1e-9)
     now_ns, last_ns, n_jumps, n_counts = START_NS, -math.inf, 0, 0
     for topic, step, value in sent:
-        # Stamps that a message can contain.
         now_ns = min(max(now_ns + step, -(2**31) * 10**9), 2**31 * 10**9 - 1)
         if topic != 'counts':
             compensator.push(topic, now_ns, value)

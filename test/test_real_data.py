@@ -50,7 +50,7 @@ def test_handheld_units_leave_what_their_noise_is(unit):
 
 
 def test_handheld_units_agree_with_a_direct_solution(unit):
-    # Nine-parameter fit of |M (N - b) / K| - g to the means of the positions, by scipy.
+    # The second route fits |M (N - b) / K| - g with nine parameters to the positions, by scipy.
     means = means_of(unit)
 
     def residual(parameters):
@@ -76,7 +76,7 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     assert len(result.positions) == 6
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-3, rtol=0.01)
-    # By hand: half the sum and half the difference of opposite faces, assumed level.
+    # The second route: bias and scale are half the sum and half the difference of opposite faces.
     means = means_of(result)
     high, low = means.max(axis=0), means.min(axis=0)
     axes = calibration.axes
@@ -87,14 +87,14 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
 
 
 def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
-    # Jumps in a plot of |a|: +20 mg at 366 s and +17 mg at 468 s; a third jump across gravity.
+    # A plot of |a| shows jumps by +20 mg at 366 s and +17 mg at 468 s; a third is across gravity.
     sources, _ = fit_sources([freezer_bag(real_data, work)])
     with pytest.raises(FitError, match='not a function of temperature') as refused:
         fit(sources, OPTIONS)
     jumps = re.findall(
         r'at ([\d.]+) s the sensor jumped by \+([\d.]+) mg along gravity', str(refused.value)
     )
-    # Times from the first sample, 1.5 s after the zero of the log.
+    # Times count from the first sample, 1.5 s after the zero of the log.
     assert [float(at) for at, _ in jumps] == pytest.approx([365.4, 465.4, 511.6], abs=0.2)
     assert [float(size) for _, size in jumps] == pytest.approx([20.0, 17.0, 2.0], abs=4.0)
 
@@ -116,7 +116,7 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
 def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     real_data, work, length, n_sets, sets, drift, mg
 ):
-    # 1420 s after the last jump in parts: each set of parts is corrected by a fit of the others.
+    # Each set of parts of the 1420 s after the last jump is corrected by a fit of the other parts.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [Part(start, start + length) for start in starts]
@@ -135,7 +135,7 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
                 raw += np.linalg.norm(windows.mean, axis=1).tolist()
                 left += windows.residual.tolist()
     assert len(raw) >= 17 * len(sets) // n_sets
-    # The drift about its mean, as a single attitude does not determine the constants.
+    # Drifts are about their mean, as a single attitude does not determine the constants.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
     # White noise of 1.5 mg per root hertz leaves 0.19 mg in a minute; longer parts are
     # interpolated over a wider range, and the first of five parts is extrapolated.
@@ -144,8 +144,8 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
 
 def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
     bag = freezer_bag(real_data, work)
-    # After the last jump; times from the first sample, 1.5 s after the zero of the log. The
-    # freezer was knocked near 860 and 1134 s.
+    # The parts are after the last jump; times count from the first sample, 1.5 s after the zero of
+    # the log. The freezer was knocked near 860 and 1134 s.
     parts = [Part(518.5, 638.5), Part(860.5, 1130.5), Part(1134.5, 1938.5)]
     seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts]
     calibration = fit(seen, OPTIONS).calibration

@@ -95,7 +95,7 @@ def check_fit(result, cli, folder):
     scale = np.array([axis.scale_factor for axis in axes])
     bias = np.array([axis.bias for axis in axes]) / scale
     sd = np.array([place['sd_g'] for place in result['positions']]).max() * 9.80665
-    # The claim before the fit includes the noise of the positions only; constants are at 20 degC.
+    # The sd before the fit includes the noise of the positions only; constants are at 20 degC.
     assert scale / UNIT.scale_factor == pytest.approx(1.0, abs=5.0 * max(result['scale_sd']))
     true_bias = np.array(UNIT.bias_at_reference) / UNIT.scale_factor
     assert bias == pytest.approx(true_bias, abs=5.0 * max(9.80665 * max(result['bias_sd_g']), sd))
@@ -158,7 +158,6 @@ class TestGrowing:
         bags = numbered_bags(tmp_path / 'bags')
         assert [str(bag) for bag in bags] == result['bags']
         assert [bag.name for bag in bags] == [f'{k:02d}.mcap' for k in range(1, N_POSITIONS + 1)]
-        # No message is lost, repeated or moved.
         assert contents(bags) == contents([session])
         assert f'position {N_POSITIONS}: good' in finished.stderr
 
@@ -170,7 +169,6 @@ class TestGrowing:
                 'record', bag, '--positions', '3', '--soak', '80s', '-o', bags, '--json', code=None
             )
             result = json.loads(finished.stdout)
-            # The bag ends before the test is complete.
             assert finished.returncode == (0 if result['is_complete'] else 1)
             assert result['n_good'] == (2, 3)[number - 1]
         assert len(numbered_bags(bags)) == 3

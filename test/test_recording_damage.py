@@ -266,7 +266,7 @@ def test_a_damaged_compressed_end_is_left_out(tmp_path):
     recording = read(path)
     assert str(recording.info.truncated).endswith('; its last chunk is damaged and left out')
     assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
-    # The same chunk truncated: the content before the damage.
+    # A truncated chunk gives its content before the damage.
     path.write_bytes(damaged[:-5])
     assert 'ends inside a chunk' in str(read(path).info.truncated)
 

@@ -96,8 +96,9 @@ def test_any_file_gives_its_messages_in_order_of_log_time(messages, **options):
             and options['index_types'] == IndexType.ALL
             and options['repeat']
         ):
-            # Second route to the order: that of rosbags for the same file. The versions of rosbags
-            # differ for equal log times in different chunks, so that these may be in either order.
+            # The second route to the order is the order of rosbags for the same file. The versions
+            # of rosbags differ for equal log times in different chunks, so that these may be in
+            # either order.
             order = [(log_ns, topic) for topic, log_ns, _ in read_with_rosbags(path)]
             wanted = [(m.log_ns, m.topic) for m in in_reading_order(messages)]
             assert [log_ns for log_ns, _ in order] == [log_ns for log_ns, _ in wanted]

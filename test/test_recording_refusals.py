@@ -77,7 +77,6 @@ def test_ros_1_messages_in_an_mcap_file(tmp_path):
     assert block.accel.tolist() == [[1.5, -2.5, 3.5]]
     assert block.accel_stamp_ns.tolist() == [12 * 10**9 + 34]
     assert block.frame_id == 'link'
-    # A raw message is CDR like any other.
     message = Message(ACCEL, 1, 12 * 10**9 + 34, 'link', (1.5, -2.5, 3.5))
     assert block.raw['accel'].data.tobytes() == serialize(message)
 
@@ -217,9 +216,9 @@ def driver_bag(path, *topics, metadata=None):
 @pytest.mark.parametrize(
     ('topics', 'taken'),
     [
-        # REP 145: the driver's topic; the magnetometer's vector is not a force.
+        # The driver's topic of REP 145 is chosen; the vector of the magnetometer is not a force.
         ([('imu/data_raw', 'imu'), ('imu/mag', 'vector')], '/imu/data_raw'),
-        # Xsens: free acceleration and rate are vectors.
+        # The free acceleration and the rate of an Xsens are vectors, but not its force.
         ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
         ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
         # With a filter's output in the bag, the filter's input is chosen.
@@ -229,7 +228,7 @@ def driver_bag(path, *topics, metadata=None):
         # Two equivalent topics, and vectors that are not forces.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
-        # The node's output, recognised by the regime topics beside it.
+        # A topic is the node's output if it has the regime topics beside it.
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], None),
         ([('a/imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], '/a/imu/data_raw'),
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag'), ('d/imu', 'imu')], '/d/imu'),
@@ -259,7 +258,6 @@ def test_what_is_corrected_already_is_explained(tmp_path):
     with pytest.raises(RecordingError, match=told):
         open_recording(path, require=('accel',))
     assert told in str(inspect_recording(path).chosen)
-    # The user's choice.
     with open_recording(path, Topics.named({'imu': 'imu/data_raw'}), require=('accel',)) as reader:
         assert reader.topics['accel'] == '/imu/data_raw'
 

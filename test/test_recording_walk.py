@@ -90,7 +90,7 @@ def test_a_walk_equals_the_plain_loop_and_a_false_index_changes_nothing(data, cu
         messages, reason = walk(
             np.frombuffer(torn, np.uint8), lambda _, content: others.append(content)
         )
-        # The message before a record of zeros may end in zeros that are not its own.
+        # The message before a record of zeros may end in zeros that do not belong to the message.
         is_wiped = len(torn) >= wanted_end + 9 and torn[wanted_end] == 0
         assert listed(messages) == (wanted[:-1] if is_wiped else wanted)
         assert others == wanted_others

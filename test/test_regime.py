@@ -140,8 +140,8 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
 
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_soaks_stay_static(sensor):
-    # 15 h of ripple and self-heating. At the required 0.05 switches an hour 0.4 openings are
-    # expected; more than 2 have a probability below 1 %.
+    # The run is 15 h of ripple and self-heating. At the required 0.05 switches an hour 0.4
+    # openings are expected; more than 2 have a probability below 1 %.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -163,10 +163,10 @@ def test_soaks_stay_static(sensor):
 
 
 def test_false_alarms_keep_to_the_setting():
-    # Noise without ripple, 20 alarms an hour permitted. Rice's formula counts crossings; those of
-    # one filter come in groups and coincide with those of the other, so that the formula is an
-    # upper bound: at most 2000 separate departures in 100 h. A lower limit checks that the test is
-    # not inactive.
+    # The signal is noise without ripple, and 20 alarms an hour are permitted. Rice's formula
+    # counts crossings; those of one filter come in groups and coincide with those of the other, so
+    # that the formula is an upper bound: at most 2000 separate departures in 100 h. A lower limit
+    # checks that the test is not inactive.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -187,9 +187,9 @@ def test_false_alarms_keep_to_the_setting():
 
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_threshold_is_that_of_the_filters_noise(dt):
-    # Second route: steady gain of the filter from its Riccati equation, noise and correlation of
-    # successive values from its impulse response, then Rice's formula. The closed forms are first
-    # order in the pace, which is at most 0.3 here: within 4 %.
+    # The second route: gain by the Riccati equation, noise and correlation by the impulse
+    # response, alarms by Rice's formula. The closed forms are first order in the pace, which is at
+    # most 0.3 here: within 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):

@@ -133,7 +133,6 @@ def test_equals_the_stream_bit_for_bit(tmp_path):
     assert block.frame_id == 'imu_link'
     assert found_flags == flags
     assert result.n_flags == len(flags)
-    # Soak, ramp, soak: the detector detects the ramp.
     assert [is_dynamic for _, is_dynamic in result.switches][:2] == [False, True]
     assert result.switches == switches(flags)
     assert result.counters.n_in == len(read_recording(bag).columns)
@@ -156,7 +155,6 @@ def test_constants_need_no_thermometer(tmp_path):
     assert block.accel.tobytes() == np.ascontiguousarray(expected[:, :3]).tobytes()
     np.testing.assert_allclose(block.accel, (source.accel - 5.0) / 510.0, rtol=1e-14)
     assert flags == []
-    # A calibration with temperature functions is not applied without temperatures.
     with pytest.raises(RecordingError, match='temperature/board'):
         replay(bag, rich_calibration(), tmp_path / 'other')
 
@@ -215,7 +213,6 @@ def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path):
     bag = thermal_test(tmp_path / 'bag', minutes=1.0, imu=True)
     with pytest.raises(CalibrationError, match=r'takes counts.*holds sensor_msgs/Imu'):
         replay(bag, rich_calibration(), tmp_path / 'out', topics=Topics(input='imu'))
-    # Without options the input of the calibration is read.
     with pytest.raises(RecordingError, match='accel/counts'):
         replay(bag, rich_calibration(), tmp_path / 'out')
 
@@ -242,7 +239,8 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
         parts, held_bytes = zip(*held, strict=True)
         assert list(parts) == sorted(parts)
         assert parts[-1] == 1.0
-    # Three times the messages: memory only grows by the flags of the bag, one per case reading.
+    # With three times the messages the memory grows by the flags of the bag alone, one per case
+    # reading.
     assert peaks[1] < 1.1 * peaks[0]
     third = len(parts) // 3
     assert max(held_bytes[-third:]) < 1.15 * max(held_bytes[:third])
@@ -304,7 +302,6 @@ def test_topics_that_cannot_be_copied_leave_nothing_behind(tmp_path):
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 def test_every_topic_is_copied(tmp_path, storage):
-    # An INS also needs the other topics of the recording.
     inputs = thermal_test(tmp_path / 'inputs', minutes=2.0)
     mcap = tmp_path / 'bag'
     stamps = START_NS + np.arange(-3, 150) * 10**9

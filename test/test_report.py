@@ -110,7 +110,6 @@ def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
 
 
 def test_certificate_has_the_residual_of_each_position_left_out(page):
-    # The last position cannot be left out.
     shown = [position.residual_rms.get(LEFT_OUT) for position in evidence().positions]
     assert shown == [*LEFT_OUT_RMS, None]
     assert 'left out, µg RMS' in page.text
@@ -122,7 +121,6 @@ def test_page_needs_no_network_and_runs_nothing(page):
     for tag, attributes in page.tags:
         for name, value in attributes.items():
             assert not name.startswith('on'), f'{tag} {name}'
-            # The page refers only to its own parts.
             if name in ('href', 'src', 'xlink:href'):
                 assert value.startswith('#')
     style = next(a['content'] for t, a in page.tags if t == 'meta' and 'http-equiv' in a)

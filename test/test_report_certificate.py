@@ -80,7 +80,7 @@ def test_what_a_laboratory_states_is_printed_and_the_rest_is_blank(tmp_path):
         *('Room 2, Exampleton', 'undamaged', '2026-02-20'),
     ):
         assert text in page, text
-    # The address of the customer, and the place of the signature.
+    # Two fields are blank: the address of the customer, and the place of the signature.
     assert page.count('class="blank"') == 2
     # The margin of each printed page contains certificate and unit, whatever their names.
     margin = (
@@ -158,7 +158,7 @@ def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
     parts = [standards[name] for name in ('noise', 'attitude', 'model')]
     assert float(np.linalg.norm(parts)) == pytest.approx(claim)
     assert standards['repeatability'] == 0.0
-    # Gravity uncertain by 1 ug, and the thermometers by the effect of a kelvin.
+    # The budget has 1 ug of gravity, and the effect of a kelvin for the thermometers.
     info = load_certificate_info(lab(tmp_path))
     stated = budget(evidence(), info)
     by_name = {contribution.name: contribution.standard for contribution in stated}
@@ -205,8 +205,8 @@ def test_table_over_temperature(tmp_path):
             at = float(row.temperature.replace('−', '-'))
             bias, sd, scale, scale_sd = in_a_soak(calibration, at)
             numbers = [float(cell.replace('−', '-')) for cell in row[2:]]
-            # Half a digit each of two values, and half a tenth of a kelvin at the ends of the
-            # range.
+            # The tolerance is half a digit of each value, and half a tenth of a kelvin at either
+            # end.
             slack = 0.06 * abs(table.bias_slope) + 0.06 * numbers[1]
             assert numbers[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)
             assert numbers[1] == pytest.approx(2.0 * sd[k] / MICRO_G, rel=0.06)
@@ -233,7 +233,7 @@ def test_gravity_in_doubt_is_the_scale_factors_doubt(tmp_path):
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
     rows = {result.quantity: result for result in results(evidence(), info, ())}
     scale = fitted().calibration.axes.x.scale_factor
-    # Gravity uncertain by a thousandth, with k = 2: much more than the uncertainty of the fit.
+    # Twice the uncertainty of gravity, a thousandth, is much more than that of the fit.
     assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
     assert (
         rows['bias x']

@@ -54,7 +54,7 @@ def test_bias_and_scale_curves_by_hand():
 
 
 def test_a_soak_measures_what_the_calibration_lacks():
-    # A scale that is wrong by 30 ppm in all soaks, in any direction of gravity.
+    # The scale is wrong by 30 ppm in all soaks, in any direction of gravity.
     windows = evidence().windows
     up = np.array([position.up for position in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
@@ -69,7 +69,7 @@ def test_a_soak_measures_what_the_calibration_lacks():
 
 
 def test_metres_of_a_navigator_by_hand():
-    # 1 mg for 60 s: 9.80665e-3 * 1800 m; one micro-g at Schuler's frequency: 2 R 1e-6.
+    # 1 mg gives 9.80665e-3 * 1800 m in 60 s; one micro-g gives at most 2 R 1e-6 by Schuler.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
 
@@ -126,7 +126,6 @@ def test_figures_are_legible_in_black_and_white(draw):
         for axes in figure.axes:
             looks = [look(line) for line in axes.get_legend_handles_labels()[0]]
             assert len(set(looks)) == len(looks)
-            # Axes over time or temperature have a unit.
             if axes.axison and axes.get_ylabel():
                 assert any(
                     unit in axes.get_ylabel()
@@ -161,7 +160,7 @@ def test_rates_are_those_of_the_gyroscope():
         celsius, drawn = np.array(soak.get_data(), dtype=float)
         bias = np.degrees(curve.bias_function.value(celsius - 20.0)) * 1e3
         slope = np.polyfit(celsius, bias, 1)[0]
-        # Equal to rounding; no value in micro-g.
+        # The drawn values equal the bias less a line, in mdeg/s and not in micro-g.
         np.testing.assert_allclose(drawn, bias - slope * (celsius - 20.0), atol=1e-9)
         assert f'{slope:+.3g}'.replace('-', '\u2212') in axes.get_title(loc='left')
     names = [figure.name for figure in figures_of(replace(evidence(), calibration=unit))]

@@ -80,7 +80,8 @@ def finder():
 
 
 def test_windows_are_means_of_ten_seconds_at_rest():
-    # 25 s at rest, 1 s of handling, 21 s at rest in another attitude: two windows, then two.
+    # A rest of 25 s, 1 s of handling, and a rest of 21 s in another attitude give two windows
+    # each.
     first, second = standing(25 * RATE_HZ), standing(21 * RATE_HZ, 2)[:, [2, 1, 0]]
     handled = first[:RATE_HZ] + np.linspace(0.0, 900.0, RATE_HZ)[:, None]
     samples = np.concatenate((first, handled, second))
@@ -119,7 +120,8 @@ def test_what_is_no_rest_is_not_kept(fault):
 
 
 def test_a_rest_that_lasts_a_day_is_kept_ever_more_rarely():
-    # All 60 windows of ten minutes, then a window a minute to the hour, then one in five minutes.
+    # Of a long rest all 60 windows of ten minutes are kept, then a window a minute up to the hour,
+    # then one in five minutes.
     kept, one = 0, finder()
     samples = standing(6 * 60)
     for minute in range(71):
@@ -213,7 +215,7 @@ def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(tmp_path, unit, pee
     sent = 0
 
     def until(condition, what):
-        """Send second after second: the first may come before both ends know each other."""
+        """Send second after second: the node may not yet have discovered the driver."""
         nonlocal sent
         pause = threading.Event()
         for _ in range(len(samples) // RATE_HZ):

@@ -130,7 +130,7 @@ def test_a_switched_load_heats_its_part():
     )
     warmer = of_part(on, 'board') - of_part(off, 'board')
     np.testing.assert_allclose(warmer[: int(spell)], 0.0, atol=1e-9)
-    # 0.5 W through 0.4 W/K to the case and about 4 W/K to the air.
+    # 0.5 W flow through 0.4 W/K to the case and about 4 W/K to the air.
     to_air = next(link.conductance for link in unit.network.links if link.a == 'air')
     assert warmer[-1] == pytest.approx(0.5 / 0.4 + 0.5 / to_air, rel=1e-6)
 

@@ -116,7 +116,7 @@ def test_each_short_rest_is_found(rng, rest_s, shaky):
     result = fit([source(accel)], OPTIONS)
     assert len(result.positions) == 10
     axes = result.calibration.axes
-    # 350 samples of 3 to 12 mg in each rest: 0.2 to 0.6 mg, in ten of them.
+    # 350 samples of 3 to 12 mg give a mean of 0.2 to 0.6 mg in each of ten rests.
     np.testing.assert_allclose([axes.x.bias, axes.y.bias, axes.z.bias], (0.3, -0.2, 0.1),
                                atol=1.5 * MG)  # fmt: skip
     assert result.residuals[-1].fitted.rms < 2.0 * MG

@@ -221,7 +221,7 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
 
 
 def test_constants_by_hand_keep_the_scale_of_few_attitudes():
-    # One attitude and much scatter: the best fit is a scale that makes all forces equal.
+    # With one attitude and much scatter the best fit is a scale that makes all forces equal.
     rng = rng_of('few')
     samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
     few = Minutes(samples, np.full(200, 20.0), np.full((200, 3), np.nan))
@@ -235,7 +235,7 @@ def test_a_bias_at_the_reference_is_held_against_its_bound():
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
     bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
     study = cases.Study('', (), {}, bound=bound)
-    # An sd of 2e-3 m/s^2 that the calibration claims in addition to its white noise.
+    # The calibration claims an sd of 2e-3 m/s^2 in addition to its white noise.
     claimed = axis_set(residual_sd_m_s2=2e-3)
     known = regime_set(x=claimed, y=claimed, z=claimed)
     score = strangers.bias_score(calibration(axes=axes, static=known, dynamic=known), study)
@@ -352,7 +352,6 @@ def carried_bag():
 
 def test_rests_of_a_recording_are_its_long_stays():
     rows = rests_of(carried_bag())
-    # The blocks exclude a minute at each end.
     expected = [(60, 17940), (18060, 35940), (36180, 86340)]
     assert [(rest.start, rest.stop) for rest in rows] == expected
 

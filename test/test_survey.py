@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A survey of a recording names what a fit would miss."""
+"""A survey of a recording lists the data that a fit would lack."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_a_good_recording(tmp_path):
     assert result.still_s == pytest.approx(3600.0, abs=15.0)
     board = result.thermometers['board']
     assert (board.lowest, board.highest) == (5.0, 35.0)
-    # 30 K in 20 minutes, up and down.
+    # The ramps are 30 K in 20 minutes, up and down.
     assert board.steepest_heating_k_min == pytest.approx(1.5, rel=0.01)
     assert board.steepest_cooling_k_min == pytest.approx(-1.5, rel=0.01)
 

@@ -28,7 +28,7 @@ def feed(tracker, board, case=None, *, start_s=0, step_s=1):
 
 @pytest.mark.parametrize('step_s', [1, 10])
 def test_memory_of_a_ramp_is_the_closed_form(step_s):
-    # After a soak, a ramp of rate r: m = T - L = r tau (1 - exp(-t / tau)).
+    # A ramp of rate r after a soak gives m = T - L = r tau (1 - exp(-t / tau)).
     tracker = ThermalTracker(DetectorSettings(), LAG)
     soak_s, ramp_s, rate = 6000, 1800, 0.5 / 60.0
     t = np.arange(0, soak_s + ramp_s + 1, step_s)
@@ -46,7 +46,7 @@ def test_memory_start_is_unknown_and_settles():
     tracker = ThermalTracker(DetectorSettings(), LAG)
     feed(tracker, np.full(10, 20.0))
     assert not tracker.is_settled(10 * SECOND_NS)
-    # 3 K for a lag of an hour are 1.5 K for one of 900 s: 50 mK after 3.4 of these, 3061 s.
+    # The start sd of 3 K for a lag of an hour is 1.5 K for a lag of 900 s, and 50 mK after 3061 s.
     feed(tracker, np.full(5000, 20.0), start_s=10)
     settled_s = TAU_S * math.log(1.5 / MEMORY_SETTLED_SD)
     assert not tracker.is_settled(round((settled_s - 10.0) * 1e9))

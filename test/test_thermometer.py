@@ -83,10 +83,10 @@ PARTS = {
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_variances_are_honest(errors, sensor, part):
-    # Mean squared error over claimed variance, ideally 1. In soaks and ramps the claim includes
-    # changes that might have begun, and is up to a few times too large; at the onset and the end
-    # the change is real and not yet detected. Coarse sensors have few independent errors in three
-    # runs: their mean scatters by a factor of 2.
+    # The mean squared error over the claimed variance is ideally 1. In soaks and ramps the claim
+    # includes changes that might have begun, and is up to a few times too large; at the onset and
+    # the end the change is real and not yet detected. Coarse sensors have few independent errors
+    # in three runs: their mean scatters by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -106,8 +106,8 @@ def test_variances_are_honest(errors, sensor, part):
     ],
 )  # fmt: skip
 def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
-    # Limits at about 1.5 times the measured errors: noise averaged over the filter's memory. A
-    # sensor with steps of 1 K crosses an edge every two minutes and determines the rate to 10 %.
+    # The limits are about 1.5 times the measured errors, noise averaged over the filter's memory.
+    # A sensor with steps of 1 K crosses an edge every two minutes and determines the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
@@ -127,8 +127,8 @@ def test_a_crossed_edge_locates_the_temperature():
 
 
 def test_an_unchanged_coarse_reading_is_not_an_ever_better_one():
-    # WHY: a thousand equal readings still only say "within the cell". WHAT: the claimed sd stays
-    # that of a uniform distribution, 1 / sqrt(12) of a quantum.
+    # WHY: a thousand equal readings only show that the temperature is within the cell. WHAT: the
+    # claimed sd stays that of a uniform distribution, 1 / sqrt(12) of a quantum.
     thermometer = Thermometer(ThermometerSettings(0.001, 0.0625))
     for k in range(5000):
         thermometer.update(k * SECOND_NS, 20.0)
@@ -200,7 +200,7 @@ def test_a_blend_has_the_moments_of_the_mixture():
     out, back = mix(*states, 0.25), mix(*states[::-1], 0.75)
     np.testing.assert_allclose(back, out, rtol=1e-12)
     mixed = np.concatenate(samples)
-    # 400 000 samples with an sd of a few: 1 % of the covariances.
+    # 400 000 samples with an sd of a few determine the covariances to 1 %.
     np.testing.assert_allclose(out[:3], mixed.mean(axis=0), atol=0.02)
     np.testing.assert_allclose(out[3:], np.cov(mixed.T)[upper], atol=0.1)
 
@@ -218,8 +218,7 @@ def test_what_is_no_number_or_not_newer_changes_nothing(stamp_s, reading):
 
 
 def test_a_small_jump_counts_less_than_a_reading():
-    # 15 sigma: within five limits of 6 sigma, so the reading is used with the influence of one
-    # limit.
+    # 15 sigma are within five limits of 6 sigma, so the reading has the influence of one limit.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004

@@ -3,8 +3,8 @@
 """
 A third thermometer is found in the bags, fitted, applied by replay, and improves the result.
 
-The electronics under the lid are switched at random, which board and case do not feel, so that
-only the lid's thermometer explains the effect on the axes.
+The electronics under the lid are switched at random. Board and case temperature do not change, so
+that only the lid's thermometer explains the effect on the axes.
 """
 
 import math
@@ -105,7 +105,6 @@ def test_a_third_thermometer_explains_what_the_others_do_not_see(runs, tmp_path)
         judged = evaluate([held_out], [('unit', one)]).judgements['unit']
         norms = np.linalg.norm(judged.windows.force, axis=1)
         spreads[sees_lid] = float(np.std(norms)) / MICRO_G
-    # RMS effect of the switched load on the axes.
     switched = float(np.sqrt(np.mean(np.square(LID_UG_K)))) * LOAD_K / 2.0
     assert errors[False] > 0.3 * switched
     assert errors[True] < 0.05 * switched

@@ -141,7 +141,7 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node, peer):
         flooding = threading.Thread(target=flood, daemon=True)
         flooding.start()
         try:
-            # Only while samples flow: a waiting loop serves everything in any case.
+            # Samples must flow, as a waiting loop serves everything in any case.
             running.wait_for(lambda: len(running.messages) > 100)
             n_ticks = len(ticks)
             ordinary.publish(Bool(data=True))
@@ -150,7 +150,7 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node, peer):
         finally:
             stop.set()
             flooding.join(TIMEOUT)
-    # A reload within 100 ms, including the time of its client.
+    # A reload must take at most 100 ms, including the time of its client.
     assert OTHERS_PERIOD_NS <= 20_000_000
 
 
@@ -234,9 +234,9 @@ def test_quality_of_service_is_open_to_overrides(node):
     ('qos', 'interval_s', 'is_resting'),
     [
         pytest.param(BEST_EFFORT, None, True, id='as measured'),
-        pytest.param(BEST_EFFORT, 749.0, True, id='four in three rests'),
-        pytest.param(BEST_EFFORT, 751.0, False, id='hardly more than one in a rest'),
-        pytest.param(BEST_EFFORT, 0.0, False, id='a middleware that does not tell the time'),
+        pytest.param(BEST_EFFORT, 749.0, True, id='four messages in three pauses'),
+        pytest.param(BEST_EFFORT, 751.0, False, id='hardly more than one message in a pause'),
+        pytest.param(BEST_EFFORT, 0.0, False, id='a middleware without arrival times'),
         pytest.param(RELIABLE, None, False, id='reliable'),
     ],
 )

@@ -113,7 +113,7 @@ def correct(
     board : array_like, shape (n,), or (array_like, array_like), optional
         Board temperature [degC]: a value for each sample (NaN where there was no reading), or
         (time_s, value) with separate times. A reading applies from the first sample with an equal
-        or later time. A calibration without temperature functions needs none.
+        or later time. A calibration without temperature functions needs no temperature.
     config : CompensatorConfig or None, optional
         The node's settings.
     **sensors : as `board`
@@ -247,7 +247,6 @@ def fit(
             options.setdefault('input', 'counts' if kind == 'counts' else 'm/s^2')
         for one in items:
             if isinstance(one, Columns):
-                # A thermometer that was not recorded has no readings.
                 nothing: Temperature = ([], [])
                 readings = {'board': nothing, 'case': nothing, **one.temperatures}
                 block = _block(one.time_s, one.counts, readings, one.start_ns)

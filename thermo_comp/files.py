@@ -5,7 +5,7 @@ Owns the reading of files of limited size, and the writing of all output files.
 
 An output never replaces an input of the same command. Without `overwrite` an output replaces no
 existing file, even if another process writes at the same time; with `overwrite`, only a file of
-the same kind. The file gets its final name once it is complete. If the name is a symbolic link,
+the same kind. An output gets its final name once it is complete. If the name is a symbolic link,
 the link stays and its target is written.
 """
 

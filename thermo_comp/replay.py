@@ -169,20 +169,20 @@ def _messages_of(
     """Write blocks as the node's messages, with the copied messages in order of time."""
     with bag as writer:
         taken = {topic.name for topic in OUTPUTS}
-        taken |= {reader.topics[one].strip('/') for one in reader.topics.keys() - reader.fields}
+        taken |= {reader.topics[role].strip('/') for role in reader.topics.keys() - reader.fields}
         others = {topic for topic in reader.info.topics if topic.strip('/') not in taken}
         following = reader.raw(others if all_topics else ())
-        one = next(following, None)
+        waiting = next(following, None)
 
         def copy(topic: str, kind: str, messages: Messages, times: Ints) -> None:
             writer.write_raw(topic, kind, times, messages, reader.definitions.get(kind))
 
         def copy_others(until_ns: float) -> None:
-            nonlocal one
-            while one is not None and one[1].log_ns[0] <= until_ns:
-                topic, messages = one
+            nonlocal waiting
+            while waiting is not None and waiting[1].log_ns[0] <= until_ns:
+                topic, messages = waiting
                 copy(topic.name, topic.type, messages, messages.log_ns)
-                one = next(following, None)
+                waiting = next(following, None)
 
         def write(block: Block, corrected: CompensatedBlock, new: list[tuple[int, bool]]) -> None:
             if len(corrected.stamp_ns):

@@ -25,7 +25,7 @@ _REST_S = 10.0
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that are searched again for the begin of a rest.
 _LOOKED_BACK = 200
-# Sd of a position's force by hysteresis, mounting and drift, which a longer rest keeps [g].
+# Sd of a position's force by hysteresis, mounting and drift, however long the rest [g].
 _FLOOR_SD = 2e-5
 # Ratio of a rest's noise to the median of all rests, above which the rest is 'restless'; ratio to
 # the noise of the previous rest, above which the unit is held by hand.
@@ -112,7 +112,7 @@ class Acquisition:
         #: Stamp before which no later position begins.
         self.settled_ns = self._newest_ns = self._begin_ns = _EVER_NS
         self._n_looked = 0
-        # Mean of the position's first rest; after a quieter rest the search no longer finds it.
+        # Mean of the position's first rest, which the search no longer finds after a quieter rest.
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:
@@ -179,10 +179,10 @@ class Acquisition:
             self._first = means[0]
         ups = self._directions(means)
         up = self._directions(self._first[None])[0]
-        other = ups @ up < math.cos(math.radians(coverage.SAME_DIRECTION_DEG))
-        if not other.any():
+        is_elsewhere = ups @ up < math.cos(math.radians(coverage.SAME_DIRECTION_DEG))
+        if not is_elsewhere.any():
             return None
-        lower = ranges[int(np.argmax(other))][0]
+        lower = ranges[int(np.argmax(is_elsewhere))][0]
         return cells.start_ns + round(float(cells.index[lower]) * cells.cell_s * 1e9)
 
     def _close(self, end_ns: int) -> None:

@@ -229,11 +229,10 @@ def import_(
     """
     Convert a file of another tool into a calibration.
 
-    Thermal parameters of PX4 and ArduPilot give the bias over temperature;
-    the files of imu_tk, imu_calib and Kalibr give bias, scale and
-    misalignment. Both regimes get the same set. The input unit is that of
-    the file: m/s^2 (node: input:=imu), or counts. The missing parts need a fit
-    to bags of a thermal test.
+    Thermal parameters of PX4 and ArduPilot give the bias over temperature; the files of imu_tk,
+    imu_calib and Kalibr give bias, scale and misalignment. The static and the dynamic regime get
+    the same set. The input unit is that of the file: m/s^2 (node: input:=imu), or counts. Parts
+    that the file lacks need a fit to bags of a thermal test.
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml

@@ -98,7 +98,7 @@ def evaluate_rests(
     logged, _, notes = read_rests(rests, known, is_for_update=False)
     result = watch(series_of(logged, known, gravity), known, tolerance)
     out.points(notes)
-    limit = f'{LIMIT:g} times the claim' if tolerance is None else spoken(tolerance)
+    limit = f'{LIMIT:g} times the claimed sd' if tolerance is None else spoken(tolerance)
     for rows, name in ((result.periods, 'from'), (result.temperatures, 'board')):
         out.table(
             (name, 'rests', 'degC', 'mean ug', 'RMS ug', 'claimed ug', 'within'),

@@ -185,7 +185,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
         _say_positions(out, result)
     _say_models(out, result.fit.selected.trials)
     parts = result.fit.windows.model.parts
-    # Behind a steady ramp a lag of two stages is the sum of their time constants.
+    # In a steady ramp the lag behind two stages is the sum of their time constants.
     taus = parts and [part.tau_s + part.second_tau_s for part in parts]
     shares = parts and [part.sensor_share for part in parts]
     if taus and shares:

@@ -92,7 +92,7 @@ class Output:
             def show(
                 columns: Sequence[str], rows: Sequence[Sequence[Cell]], lines: Sequence[str]
             ) -> None:
-                # A low terminal shows all lines, and as many of the newest rows as fit.
+                # On a low terminal show all lines, and as many of the newest rows as fit.
                 newest = rows[-max(1, console.height - len(lines) - 3) :]
                 shown = [*aligned(columns, newest), '', *lines]
                 view.update(Text('\n'.join(_shown(x, sys.stderr) for x in shown)), refresh=True)

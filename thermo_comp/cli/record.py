@@ -147,8 +147,8 @@ def _end(
     is_stopped: bool,
 ) -> None:
     """Print the result of the test, and the command that fits it."""
-    there = [position for position in account.positions if position.n_rests]
-    out.table(_COLUMNS, _rows(there))
+    rested = [position for position in account.positions if position.n_rests]
+    out.table(_COLUMNS, _rows(rested))
     for line in _lines(account):
         out.line(line)
     command = f'thermo_comp fit {shlex.quote(str(folder))}/*.mcap -o unit.yaml --gravity G'
@@ -163,7 +163,7 @@ def _end(
         int(not account.is_complete and not is_stopped),
         bags=written,
         command=command if written else None,
-        positions=there,
+        positions=rested,
         bias_sd_g=bias,
         scale_sd=scale,
         misalignment_sd_rad=misalignment,

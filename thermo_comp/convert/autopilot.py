@@ -13,9 +13,9 @@ the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher
 temperature.
 
 ArduPilot's DataFlash (``.BIN``): a message type per IMU in old logs (``IMU``, ``IMU2``), a type
-with an instance number ``I`` in new ones; its temperature is called ``T`` or ``Temp``. Samples
-logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected. The
-value 2 (learning) corrects nothing; ArduPilot sets it to 1 when learning ends.
+with an instance number ``I`` in new ones; the IMU's temperature is ``T`` or ``Temp``. Samples
+logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected.
+While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets 1 at the end.
 
 https://docs.px4.io/main/en/dev_log/ulog_file_format
 https://ardupilot.org/copter/docs/logmessages.html
@@ -85,8 +85,8 @@ def read_autopilot(
     if correction and not allow_compensated:
         rows = _uncorrected(rows, correction)
     stamped = rows.stamp_ns != NO_STAMP
-    rest = find_stillness(rows.stamp_ns[stamped], rows.accel[stamped])
-    if rest.noise <= _NO_NOISE * rest.magnitude:
+    still = find_stillness(rows.stamp_ns[stamped], rows.accel[stamped])
+    if still.noise <= _NO_NOISE * still.magnitude:
         raise RecordingError(
             'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
             'which cannot calibrate a real sensor',
@@ -187,10 +187,10 @@ def _combined(columns: _Columns) -> list[_Columns]:
 def _stamps(columns: _Columns) -> Ints:
     """Return stamps from microseconds since the start; `NO_STAMP` (damage) beyond a century."""
     # The time of the sample if logged; older logs only have the time of publication.
-    whole = columns['timestamp_sample' if 'timestamp_sample' in columns else 'timestamp']
-    size = whole.astype(np.float64)
+    micros = columns['timestamp_sample' if 'timestamp_sample' in columns else 'timestamp']
+    size = micros.astype(np.float64)
     is_time = (size >= 0.0) & (size < _CENTURY_US)
-    return np.where(is_time, np.where(is_time, whole, 0).astype(np.int64) * 1000, NO_STAMP)
+    return np.where(is_time, np.where(is_time, micros, 0).astype(np.int64) * 1000, NO_STAMP)
 
 
 def _column(columns: _Columns, name: str) -> Floats:
@@ -312,8 +312,8 @@ def _instance(present: Mapping[int, T], wanted: int | None, what: str, path: Pat
         raise RecordingError(f'the log holds no {what}', path=path)
     number = min(present) if wanted is None else wanted
     if number not in present:
-        there = ', '.join(map(str, sorted(present)))
-        raise RecordingError(f'the log holds no {what} {number}; there are: {there}', path=path)
+        numbers = ', '.join(map(str, sorted(present)))
+        raise RecordingError(f'the log holds no {what} {number}; there are: {numbers}', path=path)
     return present[number]
 
 

@@ -125,7 +125,7 @@ class ColumnMap:
         if twice := {str(name) for name in given if given.count(name) > 1}:
             raise ValueError(f'column {min(twice)!r} is given twice')
         if self.gyro is not None and self.accel.output == 'counts':
-            raise ValueError('a gyro travels in an Imu message: accel output must be imu')
+            raise ValueError('a gyro is part of an Imu message: accel output must be imu')
 
 
 def load_column_map(path: Path) -> ColumnMap:

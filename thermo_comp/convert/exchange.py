@@ -188,8 +188,8 @@ def _losses(calibration: Calibration) -> list[str]:
         worth = [group.explains_m_s2 for group in calibration.evidence if group.group in lost]
         cost = f', up to {spoken(float(np.linalg.norm(worth)))} RMS' if worth else ''
         notes.append(
-            f'the thermal response is lost ({", ".join(lost)}){cost}: heating and cooling read '
-            'the same'
+            f'the thermal response is lost ({", ".join(lost)}){cost}: heating and cooling get '
+            'the same correction'
         )
     static, dynamic = (
         [(axis.delta, axis.bias_function, axis.scale_function) for axis in regime.axes()]

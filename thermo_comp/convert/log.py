@@ -3,8 +3,8 @@
 """
 Owns the conversion of a foreign log to a bag: checks, thinning, and a report on every row.
 
-At rest the specific force is gravity in any attitude. A log whose map contradicts that is refused,
-because an unnoticed factor of 9.8 would end in a calibration.
+At rest the specific force is gravity in any attitude. A log whose column map contradicts gravity
+is refused, because an unnoticed factor of 9.8 would end in a calibration.
 """
 
 from collections.abc import Callable, Mapping

@@ -34,10 +34,10 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
     """
     Read a table, a PX4 or ArduPilot log, or a bag with other topics.
 
-    Table: `columns` is the path of its column map (default: guessed), `rate_hz` the sample rate if
-    it has no times. Log: `imu` and `baro` count from 0, `allow_compensated` accepts samples that
-    the autopilot has corrected. Bag: `topic` names ``imu``, ``board`` and ``case``, `unit` is the
-    unit of the Imu topic.
+    Table: `columns` is the path of a table's column map (default: guessed), `rate_hz` the sample
+    rate of a table without times. Log: `imu` and `baro` count from 0, `allow_compensated` accepts
+    samples that the autopilot has corrected. Bag: `topic` names ``imu``, ``board`` and ``case``,
+    `unit` is the unit of the Imu topic.
 
     Raises ValueError for a keyword that does not apply to this kind of file, RecordingError if the
     file cannot be read.

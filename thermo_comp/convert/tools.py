@@ -127,7 +127,6 @@ def _read_px4(text: str, number: int | None) -> Content | None:
     rate_bias = None
     if values.get('TC_G_ENABLE', 1.0) == 1.0 and f'TC_G{number}_X1_0' in values:
         rate_bias, rate_reference, *edges = cubics(f'TC_G{number}_')
-        # Give both sensors one reference temperature and their common range.
         moved = np.polynomial.Polynomial((reference - rate_reference, 1.0))
         for row in rate_bias:
             coefficients = np.polynomial.Polynomial(row)(moved).coef

@@ -110,7 +110,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # With this normalisation the sum of n equal rests is sqrt(n) times a single rest.
+        # Q is orthogonal, so the sum of n equal rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
         mean = np.full(Q.shape[1], series.temperature[at].mean() - series.reference_temperature)
         parts.append(
@@ -156,7 +156,7 @@ class Model:
             np.where(is_same, along, 0.0),
             np.diag(rows.scatter),
         ]
-        # The lack of fit is correlated between temperatures over 10 K.
+        # The lack of fit is correlated between temperatures less than some 10 K apart.
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)

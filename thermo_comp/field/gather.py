@@ -85,8 +85,8 @@ class RestFinder:
         self._states.append(state)
         rests = []
         if len(self._run) == SECONDS:
-            every = next(every for begin, every in _SPACING if self._n_windows >= begin)
-            if self._n_windows % every == 0:
+            spacing = next(spacing for begin, spacing in _SPACING if self._n_windows >= begin)
+            if self._n_windows % spacing == 0:
                 rests.append(self._window())
             self._n_windows += 1
             # The first second of the next window is compared with the last second of this one.

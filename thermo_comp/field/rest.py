@@ -146,7 +146,6 @@ def _number(value: float) -> float:
 
 
 def _whole(value: int) -> int:
-    # Stamps [ns] are 64-bit integers.
     if type(value) is not int or not 0 < value < 1 << 63:
         raise ValueError(value)
     return value

@@ -5,8 +5,8 @@ Owns rests as measurements of a calibration: ``|f| - g`` and its derivatives by 
 
 A rest at an unknown attitude measures one number. With x the axes' forces before the misalignment
 M, f = M x, u = f / |f| and v = M^T u, an error d_bias [input units] and d_scale [relative] of axis
-i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. So, to first order, the true error
-of the calibration along u is ``|f| - g = H (true - calibrated) + noise``.
+i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order the true error of
+the calibration along u is ``|f| - g = H (true - calibrated) + noise``.
 """
 
 from __future__ import annotations
@@ -218,8 +218,8 @@ def series_of(
     white = averaged(np.maximum((sd / K) ** 2, correction.noise) / n[:, np.newaxis])
     noise = (v**2 * white).sum(axis=1) / sizes
     bare = SlowUncertainty(replace(calibration, posterior=None), correction)
-    whole = SlowUncertainty(calibration, correction)
-    slow, claim = (_along(correction, states, shares, model, v, x) for model in (bare, whole))
+    full = SlowUncertainty(calibration, correction)
+    slow, claim = (_along(correction, states, shares, model, v, x) for model in (bare, full))
     unexplained = np.broadcast_to(correction.curves.unexplained(states[:, BOARD])[0].T, x.shape)
     slow -= (v**2 * unexplained).sum(axis=1)
     residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])

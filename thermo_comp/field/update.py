@@ -266,7 +266,7 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
 
 
 def _with_residual(part: RegimeSet, turn_on: float, determined: Sequence[bool]) -> RegimeSet:
-    """Replace the slow error of each axis by that of the starts, or keep a larger one."""
+    """Raise the slow error of each axis to that of the starts, if the latter is larger."""
     axes: dict[str, Any] = {
         name: replace(
             axis,

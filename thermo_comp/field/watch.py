@@ -3,9 +3,9 @@
 """
 Owns the drift watch: ``|f| - g`` of a rest log against the claimed sd, and a forecast.
 
-The claim is valid while the error along gravity is within `LIMIT` claimed standard deviations. The
-forecast assumes a random walk of the error from its present estimate, with the variance estimated
-from the log: it is the distribution of the first passage of either bound.
+A unit is within its claim while the error along gravity is within `LIMIT` claimed sd. The forecast
+assumes a random walk of the error from its present estimate, with the variance estimated from the
+log: it is the distribution of the first passage of either bound.
 """
 
 from collections.abc import Sequence
@@ -48,13 +48,13 @@ class Row:
 @dataclass(frozen=True)
 class Watch:
     """
-    The rests of a log against the claim.
+    Comparison of the rests of a log with the claimed sd.
 
     days, periods, temperatures: by day, by period (at most 30), by class of temperature
-    left: first day of the last time outside the claim; None while the unit is within it
+    left: first day of the last period outside the claim; None for a unit within its claim
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit leaves its
         claim [days]; infinite: later than ten years
-    interval: the same for a unit that has just been updated
+    interval: the same quantiles for a unit that has just been updated
     """
 
     days: tuple[Row, ...]

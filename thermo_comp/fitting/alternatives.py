@@ -66,14 +66,14 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     has_choice = has_case and options.prior is None and options.detector is None
     if not has_choice or not _may_have_sets(fit.selected):
         return fit
-    # The alternative detector ends the dynamic regime once the case temperature is constant, and
-    # not only once those of case and board are. Only models with two sets depend on the regime.
+    # The alternative detector ends the dynamic regime once the case temperature is constant; the
+    # default also waits for the board temperature. Only models with two sets depend on the regime.
     model = fit.windows.model
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
-    other = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves of the program limit the number of columns; here both models have the same.
-    return other if is_better(fit.selected.score, other.selected.score, by_halves=False) else fit
+    early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
+    # Left-out halves of the program limit the number of columns, which is equal in both models.
+    return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
 def windows_of(
@@ -98,7 +98,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     Fit the windows with one lag per axis, or with a bank of time constants.
 
     The bank is fitted if no lag per axis is found, or if the lags leave more left-out drift than
-    noise explains. The bank then replaces the lags if it is better on left-out data.
+    noise explains. The bank replaces the lags per axis if it is better on left-out data.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -120,8 +120,8 @@ def _may_have_sets(selected: Selected) -> bool:
     """
     Whether the chosen model has two sets, or a model with two sets is similarly good.
 
-    Similarly good: its left-out error is within one standard error of that of the chosen model,
-    and its white noise is less than 80 % of that of the chosen model, on every axis.
+    A model is similarly good if its left-out error is within one standard error of that of the
+    chosen model, and its white noise is less than 80 % of that of the chosen model, on every axis.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma

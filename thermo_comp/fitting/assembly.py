@@ -60,7 +60,7 @@ def build_calibration(
     """
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
-    # Response columns that are in use, or that only the covariance has.
+    # Response columns with a weight, or with an entry in the covariance alone.
     used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_parameters(regression, layout, state, model, used, kinds)
@@ -149,7 +149,7 @@ def _valid_columns(
                 # any value.
                 most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
-        # Columns that occur in the curves of parts alone have their group.
+        # A column that is used only in the curves of parts gets the group of these curves.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if known is None else union((valid, column.range))
         result.append(replace(column, group=group, range=valid))
@@ -317,10 +317,10 @@ def file_parameters(
                 dynamic = both
             rows += [level, *static, level + delta, *dynamic, *response[used]]
     if regression.forces is not None:
-        every = regression.forces.kinds
-        at = [every.index(kind) for kind in kinds]
+        all_kinds = regression.forces.kinds
+        at = [all_kinds.index(kind) for kind in kinds]
         for places in layout.nonlinear:
-            rows += [*unknown[places[at]], *unknown[places[[len(every) + k for k in at]]]]
+            rows += [*unknown[places[at]], *unknown[places[[len(all_kinds) + k for k in at]]]]
     a, _, c = state.misalignment
     # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the elements (a, b, c) of its inverse.
     of_a, of_b, of_c = unknown[layout.misalignment]

@@ -87,8 +87,8 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     without_slow = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
     selected = select(regression, state, narrow, without_slow, report)
     chosen = selected.posterior
-    wide = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
-    selected = replace(selected, posterior=replace(chosen, prior=wide))
+    full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
+    selected = replace(selected, posterior=replace(chosen, prior=full_prior))
     return Fit(windows, regression, selected, candidates.typical)
 
 
@@ -165,8 +165,9 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     """
     Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
 
-    The effect of such a lag is nearly collinear with the curve, and its final value would be
-    extrapolated. No model has these columns; the covariance has the linear ones, see `claim`.
+    The effect of a slow lag is nearly collinear with the curve, and its final value would be
+    extrapolated. No model uses slow columns; those linear in temperature enter the covariance, see
+    `claim`.
     """
     data = windows.data
     longest_s = float(data.age.max())
@@ -214,7 +215,8 @@ def _candidates(
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
     if data.n_positions >= POSITIONS_NEEDED:
-        # Rests of one temperature each show the drift as differences between their norms.
+        # If each rest has one temperature, the drift appears as a difference between the rests'
+        # norms.
         force = (position_means(data) - start.bias) / start.scale
         sizes = sizes_of(windows, options)
         errors = np.linalg.norm(force, axis=1) - sizes

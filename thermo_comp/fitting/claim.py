@@ -5,9 +5,9 @@ Owns the published uncertainty: the covariance of the fit, widened by what the d
 determine, and the lack of fit, the excess of the left-out errors over this covariance.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
-mixture of fits on a grid of this standard deviation. The weight of each fit is the evidence of the
-norms times a half-Student prior. The standard deviation of gravity is a common error of the scale
-factors.
+mixture of fits on a grid of this standard deviation. A fit's weight in the mixture is the evidence
+of the norms times a half-Student prior. The standard deviation of gravity is a common error of the
+scale factors.
 
 The lack of fit per regime and temperature is the mean square of the left-out drift less the
 published variance of this drift. The lack of fit covers effects that no column describes, such as
@@ -45,9 +45,9 @@ class Claim:
     """
     The published uncertainty of a unit.
 
-    layout: places of the unknowns of the fit and of the columns that only the covariance has
+    layout: places of the unknowns of the fit and of the columns in the covariance alone
     covariance: of the unit's own unknowns, shape (n_unit, n_unit)
-    offset_sd: standard deviation of a new mounting or turn-on [m/s^2]
+    offset_sd: sd of the bias offset of a new mounting or turn-on [m/s^2]
     """
 
     layout: Layout
@@ -65,7 +65,7 @@ def claim_of(
     Return the published covariance of the fit of the chosen model.
 
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
-    do not determine are added to the covariance; `gravity_sd`: [m/s^2]
+    do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2]
     """
     prior = chosen.prior
     posterior = regression.solve(chosen.state, prior, n_steps=0)
@@ -74,12 +74,12 @@ def claim_of(
         covariance, offset_sd = _over_mountings(regression, posterior)
     if candidates is not None:
         wider = _with_unseen(regression, posterior, candidates)
-        wide = regression.solve(posterior.state, wider, n_steps=0)
-        # The covariance with unseen columns is that at the mounting sd of the mode. Add the excess
+        with_unseen = regression.solve(posterior.state, wider, n_steps=0)
+        # The covariance with unseen columns is computed at the mode's mounting sd. Add the excess
         # of the mixture's covariance over that of the mode.
-        at = _places(posterior.layout, wide.layout)
+        at = _places(posterior.layout, with_unseen.layout)
         excess = covariance - posterior.covariance
-        layout, covariance = wide.layout, wide.covariance.copy()
+        layout, covariance = with_unseen.layout, with_unseen.covariance.copy()
         covariance[np.ix_(at, at)] += excess
     if gravity_sd and regression.gravity:
         # An error of gravity is the same relative error of all three scale factors.
@@ -103,18 +103,19 @@ def _places(layout: Layout, wider: Layout) -> Ints:
 
 def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) -> Prior:
     """
-    Add unseen columns to the prior, so that the covariance does not state that they are 0.
+    Add columns that the data do not determine to the prior, so that their variance is not 0.
 
     An inactive column is consistent with 0, but the data bound it only to ``1 / sqrt(S)``, S being
-    its information given the active columns. If this bound exceeds two standard deviations of a
-    window's noise, the column enters the covariance with this sd and zero weight. A column that
-    was almost constant is judged as if it had changed as much as the temperature.
+    its information given the active columns. A column whose bound exceeds two sd of a window's
+    noise enters the covariance with the bound as sd, and zero weight. The bound of an almost
+    constant column is scaled to the change of temperature.
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
-    # A model without any curve lacks that over the board's temperature. One attitude cannot tell
-    # the curve of a bias from that of a scale factor: powers that a curve lacks may be in it.
+    # In a model without any curve the unseen curve is that over the board's temperature. From one
+    # attitude the curves of bias and scale factor cannot be separated: each may have powers that
+    # the curve of a part lacks.
     curves = [PART] * (PART in active) or [CURVE] * (CURVE not in active)
     may = np.isin(groups, [*LAGS, *curves]) & typical.any(axis=0)
     inactive = regression.inactive(posterior, may)
@@ -158,15 +159,16 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     # scale, and falling to 0 below a hundredth of the scale, which few mountings reach.
     density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
     density += np.log(np.minimum(grid / 0.01, 1.0))
-    # With large mountings the attitudes are free and could explain what the model lacks. So the
-    # drifts increase the evidence of an sd, relative to that of the mode, by at most `TRIAL_GAIN`.
+    # A large mounting sd leaves the attitudes free to absorb errors of the model. Therefore the
+    # drifts may increase the log evidence of an sd, over that of the mode, by at most
+    # `TRIAL_GAIN`.
     evidence = np.array([
         [fit.log_evidence for fit in fits],
         _norm_evidence(regression, posterior, tried, fits[-1].root),
     ])  # fmt: skip
     nearest = int(np.argmin(np.abs(np.log(tried / prior.offset_sd))))
-    whole, norms = evidence - evidence[:, [nearest]]
-    weight = np.minimum(whole, norms + TRIAL_GAIN) + density
+    of_data, of_norms = evidence - evidence[:, [nearest]]
+    weight = np.minimum(of_data, of_norms + TRIAL_GAIN) + density
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
@@ -184,7 +186,8 @@ def _norm_evidence(
     """
     Return the log evidence of the mean norms of the positions, for each sd of mountings, (k,).
 
-    `by_drifts`: root of the unit's covariance if the norms are unknown, for the thermal weights
+    `by_drifts`: root of the unit's covariance without information from the norms; the covariance
+        of the thermal weights is taken from it
     """
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     point, first = regression.at(state, prior), regression.windows.edges[:-1]
@@ -195,7 +198,7 @@ def _norm_evidence(
     # Errors of the norms without offsets.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     if prior.informative is None:
-        # The prior of the constants is almost flat; it is taken about the state.
+        # The prior of the constants is almost flat, so it is centred on the state.
         weights = layout.axis[:, 2:].ravel()
         constants = np.setdiff1d(np.arange(layout.n_unit), weights)
         of_prior = np.hstack((
@@ -222,8 +225,8 @@ def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[La
     model_error = np.zeros_like(drift)
     for trial in selected.trials:
         if trial.is_near:
-            other = within_positions(regression.force(trial.posterior.state), position)
-            model_error = np.maximum(model_error, 0.5 * (other - drift) ** 2)
+            other_drift = within_positions(regression.force(trial.posterior.state), position)
+            model_error = np.maximum(model_error, 0.5 * (other_drift - drift) ** 2)
     static, dynamic = (
         _points(windows.temperature, excess, model_error, rows & np.isfinite(excess[:, 0]))
         for rows in (~windows.is_dynamic, windows.is_dynamic)

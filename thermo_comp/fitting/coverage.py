@@ -75,7 +75,6 @@ def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
     # Slices of `_SPHERE`: faces, edges and corners of a cube, then all other directions.
     tiers = slice(0, 6), slice(6, 18), slice(18, 26), slice(26, None)
     tier = next(tier for tier in tiers if good[tier].any())
-    # Among directions of equal gain take the first.
     return np.asarray(_SPHERE[tier][np.argmax(gain[tier] >= 0.99 * gain[tier].max())])
 
 
@@ -114,14 +113,15 @@ def rough_centre(means: Floats) -> Floats:
         return zero
     arms = means - means.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    # The origin is accepted as the centre if the norms about it vary by less than 30 % of spread.
+    # The origin is the centre if the sd of the norms is below 30 % of the RMS distance to the
+    # mean.
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
     # Points with less than 2 % of their variance across a plane do not determine a centre.
     if values[0] < 0.02 * values[2]:
         return zero
-    # A sphere about c satisfies |m|^2 = 2 c m + const; `arms` are centred for small numbers.
+    # A sphere about c satisfies |m|^2 = 2 c m + const; subtracting the mean keeps numbers small.
     columns = np.column_stack((2.0 * arms, np.ones(len(arms))))
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
@@ -231,7 +231,7 @@ def spoken_direction(up: Floats) -> str:
 
 
 def _cube() -> Floats:
-    """Faces, edges and corners of a cube, in this order, the upright one first."""
+    """Return the directions of faces, edges and corners of a cube, in this order, +z first."""
     steps = np.array([(x, y, z) for z in (1, 0, -1) for y in (0, 1, -1) for x in (0, 1, -1)])
     order = np.argsort(np.abs(steps).sum(axis=1), kind='stable')[1:]
     cube = steps[order].astype(np.float64)

@@ -97,7 +97,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             'handling in the other time was cut out',
         )
     if not any(interval.sample_sd.any() for bag in bags for interval in bag.intervals):
-        text = 'no sample at rest differs from the one before: does the sensor stand still?'
+        text = 'at rest all samples are equal: does the sensor repeat one reading?'
         yield _advice('stuck', text)
     if dead := '; '.join(_dead_axes(bags)):
         yield Finding('stuck', 'refusal', f'{dead}: the axis is dead there, leave out such a bag')
@@ -123,7 +123,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             yield _advice(
                 'compensated',
                 'the samples are no whole numbers: scaled or compensated before they were '
-                'recorded? A calibration made on them fits that output only',
+                'recorded? A calibration made from such samples is valid for that output only',
             )
     jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
     if jumps:
@@ -259,7 +259,7 @@ def _judge_positions(up: Floats) -> Finding:
             f'{POSITIONS_NEEDED} positions separate them, '
             f'{POSITIONS_FOR_MISALIGNMENT} give the misalignment',
         )
-    if not can_tell_misalignment(up):
+    if not determines_misalignment(up):
         return _advice(
             'misalignment',
             f'{n} positions determine bias and scale; the misalignment keeps its prior: it needs '
@@ -272,7 +272,7 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a further position if the sd of |f| in some attitude is 3 times the positions'."""
+    """Advise a further position if the sd of |f| in some attitude is 3 times that in positions."""
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield _advice(
             'unseen',
@@ -282,7 +282,7 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
         )
 
 
-def can_tell_misalignment(up: Floats) -> bool:
+def determines_misalignment(up: Floats) -> bool:
     """
     Whether the number and the spread of positions are sufficient to estimate M.
 
@@ -308,14 +308,14 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
     worst, skewed = float(np.abs(state.bias).max()), float(np.abs(state.misalignment).max())
     largest = max(scale, worst / options.gravity, skewed)
     is_none = largest < 1e-4 and raw < 2e-5 * options.gravity
-    if is_none and span > 20.0 and can_tell_misalignment(state.up):
+    if is_none and span > 20.0 and determines_misalignment(state.up):
         yield Finding(
             'compensated',
             'refusal',
             f'there is nothing to correct: over {span:.0f} K |f| moves by {raw / MICRO_G:.1f} ug '
             f'RMS, scales differ by {1e6 * scale:.1f} ppm, biases reach {worst / MICRO_G:.1f} ug '
             f'and misalignments {1e6 * skewed:.1f} urad: the samples have been compensated '
-            'already, and the calibration must be made on raw ones',
+            'already, and the calibration must be made from raw samples',
         )
 
 
@@ -341,7 +341,7 @@ def judge_result(
         yield _advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and has_temperature:
         why = 'each position is predicted badly by the others; record more positions'
-        yield _advice('left out', f'{text}: positions left out are worse than raw: {why}')
+        yield _advice('left out', f'{text}: left-out positions exceed the raw error: {why}')
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms

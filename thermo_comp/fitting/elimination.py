@@ -34,10 +34,10 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     root = np.sqrt(square)
     scaled = matrix / root[..., None, :]
     scaled /= root[..., :, None]
-    every = np.arange(matrix.shape[-1])
-    jitters = 1e-13, 1e-11, 1e-9, 1e-7  # tried in turn, each added to those before
+    index = np.arange(matrix.shape[-1])
+    jitters = 1e-13, 1e-11, 1e-9, 1e-7  # added one after another until a factor exists
     for jitter in jitters:
-        scaled[..., every, every] += jitter
+        scaled[..., index, index] += jitter
         try:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
@@ -107,7 +107,7 @@ class Reduced:
     The normal equations of the unit's n unknowns, with all others eliminated.
 
     layout: places of the unknowns
-    starts_prior: precision of the initial lag states, and this times their value, (2, n_bags, r)
+    starts_prior: precision of the initial lag states, and precision times state, (2, n_bags, r)
     matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
     positions: the blocks of the positions; the initial lag states of the bag, then the unknowns of
         the unit remain
@@ -145,7 +145,7 @@ class Reduced:
         return replace(self, common=Blocks.of(block, cross))
 
     def follow(self, step: Floats) -> tuple[Floats, Floats]:
-        """Return the steps of the unknowns of positions and bags, given that of the unit."""
+        """Return the steps of the unknowns of positions and bags, given the step of the unit's."""
         r, solved = len(self.bags.root[0]), self.positions.solved
         starts = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
         if self.common is not None:
@@ -157,8 +157,9 @@ class Reduced:
 
     def variances(self, root: Floats) -> tuple[Floats, Floats]:
         """
-        Return the variances of the unknowns of positions and bags, given an upper triangular root
-        of the covariance of the unit's, without the prior on the sum of the initial lag states.
+        Return the variances of the unknowns of positions and bags, without the prior on the sum of
+        the initial lag states; `root`: upper triangular root of the covariance of the unit's
+        unknowns.
         """
         bag, r, solved = self.layout.bag, len(self.bags.root[0]), self.positions.solved
         by_unit, by_starts = self.bags.solved[..., :-1], solved[..., :r]
@@ -186,10 +187,10 @@ class Reduced:
         """
         Carry out the elimination for further unknowns of the unit, m of each axis.
 
-        `rows`: their normal equations with the unknowns of the fit and the residual, shape
-        (n_positions, 3, m, k + 1). Returns what the elimination subtracts from the Hessian of the
-        further unknowns, shape (3 m, 3 m), and, after the elimination, their cross block with the
-        unit and their gradient, shape (n + 1, 3 m).
+        `rows`: normal equations of the further unknowns with the unknowns of the fit and the
+        residual, shape (n_positions, 3, m, k + 1). Returns what the elimination subtracts from the
+        Hessian of the further unknowns, shape (3 m, 3 m), and, after the elimination, their cross
+        block with the unit and their gradient, shape (n + 1, 3 m).
         """
         layout, turned = self.layout, self.positions.turned
         n_positions, n_own, _ = turned.shape
@@ -226,11 +227,11 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -
         rows[:, :n_own, n_own:],
         rows[:, n_own:, n_own:],
     )
-    every = np.arange(n_own)
-    block[:, every, every] += precision[layout.own]
+    index = np.arange(n_own)
+    block[:, index, index] += precision[layout.own]
     cross[..., -1] -= (precision * away)[layout.own]
     # Attitudes without any information keep their value.
-    block[:, every, every] += np.einsum('pii->pi', block) <= 0.0
+    block[:, index, index] += np.einsum('pii->pi', block) <= 0.0
     positions = Blocks.of(block, cross)
     diagonal = np.einsum('pii->pi', starts[..., :r])
     starts = starts - np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned

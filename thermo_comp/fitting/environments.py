@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the exclusion of bags from another environment, and the error that they add to the claim.
+Owns the exclusion of bags from another environment, and their part in the published error.
 
 In a chamber with a fan the board temperature follows the case temperature by one law, in still air
-by another. The bias of a part without a thermometer then depends on the environment, and no set of
-coefficients describes both. One bag of still air would increase the error of the correction in the
-chamber. Therefore the fit excludes this bag, and its error becomes a lack of fit.
+by another. The bias of a part without a thermometer depends on the environment, and no set of
+coefficients describes two environments. A bag of still air would increase the error in the
+chamber. The fit excludes a bag of another environment and publishes the error of its correction as
+a lack of fit.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ from .windows import ThermalWindows, thermal_windows
 
 
 def _is_far_above(square: Floats | float, usual: float) -> Bools:
-    """Whether the mean square of a drift is that of five times the usual RMS, or more."""
+    """
+    Whether the RMS of a drift exceeds five times the usual RMS; both are given as mean squares.
+    """
     return np.asarray(square > 5.0**2 * usual)
 
 
@@ -43,8 +46,8 @@ def contradicting_bag(fit: Fit) -> int | None:
     Find the bag that may be of another environment; None if no bag is suspect.
 
     A bag is suspect if its left-out drift is far above the median of all bags, and above the white
-    noise of a window. A single bag whose drift the others do not determine is suspect if their
-    median is far above the noise.
+    noise of a window. A bag is also suspect if its drift is the only one that the other bags do
+    not determine, and the median drift is far above the noise.
     """
     square = _square_of_bags(fit)
     known = np.isfinite(square)
@@ -142,8 +145,8 @@ def with_excluded_error(
         'environment',
         'advice',
         f'{names}: the correction by {others} leaves a drift of {rms:.0f} ug. The recording took '
-        'no part in the fit, and the claim includes this error. Another environment, with the '
-        'fan off or mounted elsewhere, needs a calibration of its own',
+        'no part in the fit; the published uncertainty includes this error. Another environment, '
+        'with the fan off or mounted elsewhere, needs a separate calibration',
     )
     return replace(calibration, static=static, dynamic=dynamic), finding
 

@@ -8,9 +8,9 @@ Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + kappa (A l_p)_i g + noise,
     a = (A u_p)_i g,  A = M^-1,  l_p across u_p: tilt of the support
 
-B and S are columns of one table (`unit.columns`), each divided by its RMS. With g = 0 this is the
-equation of an angular rate: b, B beta and o_p remain. If |f| differs between positions it replaces
-g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added (`forces`). The terms
+B and S are columns of one table (`unit.columns`), each divided by its RMS. With g = 0 the equation
+is that of an angular rate: b, B beta and o_p remain. If |f| differs between positions it replaces
+g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added (`forces`). All terms
 are linear combinations of the base series of the windows (`series`).
 """
 
@@ -57,15 +57,15 @@ class Effects(NamedTuple):
     force: specific force along each axis in each position, shape (n_positions, 3)
     across: derivative of the reading by a rotation of the attitude, shape (n_positions, 3, 2)
     read: reading without the bias, shape (n_positions, 3)
-    bends: sums of nonlinear terms at the reference temperature and per kelvin,
-        shape (2, n_positions, 3)
+    nonlinear: sums of the nonlinear terms at the reference temperature and per kelvin, shape (2,
+        n_positions, 3)
     slopes: their derivatives by the force, of the same shape
     """
 
     force: Floats
     across: Floats
     read: Floats
-    bends: Floats
+    nonlinear: Floats
     slopes: Floats
 
 
@@ -116,22 +116,22 @@ class Equations(Series):
             return self.gravity
         return np.asarray(self.forces.norms(state.radius, state.stretch)[:, None])
 
-    def layout(self, used: Bools, bends: Bools | None = None) -> Layout:
+    def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
         """
         Assign a place to every unknown; the same object for the same unknowns.
 
-        `used`: active columns of bias and scale, shape (2, m); `bends`: active nonlinear
+        `used`: active columns of bias and scale, shape (2, m); `nonlinear`: active nonlinear
         coefficients, shape (2 k,); None for all
         """
-        if bends is None or self.forces is None:
-            bends = np.ones(2 * len(self.forces.kinds) if self.forces else 0, dtype=bool)
-        key = used.tobytes() + bends.tobytes()
+        if nonlinear is None or self.forces is None:
+            nonlinear = np.ones(2 * len(self.forces.kinds) if self.forces else 0, dtype=bool)
+        key = used.tobytes() + nonlinear.tobytes()
         if key not in self._layouts:
             moved = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
             n_starts = self.start_root.shape[1] if moved else 0
             n_tilts = self.windows.tilt.shape[1]
             self._layouts[key] = lay_out(
-                used, self.bag_of_position, n_tilts, n_starts, bends, self.forces
+                used, self.bag_of_position, n_tilts, n_starts, nonlinear, self.forces
             )
         return self._layouts[key]
 
@@ -143,11 +143,11 @@ class Equations(Series):
         sizes = np.reshape(self._norm(state), (-1, 1, 1))
         across = sizes * (state.kappa[:, None] * turned)
         if self.forces is None:
-            bends = np.zeros((2, 2, *force.shape))
+            nonlinear = np.zeros((2, 2, *force.shape))
         else:
             terms = np.stack(self.forces.terms(force))
-            bends = np.einsum('vpik,ijk->vjpi', terms, state.nonlinear.reshape(3, 2, -1))
-        return Effects(force, across, state.kappa * (force + bends[0, 0]), bends[0], bends[1])
+            nonlinear = np.einsum('vpik,ijk->vjpi', terms, state.nonlinear.reshape(3, 2, -1))
+        return Effects(force, across, state.kappa * (force + nonlinear[0, 0]), *nonlinear)
 
     def tangent(self, state: State, layout: Layout, base: Base) -> Tangent:
         """Linearise the equations about a state."""
@@ -209,8 +209,8 @@ class Equations(Series):
         """
         Return series and factor of the active nonlinear coefficients.
 
-        The relative change of the scale factor multiplies the terms at the reference temperature.
-        Its product with the change of the terms per kelvin is negligible.
+        The relative change of the scale factor multiplies the terms at the reference temperature,
+        but not their change per kelvin: that product is negligible.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):
@@ -264,7 +264,7 @@ class Equations(Series):
 
     @last_result_kept
     def precision(self, prior: Prior, layout: Layout) -> Floats:
-        """Return inverse prior variances, shape (n,); 0 for those of an informative prior."""
+        """Return inverse prior variances, shape (n,); 0 for unknowns with an informative prior."""
         result = np.zeros(layout.n)
         result[layout.kappa] = prior.scale_sd**-2
         result[layout.bias] = prior.bias_sd**-2.0
@@ -272,8 +272,8 @@ class Equations(Series):
         columns = self.weight_sd(prior).transpose(1, 0, 2)[:, active]
         result[layout.axis[:, 2 : 2 + columns.shape[1]]] = columns**-2.0
         if self.forces is not None:
-            bends = prior.nonlinear_sd[prior.nonlinear_sd > 0.0]
-            result[layout.axis[:, 2 + columns.shape[1] :]] = bends**-2.0
+            nonlinear = prior.nonlinear_sd[prior.nonlinear_sd > 0.0]
+            result[layout.axis[:, 2 + columns.shape[1] :]] = nonlinear**-2.0
             result[layout.stretch] = self.forces.stretch_sd[:, None] ** -2.0
             if layout.radius.size:
                 result[layout.radius] = self.forces.radius_sd**-2.0

@@ -114,7 +114,7 @@ def left_out_error(score: Score, gravity: float | Floats) -> Floats:
 def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...]) -> State:
     """Fit again with some groups only, under a flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
-    # The residuals of such a model are mostly model error: all windows get equal weight.
+    # Residuals of a model with few groups are mostly model error: all windows get equal weight.
     prior = replace(
         chosen.prior,
         column_sd=only * regression.windows.parts * [[0.05], [0.005]],

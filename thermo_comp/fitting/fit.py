@@ -183,34 +183,34 @@ def _fit_one_environment(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
     """Fit the bags, without those of another environment, see `environments`."""
-    whole = _fit(bags, options, progress)
+    first = _fit(bags, options, progress)
     known = options.prior
     excluded: list[int] = []
     if known is None:
-        bag = contradicting_bag(whole.fit)
+        bag = contradicting_bag(first.fit)
         excluded = [] if bag is None else [bag]
-    elif known.unit.serial == whole.calibration.unit.serial and not whole.fit.windows.data.forces:
-        excluded = bags_contradicting_prior(whole.fit.windows, known, options)
+    elif known.unit.serial == first.calibration.unit.serial and not first.fit.windows.data.forces:
+        excluded = bags_contradicting_prior(first.fit.windows, known, options)
     if not excluded:
-        return whole
+        return first
     kept = [bag for k, bag in enumerate(bags) if k not in excluded]
-    rest = whole
+    refit = first
     if kept:
-        rest = _fit(kept, options, progress)
-        if known is None and not is_better_without(whole.fit, rest.fit, excluded[0]):
-            return whole
+        refit = _fit(kept, options, progress)
+        if known is None and not is_better_without(first.fit, refit.fit, excluded[0]):
+            return first
     elif known is not None:
         # All bags contradict the prior, so no bag can update the prior.
-        provenance = whole.calibration.provenance
-        rest = replace(whole, calibration=replace(known, provenance=provenance))
+        provenance = first.calibration.provenance
+        refit = replace(first, calibration=replace(known, provenance=provenance))
     others = 'the other bags' if known is None else 'the prior'
     calibration, finding = with_excluded_error(
-        rest.calibration, [bags[k] for k in excluded], others
+        refit.calibration, [bags[k] for k in excluded], others
     )
     return replace(
-        rest,
+        refit,
         calibration=with_notes(calibration, [finding]),
-        findings=(*rest.findings, finding),
+        findings=(*refit.findings, finding),
         bags=tuple(bags),
     )
 

@@ -77,7 +77,7 @@ class Inactive:
 
     def chosen(self, column_sd: Floats, wanted: Bools, least: float, most: int) -> Bools:
         """
-        Choose `most` of the wanted columns at most, by forward selection, shape (m,).
+        Choose up to `most` of the wanted columns by forward selection, shape (m,).
 
         The next column is that with the largest gain in log evidence given those chosen before;
         the selection ends when this gain is below `least`.

@@ -4,9 +4,9 @@
 Owns the fit of the gyroscope: the angular rate of the still windows, over the same columns.
 
 A gyroscope at rest measures the component of the Earth's rate in its attitude, plus a bias that
-changes at each turn-on. Each position therefore has an offset. Changes within a position determine
-the effect of temperature; the mean over the positions determines the constant bias. The regression
-is that of the accelerometer with gravity 0, in rad/s in place of m/s^2.
+changes at each turn-on. Each position has one constant offset as an unknown. Changes within a
+position determine the effect of temperature; the mean over the positions determines the constant
+bias. The regression is that of the accelerometer with gravity 0, in rad/s in place of m/s^2.
 """
 
 from __future__ import annotations

@@ -3,10 +3,10 @@
 """
 Owns the estimation of prior standard deviations and noises, without columns of too little gain.
 
-Each column has one prior standard deviation for the bias of all axes and one for the scale. Both
-are found by MacKay's fixed point with a log-normal hyperprior per kelvin: the mode of log evidence
-plus hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``. The sd
-of a column about which the data have no information stays at the centre sd0 of the hyperprior.
+Each column has one prior standard deviation for the bias of all axes and one for the scale, found
+by MacKay's fixed point with a log-normal hyperprior per kelvin: the mode of log evidence plus
+hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``. The sd of a
+column about which the data have no information stays at the centre sd0 of the hyperprior.
 
 References
 ----------
@@ -96,13 +96,13 @@ def _updated(
     misalignment_sd = prior.misalignment_sd
     gamma = float(determined[layout.misalignment].sum())
     if gamma > 1.0 and prior.informative is None:
-        # Three elements determine their sd poorly: the built-in prior counts as a fourth.
+        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth.
         square = np.sum(state.misalignment**2) + MISALIGNMENT_SD**2
         misalignment_sd = float(np.sqrt(square / (gamma + 1.0)))
     start_share = prior.start_share
     if layout.start.size:
-        # The run-time prior has the weight of one state, so that one bag cannot make the share
-        # small.
+        # The run-time prior counts as one further state; else the states of one bag could make
+        # `start_share` very small.
         gamma = float(determined[layout.start].sum())
         start_share = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
         changes.append(float(np.abs(np.log(start_share / prior.start_share))) / 4.0)
@@ -280,8 +280,8 @@ def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
             usual = sliding_window_view(around, 2 * side + 1, axis=0)
             np.subtract(part, np.median(usual, axis=-1), out=part)
     size = np.abs(size)
-    # The window means of a charge-balancing converter often have few distinct values, with a
-    # median deviation of 0. The 80 % quantile of |x| is robust, too: 1.2816 sd of a normal.
+    # The 80 % quantile of |x| is 1.2816 sd of a normal. The median is not used: the window means
+    # of a charge-balancing converter often have few distinct values, with a median deviation of 0.
     usual = np.quantile(size, 0.8, axis=0) / 1.2816
     size = np.minimum(size / np.maximum(usual, 1e-300), 1e3).max(axis=1)
     return np.asarray((3.0 / np.maximum(size, 3.0)) ** 2)

@@ -74,7 +74,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
     near = _near(bag, gaps, [_MARGIN_S] * len(gaps))
-    # The level of correlated noise needs a longer mean.
+    # If the noise is correlated, the level is a mean over a longer time.
     margins = [_margin(part, quiet_sd) for part in near]
     slow = [place for place, margin in enumerate(margins) if margin > _MARGIN_S]
     wider = _near(bag, [gaps[place] for place in slow], [margins[place] for place in slow])
@@ -170,10 +170,9 @@ def _examine(
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
     """
-    Return the sd of a mean over that for white noise of `sd`, per axis, at least 1.
-
-    This ratio follows from the means of 40 pieces of the residuals, shape (n, 3): from their
-    variance and their lag-1 correlation r, which multiplies the variance by (1 + r) / (1 - r).
+    Return the sd of a mean, relative to that for white noise of `sd`, per axis, at least 1. The
+    residuals, shape (n, 3), are averaged to 40 pieces, whose variance is multiplied by (1 + r) /
+    (1 - r), r being their lag-1 correlation.
     """
     size = max(len(residual) // 40, 1)
     n = len(residual) // size
@@ -224,8 +223,8 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # The whitened step H_k = (i >= k) is 1 at k and 1 - r after k. The product of H_k with a
-    # residual is a sum from k on; the square of H_k without the trend follows from such sums of
-    # the trend.
+    # residual is a sum from k on; the square of H_k without the trend follows from sums of the
+    # trend.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)

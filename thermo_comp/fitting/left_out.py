@@ -12,8 +12,8 @@ The errors are the drift (each axis less its mean over the position, which does 
 attitude) and ``|f| - g`` of the position, if the other positions determine it.
 
 A model is better if it reduces the error by more than the standard error over the folds, both for
-positions and for sections of the program. A model that describes only one recording, or only one
-program, fails one of the two tests.
+positions and for sections of the program. A model that describes only one recording fails for
+positions, a model that describes only one program fails for sections.
 
 References
 ----------
@@ -67,23 +67,23 @@ class Folds:
         Return the log ratio of the mean square error to that of another model, and its standard
         error, over the folds that both have; None without such folds.
 
-        There are two estimates: the mean over folds of their log ratios, which is robust to a few
-        large folds, and the log ratio of the sums with its jackknife error, which is robust to
-        small folds. If their signs agree the more significant estimate is returned, else 0.
+        Of two estimates with equal signs the more significant is returned, else 0: the mean over
+        folds of their log ratios, which is robust to a few large folds, and the log ratio of the
+        sums with its jackknife error, which is robust to small folds.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
         if not n:
             return None
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
-        whole = float(np.log(before.sum() / after.sum()))
+        of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
             # The scatter of one fold is unknown: its error is the smallest difference that counts.
-            return whole, _EQUAL
+            return of_sums, _EQUAL
         each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))
         spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
-        estimates = [(whole, spread), (float(each.mean()), float(each.std(ddof=1) / np.sqrt(n)))]
+        estimates = [(of_sums, spread), (float(each.mean()), float(each.std(ddof=1) / np.sqrt(n)))]
         if estimates[0][0] * estimates[1][0] < 0.0:
             return 0.0, max(error for _, error in estimates)
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
@@ -134,12 +134,12 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
     Return the gain of a model if it exceeds its standard errors, else 0.
 
-    The gain is the sum of the log gains of the drift. If the drifts are equal, it is the log gain
-    of the norms of left-out positions, which must exceed two standard errors.
+    The gain is the sum of the log gains of the drift. If the drifts are equal, the gain is the log
+    gain of the norms of left-out positions, which must exceed two standard errors.
     """
     positions, sections, norms = _gains(before, after)
     drift = [gain for gain in (positions, sections) if gain]
-    # The RMS error of halves may rise by a quarter: that of two folds scatters by about as much.
+    # The RMS error of the two halves may rise by a quarter, which is about its scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
         return 0.0
@@ -215,9 +215,9 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
     covariance, see `Posterior`.
     """
     step, factor = point.unit_step(matrix)
-    whole = np.zeros(point.layout.n)
-    whole[: point.layout.n_unit] = step
-    return point.moved(whole).state, inverse_root(factor)
+    full_step = np.zeros(point.layout.n)
+    full_step[: point.layout.n_unit] = step
+    return point.moved(full_step).state, inverse_root(factor)
 
 
 def _is_determined(by_others: float, by_all: float) -> bool:

@@ -280,7 +280,7 @@ def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
     kinds: tuple[Kind, ...] = ('square', 'cube')
     sd = np.tile(prior_sd(kinds, options), 3)
     factor = np.insert(posterior.matrix, [at] * len(sd), 0.0, axis=0)
-    rest = np.insert(posterior.variances, [at] * len(sd), sd**2)
+    variances = np.insert(posterior.variances, [at] * len(sd), sd**2)
     terms = tuple(blank_term(kind, options.nonlinear_sd(kind)) for kind in kinds)
     gravity = calibration.gravity_m_s2
     return replace(
@@ -288,7 +288,7 @@ def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
         nonlinearity=Nonlinearity(
             (0.99 * gravity, 1.01 * gravity), options.nonlinear_sd('square'), terms
         ),
-        posterior=FilePosterior.of(factor, rest),
+        posterior=FilePosterior.of(factor, variances),
     )
 
 

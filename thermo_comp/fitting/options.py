@@ -198,10 +198,10 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     if not -1000.0 <= height_m <= 10000.0:
         raise ValueError(f'`height_m` must be within -1000..10000, got {height_m}')
     sine2 = math.sin(math.radians(latitude_deg)) ** 2
-    # Constants of WGS 84: gravity at the equator, Somigliana's k, eccentricity squared, ...
+    # Constants of WGS 84: gravity at the equator, Somigliana's k, eccentricity squared.
     root = math.sqrt(1.0 - 0.00669437999014 * sine2)
     at_ellipsoid = 9.7803253359 * (1.0 + 0.00193185265241 * sine2) / root
-    # ... semi-major axis, flattening, and m, centrifugal acceleration over gravity at the equator.
+    # WGS 84: semi-major axis, flattening, and m, centrifugal acceleration over equatorial gravity.
     relative, flattening, m = height_m / 6378137.0, 1.0 / 298.257223563, 0.00344978650684
     slope = 2.0 * (1.0 + flattening + m - 2.0 * flattening * sine2)
     return at_ellipsoid * (1.0 - slope * relative + 3.0 * relative**2)

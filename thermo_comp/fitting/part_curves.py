@@ -6,7 +6,7 @@ Owns the curves over the temperatures of parts: sums of columns with one weight 
 The temperature of the part of an axis is ``x = t - m``, t being that of the board and m the lag of
 the part. By the binomial theorem x^p is a sum of the columns t^p, t^(p-1) m, ..., m^p, which the
 bank has. If all bags repeat one warm-up, t and m are functions of each other, and separate weights
-of these columns would not be those of the part.
+of the columns would not be those of the part.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from ..typing import Floats, Ints
 from ..unit.columns import Column, Part
 
-#: Highest power of x.
+#: Highest power of x, the temperature of a part.
 ORDER = 3
 #: Kinds of the columns of m, m^2 and m^3.
 _OF_LAG = 'board', 'square', 'cube'

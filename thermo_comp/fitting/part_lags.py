@@ -7,7 +7,7 @@ The bias and the scale factor of an axis are modelled as functions of ``x = t - 
 temperature of one part of the unit: t is the board temperature less the reference temperature, and
 m = T - L(T + v g) the difference between the board temperature T and that of the part. The part
 lags a temperature between board and case: that of the board plus the share v of the gradient g.
-The lag has one stage or, where a part hangs on another part, two stages in series. The time
+The lag has one stage or, for a part that is heated through another part, two in series. The time
 constants and v minimise the RMS residual of a spline of the bias and a cubic of the scale factor,
 both over x.
 """
@@ -69,9 +69,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         searched = curves(500).lags(noise)
         if searched is None:
             continue
-        many, whole = curves(3000), curves(len(data.time))
-        lags = [many.near(lag, axis) for axis, lag in enumerate(searched)]
-        residual = np.column_stack([whole.residual(lag, axis) for axis, lag in enumerate(lags)])
+        subset, full = curves(3000), curves(len(data.time))
+        lags = [subset.near(lag, axis) for axis, lag in enumerate(searched)]
+        residual = np.column_stack([full.residual(lag, axis) for axis, lag in enumerate(lags)])
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
         x, y, z = (Part(round(lag[0], 1), round(lag[1], 1), round(lag[2], 4)) for lag in lags)
@@ -81,7 +81,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
             return parts
         # A larger residual has another cause, e.g. slow noise: the lags are then accepted only if
         # they reduce the RMS residual of each axis to an eighth or less of that without a lag.
-        if accepted is None and min(map(many.reduction, lags, range(3))) >= 8.0:
+        if accepted is None and min(map(subset.reduction, lags, range(3))) >= 8.0:
             accepted = parts
     return accepted
 
@@ -91,8 +91,8 @@ class _PartCurves:
     Bias and scale factor of each axis as functions of x (see the module), for any lags.
 
     `rows`: the windows that are used
-    `has_stress`: whether both also depend on m, by a coefficient that is linear in x: the stress
-        between a part and the board
+    `has_stress`: whether bias and scale also depend on m, by a coefficient that is linear in x:
+        the stress between a part and the board
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class _PartCurves:
         ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
         knots = _even(np.append(0.0, self._taus))
         self._ratio = CubicSpline(knots, ratios, axis=1)
-        # Likewise the lag of the gradient, whose limit is the gradient.
+        # The lag L_tau(g) of the gradient g is interpolated over tau; its limit at tau = 0 is g.
         of_case = [
             [c.group == 'gradient_lag' and c.tau_s == tau and c.sensor == 'case' for c in columns]
             for tau in self._taus
@@ -192,10 +192,10 @@ class _PartCurves:
         free = np.flatnonzero(steps)
 
         def lag_at(values: Floats) -> Part:
-            every = start.copy()
-            every[free] = values
-            second = float(np.exp(every[1])) if first.second_tau_s else 0.0
-            return _in_order(float(np.exp(every[0])), second, float(np.clip(every[2], -2.0, 2.0)))
+            point = start.copy()
+            point[free] = values
+            second = float(np.exp(point[1])) if first.second_tau_s else 0.0
+            return _in_order(float(np.exp(point[0])), second, float(np.clip(point[2], -2.0, 2.0)))
 
         simplex = start[free] + np.vstack((np.zeros(len(free)), np.diag(np.array(steps)[free])))
         options: Any = {'xatol': 2e-3, 'fatol': 1e-4, 'maxfev': 150, 'initial_simplex': simplex}
@@ -275,8 +275,8 @@ class _PartCurves:
 
     def _centred(self, values: Floats) -> Floats:
         """Subtract the weighted mean over each position; multiply by the root of the weight."""
-        every = np.hstack((values, np.ones_like(self._weight))) * self._weight
-        sums = np.add.reduceat(every, self._first, axis=0)
+        weighted = np.hstack((values, np.ones_like(self._weight))) * self._weight
+        sums = np.add.reduceat(weighted, self._first, axis=0)
         level = sums[:, :-1] / sums[:, -1:]
         return np.asarray((values - level[self._position]) * np.sqrt(self._weight))
 

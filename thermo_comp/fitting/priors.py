@@ -3,10 +3,10 @@
 """
 Owns informative priors: an earlier calibration of the unit, or the population of its type.
 
-Such a prior is a calibration: a mean and a covariance of all parameters. A population has the mean
-and the scatter over units of the parameters relative to the scale factors. The covariance of an
-earlier calibration of the unit is increased by the ageing of the unit. The calibration is the
-Gaussian prior of the regression, and its columns are those of the regression.
+An informative prior is a calibration: mean and covariance of all parameters form the Gaussian
+prior of the regression, which has the calibration's columns. A population's mean and covariance
+are the mean and the scatter over units of the parameters relative to the scale factors. The
+covariance of an earlier calibration of the unit is increased by the ageing of the unit.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ def informative_priors(
     """
     Return candidate priors from a calibration, which the fit compares by evidence.
 
-    The fit begins with the last one, the widest. FitError if the calibration has no covariance.
+    The last candidate is the widest; the fit begins with it. FitError if the calibration has no
+    covariance.
     """
     if calibration.posterior is None:
         raise FitError('the prior has no covariance: an imported calibration cannot be a prior')
@@ -205,7 +206,6 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     share = 0.01
     scatter = (1.0 - share) * away.T @ away
     scatter[np.diag_indices_from(scatter)] += share * np.sum(away**2, axis=0)
-    # Add the variance of the mean.
     scatter *= 1.0 + 1.0 / len(vectors)
     # Parameters that none of the units determined keep the uncertainty of their own prior.
     scatter += np.mean([covariance for _, covariance in units], axis=0)
@@ -222,9 +222,9 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     Return the columns of the bank whose sum is a column, each with its share.
 
     The parts of two units of a type differ in their time constants. A lag is interpolated between
-    those of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages is a
-    sum of two lags, and one between board and sensor a sum of their lags; their powers are
-    approximated by those of one lag of the board with the sum of the time constants.
+    the lags of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages,
+    or behind a temperature between board and sensor, is a sum of single lags; its powers are
+    approximated by the powers of one lag of the board with the sum of the time constants.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE

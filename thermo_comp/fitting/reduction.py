@@ -173,12 +173,12 @@ def reduce_source(
     Stream one source and keep its sufficient statistics.
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
-    3 s, or less if shorter rests determine bias and scale better; the largest
-    variance of a rest is chosen in the same way. A cell has `least` samples, or 5 if the samples
-    are slow and the unit rarely rests as long.
+    3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
+    is chosen in the same way. A cell has `least` samples, or 5 if the samples are slow and most
+    rests are shorter than a cell.
     """
     reading = _Pass(source, CellAccumulator(min(cell_s, window_s), full_scale, window_s, least))
-    # The norms at rest choose the thresholds only if they are those of gravity.
+    # The norms at rest determine the thresholds only if |f| at rest is gravity.
     cells = reading.cells if source.force is None else stillness.without_rotation(reading.cells)
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
@@ -250,17 +250,17 @@ def _with_shorter_cells(
     """
     Reduce a source of slow samples in shorter cells; None if cells of the usual length suffice.
 
-    `share`: the part of the bag at rest in cells of the usual length. Slow samples make these
-    cells so long that a bias which changes within minutes looks like a motion, and that short
-    rests are lost.
+    `share`: the part of the bag at rest in cells of the usual length. Slow samples make cells so
+    long that a bias which changes within minutes looks like a motion, and that short rests are
+    lost.
     """
     if share < 0.95 and source.force is None:
-        # The rests are interrupted: shorter cells must add 5 % of the bag.
+        # For interrupted rests: shorter cells are used if they add 5 % of the bag.
         shorter = reduced(least=10)
         if shorter.n_still_cells / shorter.n_cells > share + 0.05:
             return shorter
     if share < 0.5:
-        # The rests are short: shorter cells must show six attitudes.
+        # For short rests: shorter cells are used if they show six attitudes.
         shorter = reduced(least=5)
         means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
         means = means.reshape(-1, 3)
@@ -339,7 +339,6 @@ def _windows(
 ) -> StillInterval:
     """Average the cells of a still interval to windows of `per_window` cells."""
     n_whole, rest = divmod(upper - lower, per_window)
-    # A remainder below half a window is dropped.
     end = upper - rest if n_whole and 2 * rest < per_window else upper
     rows = slice(lower, end)
     offsets = np.arange(0, end - lower, per_window)

@@ -115,7 +115,7 @@ class Point:
         """-2 times the log density of the state, without the constants of the prior."""
         size = float(self.precision @ self.away**2)
         if self.prior.informative is not None:
-            # The precision of the unit's unknowns is 0 in the diagonal form.
+            # With an informative prior the diagonal `precision` is 0 for the unit's unknowns.
             root = self.prior.informative.root
             size += float(np.sum((root @ self.away[: self.layout.n_unit]) ** 2))
         if self._has_common_start:
@@ -135,14 +135,14 @@ class Point:
     def _common_variance(self) -> float:
         """
         Prior variance of the sum over the bags of an initial lag state. The sd of the mean over
-        the bags is 0.1 of the sd of one bag: a non-zero mean is a response of the unit, which
-        other initial states would show as well.
+        the bags is 0.1 of the sd of one bag: a mean that is not 0 is an effect of the unit, not of
+        the bags' initial states.
         """
         return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_share
 
     @cached_property
     def reduced(self) -> Reduced:
-        """The normal equations of the unit, those of positions and bags eliminated."""
+        """The normal equations of the unit, with the unknowns of positions and bags eliminated."""
         return self._reduced(self.normal)
 
     @property

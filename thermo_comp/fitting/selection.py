@@ -146,9 +146,9 @@ class Growth:
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
         """Fit a model with further groups, and then the same model with bends."""
-        more = tuple(group for group in groups if group in self.free)
-        typical = self._typical(before, more, self._candidates.typical)
-        smooth = self.extended(before, more, typical)
+        added = tuple(group for group in groups if group in self.free)
+        typical = self._typical(before, added, self._candidates.typical)
+        smooth = self.extended(before, added, typical)
         return [smooth, *(self.trials(smooth, [BEND]) if BEND in self.free else [])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
@@ -197,7 +197,6 @@ class Growth:
         likely.sort(key=gains.__getitem__, reverse=True)
         tried = likely[:3]
         if chosen.groups == (CURVE,) and (SET,) in likely[3:]:
-            # The paper's two sets are always tried.
             tried.append((SET,))
         return [
             self.extended(chosen, groups, self._typical(chosen, groups, typical))
@@ -221,16 +220,15 @@ class Growth:
 
 def better_beginning(fits: Sequence[Trial]) -> Trial:
     """
-    Choose between fits begun with small and with large mountings: the one better on left-out data.
-
-    If neither is better, the large mountings must be likelier by `TRIAL_GAIN`. Both fits explain
-    the norms of few positions, one by mounting offsets, the other by misalignments; only
-    misalignments predict the norm of another position.
+    Choose the fit that is better on left-out data: begun with a small or with a large prior sd of
+    mounting offsets. If neither is better, the large sd must be likelier by `TRIAL_GAIN`. Both
+    fits explain the norms of few positions, one by mounting offsets, the other by misalignments;
+    only misalignments predict the norm of another position.
     """
     small, *others = fits
     for large in others:
-        more = log_density(large.posterior) - log_density(small.posterior)
-        is_likelier = more > TRIAL_GAIN and not is_better(large.score, small.score)
+        evidence_gain = log_density(large.posterior) - log_density(small.posterior)
+        is_likelier = evidence_gain > TRIAL_GAIN and not is_better(large.score, small.score)
         if is_likelier or is_better(small.score, large.score):
             return large
     return small
@@ -254,7 +252,8 @@ def select(
 ) -> Selected:
     """Choose the groups of columns by left-out data, and fit them."""
     growth = Growth(regression, candidates)
-    # Without a curve the drift is attributed to mountings or to noise: begin from both priors.
+    # Without a curve the drift is attributed to mountings or to noise: begin from a small and from
+    # a large prior sd of mounting offsets.
     priors = [prior]
     if prior.offset_scale > 0.0:
         priors.append(replace(prior, offset_sd=float(prior.sigma.mean())))
@@ -274,8 +273,8 @@ def select(
     if PART in growth.free:
         # Curves over the temperatures of parts take the place of the curve over that of the board.
         parts = better_beginning([growth.extended(fit, (PART,)) for fit in fits])
-    chosen, more = _grown(growth, first, parts, progress)
-    trials += more
+    chosen, tried = _grown(growth, first, parts, progress)
+    trials += tried
     if chosen is not constants and not is_better(constants.score, chosen.score):
         more_evidence = chosen.posterior.log_evidence - constants.posterior.log_evidence
         if not is_undecided(constants.score, chosen.score) or more_evidence < TRIAL_GAIN:
@@ -297,11 +296,11 @@ def _grown(
         trials = [parts, *growth.trials(parts, [BEND] if BEND in growth.free else [])]
         chosen = _best(chosen, trials)
     if growth.regression.windows.has_part_lags and not _is_complete(chosen):
-        more = growth.with_bends(first, PART_SUMS)
-        trials += more
-        chosen = _best(chosen, more)
-    chosen, more = growth.added(chosen, progress)
-    trials += more
+        tried = growth.with_bends(first, PART_SUMS)
+        trials += tried
+        chosen = _best(chosen, tried)
+    chosen, tried = growth.added(chosen, progress)
+    trials += tried
     is_without_bends = BEND in growth.free and BEND not in chosen.groups
     if is_without_bends and not _is_complete(chosen):
         # A change of slope of a part is visible only in a model with the lag of this part, not in
@@ -309,8 +308,8 @@ def _grown(
         # its drift is less than three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
-            last, more = growth.added(with_bends[0], progress)
-            trials += [*with_bends, *more]
+            last, tried = growth.added(with_bends[0], progress)
+            trials += [*with_bends, *tried]
             if is_better(chosen.score, last.score):
                 chosen = last
     return chosen, trials

@@ -4,7 +4,7 @@
 Owns the settings of thermometers and detector estimated from the bags, and the thermal states.
 
 Rates are central differences over two minutes, which need a recording. The causal thermometers and
-the detector get the noise, lag and ramps of this chamber.
+the detector get the noise, lag and ramps of the recorded test.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ def learn_thermometer(
     if not with_ramps:
         return replace(base, noise_sd_c=noise, quantum_c=quantum)
     fastest = max(course.fastest for course in with_ramps)
-    # At the beginning of a ramp the lagged temperature has the second derivative ramp / lag. This
-    # derivative is estimated from the difference of two rates one minute apart.
+    # At the beginning of a ramp the lagged temperature has the second derivative ramp / lag. The
+    # second derivative is estimated from the difference of two rates one minute apart.
     lags = []
     for course in with_ramps:
         bend = np.abs(course.rate[_BINS_PER_SIDE:] - course.rate[:-_BINS_PER_SIDE])
@@ -183,15 +183,15 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
     for name in sensors:
         rate, gradient = [np.zeros(0)], [np.zeros(0)]
         for bag in bags:
-            board, other = bag.board, bag.temperatures.get(name, Readings())
-            if min(len(board.value), len(other.value)) < 30:
+            board, sensor = bag.board, bag.temperatures.get(name, Readings())
+            if min(len(board.value), len(sensor.value)) < 30:
                 continue
-            first = max(board.stamp_ns[0], other.stamp_ns[0])
-            last = min(board.stamp_ns[-1], other.stamp_ns[-1])
+            first = max(board.stamp_ns[0], sensor.stamp_ns[0])
+            last = min(board.stamp_ns[-1], sensor.stamp_ns[-1])
             grid = np.arange(0.0, (last - first) * 1e-9, 60.0)
             at, beside = (
                 np.interp(grid, (readings.stamp_ns - first) * 1e-9, readings.value)
-                for readings in (board, other)
+                for readings in (board, sensor)
             )
             if len(grid) > 2:
                 rate.append(np.gradient(at, 60.0))

@@ -9,10 +9,11 @@ the regression.
 
 The noise is white plus exponentially correlated (first-order Gauss-Markov). Within a position the
 error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a
-stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std
-952, Annex B.4.3); a random walk is its limit for a long T. The innovations of its Kalman filter,
-divided by their standard deviations, are white and carry the same information, so samples and
-columns that are filtered alike can be treated by ordinary least squares [1]_.
+stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std 952,
+Annex B.4.3); a random walk is its limit for a long T. The innovations of a Kalman filter for white
+plus Gauss-Markov noise, divided by their standard deviations, are white and contain the same
+information, so samples and columns that are filtered alike can be treated by ordinary least
+squares [1]_.
 
 References
 ----------
@@ -96,8 +97,8 @@ class Whitener:
             level *= decay[k][:, None]
             innovation = series[rows] - level
             level += gain[k][:, None] * innovation
-            there = self._is_there[k]
-            result[rows[there]] = (innovation / root[k][:, None])[there]
+            is_present = self._is_there[k]
+            result[rows[is_present]] = (innovation / root[k][:, None])[is_present]
         return result
 
     def log_determinant(self, gains: tuple[Floats, Floats, Floats]) -> float:
@@ -136,7 +137,7 @@ class Whitener:
         level, variance = np.zeros((*shape, 3)), np.broadcast_to(ratio, shape)
         square, size = np.zeros((len(noises), 3)), np.zeros(len(noises))
         for k, rows in enumerate(self._row):
-            there = self._is_there[k]
+            is_present = self._is_there[k]
             decay = np.exp(-self._interval[k] / time_s)
             if k:
                 variance = ratio + decay**2 * (variance - ratio)
@@ -146,8 +147,8 @@ class Whitener:
             gain = variance / total
             level = level + gain[:, :, None] * innovation
             variance = variance * (1.0 - gain)
-            square += np.sum((innovation**2 / total[:, :, None])[:, there], axis=1)
-            size += np.log(total[:, there]).sum(axis=1)
+            square += np.sum((innovation**2 / total[:, :, None])[:, is_present], axis=1)
+            size += np.log(total[:, is_present]).sum(axis=1)
         spread = np.log(np.maximum(square, 1e-300) / self._n).sum(axis=1)
         return np.asarray(3.0 * size + self._n * spread)
 
@@ -250,7 +251,7 @@ class Series:
         values, vectors = np.linalg.eigh(windows.start_covariance)
         # The initial lag states are strongly correlated: few components have nearly all variance.
         kept = values > 1e-6 * values.max(initial=0.0)
-        #: Initial lag states are this times standardised components, shape (n_lags, r).
+        #: Root of the prior covariance of the initial lag states, shape (n_lags, r).
         self.start_root = vectors[:, kept] * np.sqrt(values[kept])
         self._first = windows.edges[:-1]
         self.level = self._averaged(self.measured)
@@ -335,6 +336,8 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Do the same in products of the base series, shape (n_positions, n_base, n_base)."""
+        """
+        Apply `at_starts` to products of the base series, shape (n_positions, n_base, n_base).
+        """
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

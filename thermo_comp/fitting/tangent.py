@@ -16,10 +16,10 @@ class Normal(NamedTuple):
     """
     Normal equations of each axis without any prior, in the order of `Tangent`.
 
-    local: those of the unknowns of positions and bags, with all unknowns and with the residual,
-        shape (n_positions, 3, n_local, k + 1)
-    unit: those of the unknowns of the unit and of the residual with each other, sum over the
-        positions, shape (3, n, n)
+    local: products of the derivatives by the unknowns of positions and bags with all derivatives
+        and the residual, shape (n_positions, 3, n_local, k + 1)
+    unit: products of the derivatives by the unknowns of the unit and of the residual with each
+        other, sum over the positions, shape (3, n, n)
     """
 
     local: Floats
@@ -96,13 +96,13 @@ class Tangent:
         """Return the normal equations of some unknowns, (n_positions, 3, m, k + 1)."""
         n, series = products.shape[-1], self.place[unknowns]
         base, combined = np.flatnonzero(series < n), np.flatnonzero(series >= n)
-        every = np.empty((*turned.shape[:2], len(series), n + turned.shape[-1]))
+        by_series = np.empty((*turned.shape[:2], len(series), n + turned.shape[-1]))
         of_combined = self.combined[..., series[combined] - n]
-        every[:, :, base, :n] = products[:, None, series[base]]
-        every[:, :, base, n:] = turned[:, :, series[base]]
-        every[:, :, combined, :n] = np.swapaxes(turned[..., series[combined] - n], 2, 3)
-        every[:, :, combined, n:] = np.swapaxes(of_combined, 2, 3) @ turned
-        result = every.take(self.place, axis=3)
+        by_series[:, :, base, :n] = products[:, None, series[base]]
+        by_series[:, :, base, n:] = turned[:, :, series[base]]
+        by_series[:, :, combined, :n] = np.swapaxes(turned[..., series[combined] - n], 2, 3)
+        by_series[:, :, combined, n:] = np.swapaxes(of_combined, 2, 3) @ turned
+        result = by_series.take(self.place, axis=3)
         result *= self.factor[:, :, unknowns, None]
         result *= self.factor[:, :, None]
         return np.asarray(result)
@@ -120,5 +120,5 @@ class Tangent:
         """
         combined = rows[:, None] @ self.combined
         of_base = np.broadcast_to(rows[:, None], (*combined.shape[:3], rows.shape[2]))
-        every = np.concatenate((of_base, combined), axis=3)
-        return np.asarray(every[..., self.place] * self.factor[:, :, None])
+        by_series = np.concatenate((of_base, combined), axis=3)
+        return np.asarray(by_series[..., self.place] * self.factor[:, :, None])

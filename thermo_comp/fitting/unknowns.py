@@ -84,8 +84,8 @@ class Windows:
         Prior sd of the weights of each axis over that of their column, shape (3, m); 1e-6 for a
         weight that the column does not have.
         """
-        every = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
-        return np.where(every.T, 1.0, 1e-6)
+        acts = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
+        return np.where(acts.T, 1.0, 1e-6)
 
     @cached_property
     def has_drifts(self) -> bool:
@@ -178,8 +178,8 @@ class Prior:
     start_share: variance of the initial lag states over that of the run-time prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
         inactive one, shape (2 k,)
-    informative: replaces the above for the unit's parameters; column_sd then only gives the active
-        columns
+    informative: replaces all other sd of the unit's parameters; column_sd then only gives the
+        active columns
     """
 
     bias_mean: Floats
@@ -240,7 +240,7 @@ class State:
 @dataclass(frozen=True)
 class Layout:
     """
-    Places of the unknowns in the vector of parameters; those of the unit come first.
+    Places of the unknowns in the vector of parameters; the unknowns of the unit come first.
 
     axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
     weights, nonlinear: shapes (2, 3, m) and (3, 2 k); -1 for an inactive unknown
@@ -318,14 +318,14 @@ def lay_out(
     bag_of_position: Ints,
     n_tilts: int,
     n_starts: int,
-    bends: Bools,
+    active: Bools,
     forces: Forces | None = None,
 ) -> Layout:
     """
     Assign a place to every unknown.
 
-    `used`: active columns of bias and scale, shape (2, m); `bends`: active nonlinear coefficients,
-    shape (2 k,)
+    `used`, `active`: active columns of bias and scale, shape (2, m), and active nonlinear
+    coefficients, shape (2 k,)
     """
     n = 0
 
@@ -336,11 +336,11 @@ def lay_out(
         return np.arange(n - size, n).reshape(shape)
 
     n_linear = 2 + int(used.sum())
-    axis = take(3, n_linear + int(bends.sum()))
+    axis = take(3, n_linear + int(active.sum()))
     weights = np.full((2, 3, used.shape[1]), -1)
     weights.transpose(1, 0, 2)[:, used] = axis[:, 2:n_linear]
-    nonlinear = np.full((3, len(bends)), -1)
-    nonlinear[:, bends] = axis[:, n_linear:]
+    nonlinear = np.full((3, len(active)), -1)
+    nonlinear[:, active] = axis[:, n_linear:]
     radius = take(int(forces is not None and forces.radius_sd > 0.0))
     misalignment = take(3)
     n_unit = n

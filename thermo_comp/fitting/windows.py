@@ -29,8 +29,8 @@ from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
 from .unknowns import Windows
 
-#: Groups of the columns of the curve, of the difference of the sets, of bends, and of the curves
-#: over the temperatures of parts.
+#: Groups of columns: the curve, the difference of the sets, bends (changes of slope at a
+#: temperature), and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
 #: Groups whose columns, with those of the curve, are summed in a curve over a part's temperature.
 PART_SUMS = ('board', 'product', 'square')
@@ -304,14 +304,14 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    # Hysteresis and bends of the scale are not modelled, and it has no level of the dynamic set:
-    # Fc = 1 at the reference temperature in both regimes.
+    # The scale has no hysteresis, no bends and no level of the dynamic set: Fc = 1 at the
+    # reference temperature in both regimes.
     in_scale = [*[True] * n_curves, *(column.term.has_scale for column in columns)]
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
     lag = np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64)
     of_part = rows.columns @ curves.sums.T
-    # All columns of a curve that depend on a lag depend on that of the part.
+    # The columns of a curve over a part's temperature have at most one lag, that of the part.
     lag_of_part = np.where(curves.sums != 0.0, lag, -1).max(axis=1, initial=-1)
     return Windows(
         position=position,
@@ -359,7 +359,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
     steepest = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
-    # The level of the dynamic set corresponds to the RMS gradient, which also differs in ramps.
+    # The level of the dynamic set is an effect of ramps, so it corresponds to the RMS gradient.
     steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)

@@ -101,12 +101,12 @@ def fit_fleet(
         rows = fitted(units, options)
         prior, no_prior = _common(list(rows.values()), results)
         if with_prior and prior is not None:
-            rest = [
+            others = [
                 unit
                 for unit in units
-                if not _speaks(row := rows[unit.name]) and row['verdict'] != FAILED
+                if not _in_prior(row := rows[unit.name]) and row['verdict'] != FAILED
             ]
-            again = fitted(rest, replace(options, fit=replace(options.fit, prior=prior)))
+            again = fitted(others, replace(options, fit=replace(options.fit, prior=prior)))
             for name, row in again.items():
                 notes = rows[name]['reservations'], f'not fitted with the prior: {row["problem"]}'
                 kept = {'reservations': '; '.join(map(str, filter(None, notes)))}
@@ -129,15 +129,15 @@ def _require_packages() -> None:
             )
 
 
-def _speaks(row: Row) -> bool:
+def _in_prior(row: Row) -> bool:
     """Whether a unit may contribute to the prior: data complete, calibration valid."""
     return is_valid(row) and row['is_whole'] == 1
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
     """Build the prior from the valid units; otherwise return the reason why there is none."""
-    # Of a unit that was tested twice only the later test is used.
-    tests = sorted((row for row in rows if _speaks(row)), key=lambda row: str(row['start']))
+    # If a unit was tested twice, only the later test is used.
+    tests = sorted((row for row in rows if _in_prior(row)), key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}
     if len(latest) < UNITS_NEEDED:
         return None, f'{len(latest)} units with complete data, {UNITS_NEEDED} are needed'
@@ -184,7 +184,7 @@ def render_fleet(
         ),
     )
     # With few units the spread is not known.
-    can_tell = np.isfinite(summary.limit)
+    is_comparable = np.isfinite(summary.limit)
     return render(
         'fleet.html',
         title='Fleet report',
@@ -194,8 +194,8 @@ def render_fleet(
         summary=summary,
         n_fitted=len(fitted),
         refused=[row for row in rows if not is_fitted(row)],
-        can_tell=can_tell,
-        figures=drawn_figures([shares] * bool(fitted) + [distances] * bool(can_tell)),
+        is_comparable=is_comparable,
+        figures=drawn_figures([shares] * bool(fitted) + [distances] * bool(is_comparable)),
         links={row['name']: quote(certificate_of(row)) for row in fitted},
     )
 

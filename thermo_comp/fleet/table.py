@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import ThermoCompError
 from ..files import CSV, PARQUET, write_atomically
 from ..fitting import FitResult
-from ..fitting.data_checks import can_tell_misalignment
+from ..fitting.data_checks import determines_misalignment
 from ..judging.judgement import Judgement
 from ..judging.verdicts import Verdict
 from ..text import one_line
@@ -179,7 +179,7 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
         'n_positions': len(result.positions),
         'n_samples': sum(bag.n_samples for bag in bags),
         'model': calibration.provenance.model,
-        'is_whole': int(can_tell_misalignment(up) and not _LACKS & lacking),
+        'is_whole': int(determines_misalignment(up) and not _LACKS & lacking),
         'start': start.strftime('%Y-%m-%dT%H:%M:%SZ'),
         'hours': sum(bag.end_ns - bag.start_ns for bag in bags) * 1e-9 / 3600.0,
         'gravity_m_s2': calibration.gravity_m_s2,

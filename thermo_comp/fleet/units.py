@@ -87,11 +87,11 @@ class Storage:
             yield Path(self._root, name)
             return
         with tempfile.TemporaryDirectory(prefix='thermo_comp-') as scratch:
-            there, copies = (
+            sources, copies = (
                 [f'{root}/{file.name}' for file in files] for root in (self._root, scratch)
             )
             try:
-                self._fs.get(there, copies)
+                self._fs.get(sources, copies)
             except Exception as error:  # each file system has different exceptions
                 raise OSError(errno.EIO, words(error)) from error
             yield Path(scratch, name)

@@ -180,8 +180,8 @@ class Drift:
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
-    Sort the calibrations of the first calibration's unit by date. Of calibrations fitted on the
-    same bags only the first is kept: two models of the same data are no history.
+    Sort the calibrations of the first calibration's unit by date. If several calibrations were
+    fitted on the same bags, only the first is kept: two models of the same data are no history.
     """
     known: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []

@@ -65,12 +65,12 @@ class Judgement:
 
     @property
     def is_valid(self) -> bool:
-        """Whether the calibration was shown to hold."""
+        """Whether the calibration was found valid."""
         return self.kind.is_valid
 
     @property
     def exit_code(self) -> int:
-        """0 for a calibration that was shown to hold, unless its gyroscope does not; else 1."""
+        """0 for a valid calibration whose gyroscope, if any, is not refuted; else 1."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 
@@ -122,8 +122,8 @@ def judge(
 ) -> Judgement:
     """
     Judge a calibration by its windows; windows of the fit's bags (`is_seen`) by the RMS on
-    positions left out. If a `tolerance` on the RMS
-    [m/s^2] is given, it decides instead of the claim.
+    positions left out. If a `tolerance` on the RMS [m/s^2] is given, the tolerance decides instead
+    of the claimed sd.
     """
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)
@@ -157,7 +157,7 @@ def _verdict(judgement: Judgement, claims: bool, is_thermal: bool) -> tuple[Verd
         return Verdict.OUTSIDE, text
     worst = max([s.rms for s in sections.regimes or [full]] + [judgement.headline_rms])
     ratio = sections.worst_ratio
-    # Without a claim the value is NaN, and the comparison false.
+    # Without a claimed sd `claimed_rms` is NaN, and the comparison false.
     is_wide = full.claimed_rms > (tolerance or min(verdicts.WIDE_PART * full.raw_rms, _WIDE_CLAIM))
     if windows.is_swapped.any():
         kind = Verdict.SWAPPED

@@ -16,7 +16,7 @@ from ..unit.prediction import SlowUncertainty
 from ..unit.rate_bias import MILLIDEGREE
 from .windows import Windows, means_by
 
-#: Largest ratio of RMS error to claimed RMS at which a calibration holds.
+#: Largest ratio of RMS error to claimed RMS at which a calibration is valid.
 LARGEST_RATIO = 2.0
 #: Ratio of claimed RMS to raw RMS above which a valid calibration is called wide.
 WIDE_PART = 0.5
@@ -41,7 +41,7 @@ class Verdict(Enum):
 
     @property
     def is_valid(self) -> bool:
-        """Whether the calibration was shown to hold."""
+        """Whether the calibration was found valid."""
         return self in (Verdict.VALID, Verdict.WIDE)
 
 
@@ -162,16 +162,16 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
     if claims:
         # The claimed variance of the changes, from that of the rate of one message.
         correction = Correction(triad, Correction(calibration).memory)
-        whole, away = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
+        bias, change = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
         slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
         # The errors by thermometer noise and unseen starts of lags nearly vanish in a rest's mean.
-        rest = np.maximum(variance - np.array(correction.noise) - slow - whole, 0.0)
+        of_thermometers = np.maximum(variance - np.array(correction.noise) - slow - bias, 0.0)
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
         hours = counts[:, None] * windows.window_s / 3600.0
         # Variance of a random walk about its mean over a time: 1/6 of the variance gained in it.
         walk = np.square(triad.slow_noise_m_s2_sqrt_h) * hours / 6.0
-        claimed = np.sqrt(rest + away + noise + walk)
+        claimed = np.sqrt(of_thermometers + change + noise + walk)
     changes = np.stack((raw - mean_of(raw), corrected - mean_of(corrected), claimed))
     is_judged = counts > 1
     sections = sections_of(windows.select(is_judged), *changes[:, is_judged])
@@ -180,23 +180,23 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
 
 
 def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict, str]:
-    whole, outside = sections['all'], sections['outside']
-    if not whole.n:
+    total, outside = sections['all'], sections['outside']
+    if not total.n:
         return Verdict.OUTSIDE, f'{outside.n} windows of {window_s:g} s lie there'
-    text = f'{_mdeg(whole.rms)} RMS of its changes at rest, {_mdeg(whole.raw_rms)} raw'
-    over = f'over {whole.n} windows of {window_s:g} s'
+    text = f'{_mdeg(total.rms)} RMS of its changes at rest, {_mdeg(total.raw_rms)} raw'
+    over = f'over {total.n} windows of {window_s:g} s'
     if not claims:
-        kind = Verdict.NO_BETTER if whole.rms > whole.raw_rms else Verdict.NO_CLAIM
+        kind = Verdict.NO_BETTER if total.rms > total.raw_rms else Verdict.NO_CLAIM
         return kind, f'{text} {over}; the calibration states no uncertainty'
     ratio = sections.worst_ratio
     text = (
-        f'{text}, {_mdeg(whole.claimed_rms)} claimed {over}; '
+        f'{text}, {_mdeg(total.claimed_rms)} claimed {over}; '
         f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
     )
     # At constant temperature the correction is constant: a residual equal to raw is no fault.
     if ratio > LARGEST_RATIO:
-        return Verdict.NO_BETTER if whole.rms >= whole.raw_rms else Verdict.RECALIBRATE, text
-    return Verdict.WIDE if whole.claimed_rms > WIDE_PART * whole.raw_rms else Verdict.VALID, text
+        return Verdict.NO_BETTER if total.rms >= total.raw_rms else Verdict.RECALIBRATE, text
+    return Verdict.WIDE if total.claimed_rms > WIDE_PART * total.raw_rms else Verdict.VALID, text
 
 
 def _mdeg(rate: float) -> str:

@@ -194,7 +194,7 @@ _TRIPLES = ('mean', 'force')
 
 
 def _is_seen(calibration: Calibration | None, size: Floats, gravity: float) -> Bools:
-    """Whether the calibration holds at each |f|."""
+    """Whether each |f| is within the calibrated forces."""
     if calibration is None:
         return np.ones(len(size), dtype=bool)
     known = calibration.nonlinearity

@@ -121,7 +121,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # The queue is full: apply its old readings, as the node does; before any sample, all.
+            # A full queue applies its old readings, as in the node; after a first sample only
+            # those before the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

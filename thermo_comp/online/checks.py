@@ -47,7 +47,7 @@ REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
 #: Time at rest after a step of |f| from rest, after which the step is judged [ns].
 STEP_NS: Final = 300_000_000
-#: A residual refutes beyond the tolerance and this number of its standard deviations.
+#: A residual above the tolerance and above this number of its sd refutes the calibration.
 REFUTING_SIGMAS: Final = 5.0
 
 
@@ -123,7 +123,7 @@ class RateCheck:
             self._level = 0.0
             self.is_too_fast = False
         else:
-            # At most twice the allowance, so that the alarm ends soon after a long excess.
+            # Count up to twice the allowance, so that the alarm ends soon after a long excess.
             self._level = min(level, 2.0 * self._allowance)
             self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
@@ -222,7 +222,8 @@ class GravityCheck:
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
         scatter = math.fsum(squares) / (n - 1)
         last, self._last_mean = self._last_mean, mean
-        # The means of two windows differ by noise, too: allow four standard deviations of it.
+        # The means of two windows differ by noise, too: allow four standard deviations of this
+        # noise.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
         is_still = (
             scatter <= SCATTER_FACTOR**2 * noise_variance

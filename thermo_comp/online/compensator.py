@@ -270,8 +270,8 @@ class Compensator:
         """
         Build a compensator that continues from the last sample with another model or settings.
 
-        Thermometers, regime and memory are kept as far as the new model has the same. This
-        compensator does not change, so a failure has no effect; only one of the two may continue.
+        Thermometers, regime and memory are kept as far as the new model has the same. The original
+        does not change, so a failure has no effect; only one of the two compensators may continue.
         """
         new = copy(self)
         new.take_over(model, config)

@@ -206,7 +206,8 @@ class ThermalSide:
             self._slow_key = key
             shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)
             if self.is_unmeasured:
-                # The uncertainty of the weights is taken one sd away from the reference.
+                # Without a reading, evaluate the variance one sd of the temperature from the
+                # reference.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             self._slow = [v for part in self.model.uncertainty for v in part.at(end_state, shares)]
         return self._slow

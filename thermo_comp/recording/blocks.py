@@ -254,7 +254,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     Give readings without a stamp the stamp of the sample before them (`last_ns` before the block);
     return the block and its newest stamp. Readings before any sample are dropped.
 
-    The node does the same: the samples' clock does not depend on the speed of a playback.
+    Node and reader use the samples' clock, as it does not depend on the speed of a playback.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1

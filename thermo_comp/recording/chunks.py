@@ -189,8 +189,8 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
 
 def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
     """
-    Read complete records one by one; return the messages and the reason why reading stopped. If
-    zeros follow the last message, it is dropped: its last bytes may be zeros, too.
+    Read complete records one by one; return the messages and the reason why reading stopped. A
+    last message before zeros is dropped: the zeros may have replaced its last bytes.
     """
     view = data.data
     places: list[int] = []

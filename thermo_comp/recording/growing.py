@@ -25,7 +25,7 @@ from .topics import Topics
 from .writer import BagWriter
 
 _USUAL = Topics()
-_CHUNK_BYTES = 1 << 17  # data lost if the process is killed: half a minute at 100 Hz
+_CHUNK_BYTES = 1 << 17  # lost if the process is killed [bytes]: half a minute at 100 Hz
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: Hidden name of a bag that is being written: its number and the process number.

@@ -200,7 +200,8 @@ class McapFile(BagFile):
                     raise DamagedError(f'the record at byte {at} is not whole')
                 words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
-                    # Add the zeros that follow the span: its own last bytes may be zeros, too.
+                    # Add the zeros that follow the span: they may have replaced bytes of its last
+                    # message.
                     kind = last.kind if last.kind == 'loose' else 'torn'
                     spans[-1] = replace(last, length=last.length + PREFIX.size, kind=kind)
                 elif opcode == Opcode.CHUNK:

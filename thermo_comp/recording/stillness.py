@@ -147,7 +147,7 @@ class CellAccumulator:
     def finish(self) -> Cells:
         """Return all cells so far, including the open one."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # so that the next call joins only new sums
+        self._sums = [sums]  # the next call then joins only new sums
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)
@@ -285,7 +285,7 @@ def still_runs(
         quiet = believable & (cells.variance <= ratio * noise + by_drift).all(axis=1)
         roughest = roughest_at_rest(cells, quiet, wider > 1.0, ratio)
         quiet &= (cells.roughness <= roughest).all(axis=1)
-        # Noise of this roughness changes between two cells by at most `_STEP_SDS` sd.
+        # Noise of the roughness `roughest` changes between cells by at most `_STEP_SDS` sd.
         is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
         broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
         # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.
@@ -364,7 +364,9 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, believable: Bools) -> Floats:
-    """Return the drift in the step after each cell: the common step around, shape (n - 1, 3)."""
+    """
+    Return the drift in the step after each cell: the median step around it, shape (n - 1, 3).
+    """
     both = believable[1:] & believable[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2

@@ -24,7 +24,8 @@ from .blocks import Input, Role
 PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {key: topic.type for key, topic in INPUTS.items()}
-#: Name of a driver's topic in REP 145 and of the node's output; the bag's other topics show which.
+#: Name of a driver's topic in REP 145 and of the node's output; the bag's other topics show which
+#: of both.
 _RAW = IMU_OUT.name
 #: Words in the names of vector topics that are not a specific force.
 _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')

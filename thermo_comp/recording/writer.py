@@ -41,7 +41,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
     """
     Write a bag, ``*.mcap`` or a rosbag2 directory; use it as a context manager.
 
-    Messages are buffered until `flush`, which merges all topics in log-time order, or 64 MiB. An
+    Messages are buffered until 64 MiB or `flush`, and then merged in log-time order. An
     `is_precious` bag that cannot be finished is kept. A killed process leaves a torn bag in a
     hidden file beside the target. Raises OutputError if the bag may not or cannot be written;
     ValueError for wrong shapes and for times outside the range of ROS stamps.

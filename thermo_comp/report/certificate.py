@@ -44,8 +44,8 @@ class StateResult(NamedTuple):
     """
     One axis in a soak or a ramp at one temperature of the board.
 
-    Each deviation is that of the preceding value from a straight line over temperature. The line
-    passes through the value in a soak at the reference temperature and has the slope of the soak.
+    Each deviation is that of the preceding value from the straight line over temperature that
+    passes through the value in a soak at the reference temperature, with the slope of the soak.
     """
 
     program: str
@@ -83,7 +83,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
         model = float(np.sqrt(max(claimed**2 - noise**2 - attitude**2, 0.0)))
-    rest = float(np.sqrt(max(judgement.headline_rms**2 - claimed**2, 0.0)))
+    excess = float(np.sqrt(max(judgement.headline_rms**2 - claimed**2, 0.0)))
     drift_k, drift, slope = info.thermometers.standard_uncertainty_k, None, ''
     if drift_k is not None:
         drift = drift_k * _slope(calibration)
@@ -99,7 +99,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
         Contribution('thermometers', 'B', drift, slope),
         Contribution('model', 'A', model, 'posterior of all parameters at the judged windows'),
-        Contribution('repeatability', 'A', rest, beyond),
+        Contribution('repeatability', 'A', excess, beyond),
     )
 
 
@@ -129,7 +129,6 @@ def results(
         return []
     unit = 'counts' if calibration.unit.input == 'counts' else 'm/s²'
     bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
-    # Without a covariance there is no uncertainty to expand.
     known = COVERAGE if calibration.has_uncertainty else np.nan
     scale_sd = np.hypot(scale_sd, _gravity_part(evidence, info)) * np.abs(scale)
     below = ((1, 0), (2, 0), (2, 1))

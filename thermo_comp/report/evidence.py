@@ -153,7 +153,7 @@ class Evidence:
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions, with the attitude that the judged rung sees."""
+        """The still positions, with the attitudes by the best correction of `forces`."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()

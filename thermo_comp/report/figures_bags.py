@@ -19,7 +19,7 @@ from .evidence import LEFT_OUT, RAW, Evidence, Position, given
 from .html import number
 from .trace import ShownBag
 
-# Time over which readings are averaged to the zero of the drift [s]; short compared with any ramp.
+# Time over which the readings that count as zero drift are averaged [s]; shorter than any ramp.
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].

@@ -99,7 +99,6 @@ def rounded(value: float, expanded: float) -> tuple[str, str]:
     place = 1 - math.floor(math.log10(expanded))
     if round(expanded, place) >= 10.0 ** (2 - place):  # 0.0996 is 0.10
         place -= 1
-    # Adding 0.0 turns -0.0 into 0.0.
     texts = (f'{round(x, place) + 0.0:.{max(place, 0)}f}' for x in (value, expanded))
     return minus(next(texts)), next(texts)
 

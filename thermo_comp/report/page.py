@@ -264,7 +264,7 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         yield (
             'Which bias of the angular rate is corrected?',
             of_unit.draw_rates,
-            'Bias of the gyroscope over temperature, in a soak and in ramps as above, less the '
+            'Bias of the gyroscope over temperature, in a soak and in ramps, less the '
             'value at the reference temperature and less a straight line, whose slope stands '
             'above each panel. Hatched: 95 % band, of the constant as well, which the Earth’s '
             'rate and the turn-on blur.',
@@ -289,14 +289,14 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             'Direction of the specific force in the output frame, position by position, in an '
             'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '
             'of elevation. An outlier was moved, or is not of this unit.',
-            'The area of a red ring is proportional to the residual there of a fit to the other '
-            'positions alone, which is the error expected in a new attitude.'
+            'The area of a red ring is proportional to the residual of this position in a fit to '
+            'the other positions alone, which is the error expected in a new attitude.'
             if evidence.left_out
-            else 'The area of a red ring is proportional to the residual there.'
+            else 'The area of a red ring is proportional to the residual of this position.'
             if evidence.residuals
             else '',
-            'Red cross: the direction with the largest uncertainty, and the standard deviation '
-            'of |f| there. A position recorded there would improve the calibration most.'
+            'Red cross: the direction with the largest standard deviation of |f|, which is given; '
+            'a position in this direction would improve the calibration most.'
             if evidence.least_known
             else '',
         )

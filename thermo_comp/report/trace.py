@@ -63,8 +63,8 @@ def widest(bags: Sequence[ReducedBag]) -> int:
     """Choose the bag to show: the widest in temperature, then the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
     # Spans within 5 %, and lengths within a minute, count as equal; take the first of equals.
-    wide = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
-    return max(wide, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
+    candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
+    return max(candidates, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
 
 
 def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownBag:

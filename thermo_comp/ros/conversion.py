@@ -3,10 +3,10 @@
 """
 Owns the conversion of serialized samples to serialized Imu messages, without rclpy's classes.
 
-Samples are read, and an Imu is written, at fixed offsets of their plain form, little-endian CDR:
-4 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with
-its final NUL, the string, and, at the next multiple of 8 from the end of the encapsulation,
-float64 values. A message in any other form is first converted to this form by rclpy.
+Samples are read, and an Imu is written, at fixed offsets of their plain form, little-endian CDR: 4
+bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with its
+final NUL, the string, and, at the next multiple of 8 from the end of the encapsulation, float64
+values. A message in any other form is first converted to the plain form by rclpy.
 """
 
 import struct
@@ -102,8 +102,8 @@ class SampleConverter:
     def _learn(self, data: bytes) -> bytes:
         """Note the offsets of a message of new layout; return its plain form, or empty bytes."""
         is_imu = self._kind is Imu
-        skip, rest = (_PASSED, 72) if is_imu else (0, 0)
-        size = skip + 24 + rest
+        skip, n_after = (_PASSED, 72) if is_imu else (0, 0)
+        size = skip + 24 + n_after
         given, (data, start) = data, _plain(data, size, self._kind)
         if not start:
             return b''
@@ -112,7 +112,7 @@ class SampleConverter:
         end = 16 + int.from_bytes(data[12:16], 'little')
         # The padding after the name may hold any bytes.
         self._name, gap = data[12:end], start - end + skip
-        self._unpack = struct.Struct(f'<4siI{len(self._name)}s{gap}x3d{rest}x').unpack
+        self._unpack = struct.Struct(f'<4siI{len(self._name)}s{gap}x3d{n_after}x').unpack
         frame = self._frame_id.encode() + b'\0' if self._frame_id else self._name[4:]
         self._frame = len(frame).to_bytes(4, 'little') + frame + bytes(-(12 + len(frame)) % 8)
         self._pack = struct.Struct(f'<4siI{len(self._frame)}s{_PASSED}s12d').pack

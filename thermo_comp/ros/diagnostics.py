@@ -102,7 +102,6 @@ class Reporter:
         if status.stamp_ns is not None and self._before_ns is not None:
             passed_s = (status.stamp_ns - self._before_ns) * 1e-9
             if passed_s > 0.0 and new['n_in'] and self._before['n_in']:
-                # The rate in samples per second, by the samples' stamps.
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
         findings = [*self._inputs(), *self._lost_rests()]

@@ -33,8 +33,8 @@ from .waitloop import WaitLoop, overrides
 NODE_NAME = 'thermo_comp'
 
 #: Pause after a wake-up, in which samples of 7 kHz or more gather [s], with best effort only. The
-#: pause saves a third of the CPU time at 10 kHz; at 5 kHz it would delay a sample longer than its
-#: relay.
+#: pause saves a third of the CPU time at 10 kHz; at 5 kHz it would delay a sample longer than the
+#: relaying itself.
 REST_S = 0.2e-3
 
 #: Time within which the process ends after a signal, even if a call hangs [s].
@@ -212,7 +212,7 @@ def main(args: list[str] | None = None) -> int:
         try:
             print(text, file=sys.stdout if is_help else sys.stderr, flush=True)
         except OSError as error:
-            # Otherwise the interpreter would try to flush again at its end.
+            # Replace stdout, which the interpreter would try to flush again at its end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0 if isinstance(error, BrokenPipeError) else _fail(error, 1)
         return 0 if is_help else 2

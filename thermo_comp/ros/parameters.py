@@ -5,7 +5,8 @@ Owns the node's parameters: their table, and the services that set them.
 
 The table is `NodeConfig`. The node runs with one immutable `NodeConfig`; a change makes a new one
 or is refused as a whole. A thread waits while a file is read; the loop then replaces one
-reference. Requests are answered in order of arrival, but a request without a file waits for none.
+reference. Requests are answered in order of arrival, but a request without a file does not wait
+for files.
 """
 
 import math
@@ -232,7 +233,7 @@ class ParameterRequests:
     ) -> None:
         self._loop, self._prepare, self._apply = loop, prepare, apply
         self._n_waiting = 0
-        # A request without a file waits for none.
+        # A request without a file does not wait for files.
         self._slow, self._quick = (ThreadPoolExecutor(1, 'parameters') for _ in range(2))
         for service in loop.node.services:
             if service.srv_type in (srv.SetParameters, srv.SetParametersAtomically):
@@ -284,9 +285,11 @@ class ParameterRequests:
     def _set(self, prepared: Future[Any], results: list[SetParametersResult]) -> None:
         """Apply one group; an unexpected error refuses it and is logged by the loop."""
         try:
-            changes, found = prepared.result()
+            changes, preparation = prepared.result()
             news = [change for change in changes if not self._is_in_force(change)]
-            result = self._apply(news, found) if news else SetParametersResult(successful=True)
+            result = (
+                self._apply(news, preparation) if news else SetParametersResult(successful=True)
+            )
             results.append(result if result.successful else _refusal(result.reason))
         except (ThermoCompError, ParameterNotDeclaredException) as error:
             results.append(_refusal(str(error)))

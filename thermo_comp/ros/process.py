@@ -81,5 +81,4 @@ class SignalWatch:
                 os._exit(0)
             number = os.read(self._reader, 1)
             if number:
-                # The second signal does not wait for an orderly end.
                 os._exit(128 + number[0])

@@ -140,8 +140,8 @@ class Reader:
         if self._is_closed:
             raise EOFError
         self._pipe, theirs = Pipe()
-        # The process has the package path of this process; Ctrl-C goes to the node only, which
-        # ends this process.
+        # The reading process gets the package path of the node's process; Ctrl-C only reaches the
+        # node, which ends the reading process.
         code = f'import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve'
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603 - fixed interpreter and arguments
@@ -165,7 +165,7 @@ def serve(handle: int, parent: int) -> None:
     os.nice(NICENESS)
     pipe = Connection(handle)
     with suppress(AttributeError, OSError):
-        # This process is killed with the node, even while a file hangs.
+        # The kernel kills the reading process when the node ends, even while a file hangs.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         return

@@ -77,7 +77,7 @@ class Sources:
         """Return the index of the first message that is surely from the only active publisher."""
         was_contested, n_before, self._n_known = self.is_contested, self._n_known, n_known
         if n_known <= 1:
-            # The first messages afterwards may still be from the publisher that left.
+            # The first messages with one publisher may still be from a publisher that has left.
             self.is_contested, self._number = False, numbers[-1]
             return len(numbers) if was_contested else 0
         if n_known > n_before:
@@ -351,7 +351,7 @@ def own_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
         try:
             yield node
         finally:
-            # Otherwise the node's publishers live until the next garbage collection.
+            # Without this call the node's publishers live until the next garbage collection.
             node.destroy_node()
     finally:
         context.try_shutdown()

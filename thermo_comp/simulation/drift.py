@@ -90,8 +90,8 @@ class FlowEffect(Effect):
 
     With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent``: convection in a gap
     (1.25), the load of a heat pump (1), its losses (2); times the deviation of `cold` to the
-    `power`. If the pump's supply is limited, it saturates at 1, ``x^e / (1 + x^e)``. The second
-    signal is the first times the deviation of `cold`.
+    `power`. If the pump's supply is limited, the signal saturates at 1, ``x^e / (1 + x^e)``. The
+    second signal is the first times the deviation of `cold`.
     """
 
     hot: str
@@ -103,9 +103,9 @@ class FlowEffect(Effect):
 
     def _signals(self, history: PartHistory) -> tuple[Floats, Floats]:
         at = [history.nodes.index(part) for part in (self.hot, self.cold)]
-        rest = history.origin[at[:1]] - history.origin[at[1:]]
-        difference = history.deviation[:, at[0]] - history.deviation[:, at[1]] + rest
-        flow, least = ((np.abs(d) / self.knee) ** self.exponent for d in (difference, rest))
+        at_rest = history.origin[at[:1]] - history.origin[at[1:]]
+        difference = history.deviation[:, at[0]] - history.deviation[:, at[1]] + at_rest
+        flow, least = ((np.abs(d) / self.knee) ** self.exponent for d in (difference, at_rest))
         if self.is_limited:
             flow, least = flow / (1.0 + flow), least / (1.0 + least)
         first = (flow - least) * history.of(self.cold) ** self.power

@@ -25,7 +25,7 @@ _STEP_S = 1.0  # time over which convection is held constant [s]
 class Link:
     """
     Heat path between two parts, or a part and the chamber's air, `AIR`: W/K (at 1 K). The flow is
-    proportional to the difference to the power `exponent`, 1.25 for free convection.
+    proportional to the temperature difference to the power `exponent`, 1.25 for free convection.
     """
 
     a: str
@@ -101,8 +101,8 @@ class ThermalNetwork:
         for link in self.links:
             i, j = index[link.a], index[link.b]
             away = at[i] - at[j]
-            more = link.conductance * (abs(away) ** (link.exponent - 1.0) - 1.0) * away
-            flow[[i, j]] += -more, more
+            extra = link.conductance * (abs(away) ** (link.exponent - 1.0) - 1.0) * away
+            flow[[i, j]] += -extra, extra
         flow[: len(self.nodes)] /= list(self.capacity.values())
         return flow[:-1]
 
@@ -139,7 +139,7 @@ class ThermalResponse:
 
     `air` are the chamber's temperatures at the knots `time` [s], shape (m,); `power` is the
     dissipation between the knots in addition to the constant powers [W], shape (m - 1, n_parts).
-    At the start everything is on and in equilibrium.
+    At the start all powers are on, and all temperatures in equilibrium.
     """
 
     def __init__(
@@ -148,7 +148,6 @@ class ThermalResponse:
         self.network, self._time = network, time
         heat = network.thermostat
         if heat is not None:
-            # Index of the thermostat's integral.
             n = len(network.nodes)
             watts = [network.settled(float(a))[n] for a in (air.max(), air.min())]
             if watts[0] < 0.0 or watts[1] > heat.max_power:

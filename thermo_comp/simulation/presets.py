@@ -179,7 +179,7 @@ def _mems(draw: Specimen) -> UnitModel:
 
 
 def _demo(draw: Specimen) -> UnitModel:
-    """Draw the sample unit: tempcos on the board, the paper's loads, and a head that lags."""
+    """Draw the sample unit: tempcos on the board, `loads`, and a sensor head that lags."""
     # The time constants are short, as the unit must settle in the soaks of the sample bags.
     board_tau, tau = 0.25 * draw.between(400.0, 900.0), draw.between(500.0, 1500.0)
     capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau}

@@ -234,7 +234,6 @@ def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
     bias = np.array(unit.bias_at_reference) + bias_ug * unit.counts_per_micro_g
     none = np.empty(0)
     rate = none if unit.gyro is None else unit.gyro.bias(history)
-    # The fields of a single run are filled in later.
     return Truth(unit, response, grid, temperatures, bias, 1.0 + scale, rate, none, none, none)
 
 

@@ -55,7 +55,7 @@ class ChangeDetector:
         self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
         # Memory (1 / tracking frequency) of each filter [s]: the one that detects the filter's
         # acceleration soonest at readings of 1 Hz. The spectral density of the acceleration
-        # follows from this memory, and is used for any interval of readings.
+        # follows from the memory, and is used for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
         onset = smallest_rate / sensor.lag_s
         memories = [
@@ -107,7 +107,8 @@ class ChangeDetector:
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
         """
         Take the sensor's last used reading. The baseline follows the rate at a relative speed
-        `pace`: 1 in a soak, 0 in a ramp. Returns the sign of the departure from it, 0 = none.
+        `pace`: 1 in a soak, 0 in a ramp. Returns the sign of the rate's departure from the
+            baseline, 0 = none.
         """
         stamp = self._stamp_ns
         dt = 0.0 if stamp is None else (stamp_ns - stamp) * 1e-9

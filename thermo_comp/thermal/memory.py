@@ -12,8 +12,8 @@ series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighte
 two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 
 A part may also exchange heat with both the board and another part, at a sensor s: it lags the
-temperature ``T + v g`` between them, with ``g = T_s - T``. Its lag is that of the board less v
-times the lag of the gradient.
+temperature ``T + v g`` between them, with ``g = T_s - T``. The lag behind this temperature is that
+of the board less v times the lag of the gradient.
 """
 
 import math
@@ -86,7 +86,7 @@ class Lag(_Lag, Quantity):
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
-        # The variance of the sum, by the covariance of the single lags: see `start_covariance`.
+        # The variance of the sum of both single lags follows from `start_covariance`.
         second = exp(-age_s / self.second_tau_s)
         a, b = self.shares
         tau, tau_2 = self.tau_s, self.second_tau_s
@@ -158,8 +158,8 @@ def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
     D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0 for lags of different
     inputs. After the first reading the covariance decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
     """
-    every = [Lag(*lag) for lag in lags]
-    singles = _singles(every)
+    all_lags = [Lag(*lag) for lag in lags]
+    singles = _singles(all_lags)
     tau = np.array([tau for _, tau in singles])
     names = np.array([name for name, _ in singles])
     sd = np.where(names == BOARD_INPUT, BOARD_START_SD, GRADIENT_START_SD)
@@ -168,8 +168,8 @@ def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
     is_same = names[:, np.newaxis] == names
     shape[np.diag_indices_from(shape)] *= 1.0 + START_JITTER
     covariance = np.where(is_same, 2.0 / START_TAU_S * sd * sd * shape, 0.0)
-    shares = np.array([[lag.singles.get(single, 0.0) for single in singles] for lag in every])
-    shares = shares.reshape(len(every), len(singles))
+    shares = np.array([[lag.singles.get(single, 0.0) for single in singles] for lag in all_lags])
+    shares = shares.reshape(len(all_lags), len(singles))
     return np.asarray(shares @ covariance @ shares.T)
 
 
@@ -222,7 +222,7 @@ class LagBank:
         for variance, e, tau in zip(self.extra, decays, self.taus, strict=True):
             grown = variance
             if dt > SPARSE_SHARE * tau:
-                # The input may have changed at any time between readings this far apart.
+                # Between readings far apart, the time at which the input changed is unknown.
                 grown += (change * (1.0 - e)) ** 2
             if sd:
                 # The error is the same from step to step: deviations add, not variances.
@@ -360,9 +360,9 @@ class ThermalMemory:
         values, extra = self.board.at(stamp_ns, board)
         for name, gradient in zip(self.spec.sensors, gradients, strict=True):
             if (bank := self.banks[name]).taus:
-                lagging, more = bank.at(stamp_ns, gradient)
+                lagging, bank_extra = bank.at(stamp_ns, gradient)
                 values = values + [gradient - m for m in lagging]
-                extra = extra + more
+                extra = extra + bank_extra
         return values, extra
 
     def start_shares(self, stamp_ns: int) -> list[float]:

@@ -5,8 +5,8 @@ Owns the plausibility checks of temperature readings, applied before they reach 
 
 A board has a heat capacity, so its temperature takes no step. A thermometer has noise, so its
 readings are not constant, least of all while the temperature of the other thermometer changes. The
-case is nearer to the surroundings than the board, so the case leads in a ramp. Readings that break
-such a rule are left out, or their variance is increased by the square of their possible error.
+case is nearer to the surroundings than the board, so the case leads in a ramp. Implausible
+readings are left out, or their variance is increased by the square of their possible error.
 """
 
 from enum import Enum
@@ -22,25 +22,25 @@ LARGEST_RATE: Final = 0.2
 #: Number of used readings after which steps are checked: a sensor's first readings may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: A sensor stands still after this number of equal readings (more if the declared noise makes so
-#: long a run more probable than `STILL_PROBABILITY`) over at least this time [s].
+#: A sensor counts as standing still after this number of equal readings (more if the declared
+#: noise makes so long a run more probable than `STILL_PROBABILITY`) over at least this time [s].
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
 #: Number of equal readings from which the variance grows.
 DOUBTFUL_READINGS: Final = 4
-#: Movement of the other sensor [K] that makes a still sensor a frozen one: if noise exceeds the
-#: sensor's quantum, and if the quantum hides the noise.
+#: Change of the other sensor [K] from which a still sensor counts as frozen: if the sensor's noise
+#: exceeds its quantum, and if the quantum hides the noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a frozen sensor [K].
 LARGEST_DOUBT: Final = 60.0
 
-#: Smallest temperature difference that counts as a lead: in K, and as a share of the movement ...
+#: Smallest temperature difference that counts as a lead: in K, and as a share of the movement.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
-#: ... in this number of consecutive readings, with at least this ratio of the slower rate to the
-#: faster; from the smaller ratio on a lead of the board adds to the variance.
+#: A lead lasts for this number of consecutive readings, with at least this ratio of the slower
+#: rate to the faster; from the smaller ratio on a lead of the board adds to the variance.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03

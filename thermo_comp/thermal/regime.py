@@ -85,8 +85,8 @@ class RegimeDetector:
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
-            # The detector sees an onset before the rate is large. Until it is large, the state
-            # ends only if the rate returns to the baseline.
+            # The detector detects an onset before the rate is large. Until the rate is large, the
+            # dynamic state ends only if the rate returns to the baseline.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -125,7 +125,9 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Follow a direction that lasts; a held reading makes the rate a staircase."""
+        """
+        Take over a new direction once it lasts: with coarse readings the rate is a staircase.
+        """
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -159,8 +161,9 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # A reading unchanged for longer than the relaxed rate takes to cross a cell, and than a
-        # reversal with the smallest ramp's acceleration stays in a cell, proves calm.
+        # A reading proves calm if it has been unchanged for longer than a change at the relaxed
+        # rate takes to cross a cell, and a reversal at the smallest ramp's acceleration stays in a
+        # cell.
         quantum = sensor.quantum_c
         bend = settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         self._still_ns = round(
@@ -198,7 +201,7 @@ class _Watch:
         room -= SURE_SIGMAS * doubt
         if not -room < rate < room:
             return False
-        # The movement from the mean over the last quarter lag goes on.
+        # Extrapolate half a lag ahead, from the mean over the last quarter lag.
         ahead = 3.0 * rate - 2.0 * self._mean
         limit = max(relaxed, 3.0 * lead_swing)
         return -limit < ahead < limit

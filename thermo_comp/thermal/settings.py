@@ -53,7 +53,7 @@ class ThermometerSettings:
 
     @property
     def has_wide_cells(self) -> bool:
-        """Whether a cell is so wide that noise alone never carries a reading across it."""
+        """Whether a cell is so wide that noise alone never moves a reading across the cell."""
         return self.quantum_c > WIDE_CELL_SIGMAS * self.noise_sd_c
 
 
@@ -76,7 +76,7 @@ class DetectorSettings:
         float,
         QUANTITIES['ripple'],
         "Amplitude of the surroundings' temperature in a soak (a chamber's control ripple), K. "
-        'Through the lag it makes a rate of at most ``ripple_c / lag_s``, which is no onset.',
+        'A sensor with a lag shows the ripple as a rate up to ``ripple_c / lag_s``: no onset.',
     ] = 0.1
     relaxed_rate_k_min: Annotated[
         float,
@@ -126,5 +126,5 @@ class ThermalConfig:
     case_timeout_s: Positive = 30.0
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing."""
+        """Refuse values outside their ranges."""
         refuse_impossible(self)

@@ -26,11 +26,11 @@ from typing import Final
 from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS: Final = 6.0  # innovation limit in sd, beyond which a reading is down-weighted
-OUTLIER_LIMITS: Final = 5.0  # innovation / that limit, beyond which a reading is rejected ...
-RESTART_READINGS: Final = 4  # ... unless this number of outliers in a row lie on one side
+OUTLIER_LIMITS: Final = 5.0  # innovation / OUTLIER_SIGMAS, beyond which a reading is rejected
+RESTART_READINGS: Final = 4  # outliers in a row on one side that count as a real change
 SOAK_S: Final = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
-QUIET_SHARE: Final = 5e-3  # acceleration, quiet / bending, of a sensor without wide cells
-CELL_SHARE: Final = 0.2  # the same of a sensor whose wide cells hide slow changes
+QUIET_SHARE: Final = 5e-3  # acceleration, quiet / bending mode, of a sensor without wide cells
+CELL_SHARE: Final = 0.2  # acceleration, quiet / bending mode, of a sensor with wide cells
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
 _DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
 #: Range of readings accepted as temperatures [degC]: from absolute zero.
@@ -308,7 +308,7 @@ def mix(state: State, other: State, share: float) -> State:
 
 
 def predict(state: State, dt: float, lag: float, power: float) -> State:
-    """Carry a state over `dt` [s]; acceleration: decay `lag` [s], noise `power` [K^2/s^5]."""
+    """Predict a state `dt` [s] later; acceleration: decay `lag` [s], noise `power` [K^2/s^5]."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     half = 0.5 * dt * dt
     decay = 1.0 / (1.0 + dt / lag)

@@ -131,7 +131,7 @@ class LackOfFit:
 @dataclass(frozen=True)
 class RegimeSet:
     """
-    The set of one regime. Outside `temperature_range_c` its curves continue along their tangents
+    The set of one regime. Outside `temperature_range_c` the curves continue along their tangents
     for a quarter of the span and are constant beyond; the covariance increases.
     """
 
@@ -143,7 +143,7 @@ class RegimeSet:
     lack_of_fit: Annotated[
         tuple[LackOfFit, ...],
         'Error of left-out data in excess of the posterior: variance linear between the '
-        'temperatures, held outside.',
+        'temperatures, constant outside.',
     ] = ()
 
     def __post_init__(self) -> None:

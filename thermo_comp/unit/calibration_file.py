@@ -19,7 +19,8 @@ from .calibration import FORMAT_VERSION, Calibration
 from .schema import SchemaError, build, fields_of, plain
 
 #: Largest calibration file [bytes]. A calibration with all columns of the bank takes about 900 kB
-#: with one thermometer beside the board, nearly all of it the posterior; with two it fits, too.
+#: with one thermometer beside the board, nearly all of it the posterior; with two thermometers it
+#: is also below the limit.
 SIZE_LIMIT = 1 << 23
 
 #: Former names of groups and kinds of columns, as files of version 0.2.0 may have them.
@@ -62,7 +63,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
     version = data.get('format_version')
     # Checked before the keys: keys of another version would be reported as unknown.
     if type(version) is int and version != FORMAT_VERSION:
-        advice = 'a newer release wrote it; update thermo_comp'
+        advice = 'the file is of a newer release; update thermo_comp'
         if version < FORMAT_VERSION:
             advice = 'fit the bags again'
         message = f'`format_version` must be {FORMAT_VERSION}, got {version}: {advice}'
@@ -103,7 +104,7 @@ def dump_calibration(calibration: Calibration) -> str:
             f'the calibration takes {len(content)} bytes, at most {SIZE_LIMIT} are accepted'
         )
     if parse_calibration(content) != calibration:
-        raise CalibrationError('the calibration does not survive being written')
+        raise CalibrationError('reading the written calibration gives another value')
     return text
 
 
@@ -124,7 +125,7 @@ _BASE: type[yaml.SafeDumper] = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
 class _Dumper(_BASE):  # type: ignore[valid-type, misc]
-    """Writes numbers so that this reader and any YAML 1.1 reader see the same float."""
+    """Writes numbers so that this reader and any YAML 1.1 reader get the same float."""
 
     def ignore_aliases(self, _data: Any) -> bool:
         return True

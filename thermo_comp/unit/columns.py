@@ -5,7 +5,7 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u the value of its kind (`unit.terms`), t the
 board temperature from the reference, and w the weight of the dynamic regime; u is held at the
-edges of the column's range and t at those of the calibrated temperatures. Beyond these
+edges of the column's range and t at those of the calibrated temperatures. Beyond the calibrated
 temperatures the curves continue along their tangents, but the powers of t are constant: with power
 p the tangent of a product would be u p t^(p - 1), and no recording determines how a coefficient
 that changes with temperature continues.
@@ -110,7 +110,9 @@ class Column:
         'g_s at rest, for gradient_even, size and square without lag.',
     ] = 0.0
     knee_k: Annotated[
-        float, QUANTITIES['gradient'], 'Where the slope of bend changes, from the reference.'
+        float,
+        QUANTITIES['gradient'],
+        'Temperature at which the slope of bend changes, from the reference.',
     ] = 0.0
     power: Annotated[int, QUANTITIES['power'], 'The value is multiplied by t to this power.'] = 0
     during: Annotated[
@@ -195,7 +197,8 @@ def bank(
     columns += _family('square', ['cube'], lags=coarse)
     even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
     even += _family('gradient_even', ['size', 'square'], sensors, (0, 1, 2))
-    # A heat pump's load is even in the heat flow; the effect of a change is even about rest.
+    # A heat pump's load is even in the heat flow; the effect of a temperature change is even about
+    # the gradient at rest.
     rest = at_rest or {}
     columns += even + [
         replace(column, group='gradient_even_about_rest', rest_k=rest[column.sensor])
@@ -294,7 +297,7 @@ class ColumnTable:
             for term in dict.fromkeys(terms.tolist())
             if term.form is not LINE
         ]
-        # Temperatures of parts are made of two numbers of a state.
+        # The temperature of a part is the difference of two numbers of a state.
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
 

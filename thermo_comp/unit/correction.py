@@ -26,18 +26,20 @@ from .functions import hold
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection
 
-#: Largest rate of change of the output while the sets are blended [m/s^3]: 1 ug per second ...
+#: Largest rate of change of the output while the sets are blended [m/s^3]: 1 ug per second; to
+#: this end blending is lengthened up to a number of transition times.
 GENTLE_RATE = MICRO_G
-#: ... unless blending would then take more than this number of transition times.
 LONGEST_TRANSITION = 10.0
 #: Number of board temperatures at which curves and differences of the sets are evaluated.
 _GAP_TEMPERATURES = 33
-#: Variance of rounding [counts^2]: twice 1/12, as the converter carries the remainder on.
+#: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
+#: cycle.
 ROUNDING_VARIANCE = 1.0 / 6.0
 #: Smallest noise variance of a message / largest variance of any axis: keeps the covariance
 #: positive definite in spite of rounding; far below the noise of any instrument.
 _LEAST_SHARE = 1e-13
-#: Largest number accepted in a line: corrected samples of smaller numbers do not overflow.
+#: Largest number accepted in a result of `Correction.line`: with smaller numbers the corrected
+#: samples do not overflow.
 _LARGEST = 1e140
 #: Number of states from which one call per column costs less than a table of all sums.
 _FEW = 64
@@ -58,7 +60,7 @@ class Correction:
     """
     Both sets of a calibration, blended by the weight of the thermal state, and its response.
 
-    memory: memory that the tracker needs for force and angular rate, or the memory it has
+    memory: memory that the tracker needs for force and angular rate, or the tracker's memory
     noise: noise variance of one message per axis, rounding included [m^2/s^4]
     noise_trace: the sum of `noise`
     misalignment: yx, zx, zy of M and their variances; with a nonlinearity then its constants
@@ -166,7 +168,9 @@ class Correction:
         )
 
     def felt(self, slopes: Floats) -> Floats:
-        """Differentiate bias and relative scale by `Layout.pairs`, (p, 6, n), by those of phi."""
+        """
+        Differentiate bias and relative scale by `Layout.pairs`, (p, 6, n), given `slopes` of phi.
+        """
         columns = self._felt_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))
         if len(columns):
@@ -211,8 +215,10 @@ class Correction:
         v = self._variance(states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, unchanging)
         # The largest force that each axis can measure [m/s^2], and the variance there.
         most = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
-        whole = v[:, 0] + most * (np.abs(v[:, 1]) + most * (v[:, 2] + max(self.misalignment[3:])))
-        least = _LEAST_SHARE * whole.max(axis=0)
+        variance = v[:, 0] + most * (
+            np.abs(v[:, 1]) + most * (v[:, 2] + max(self.misalignment[3:]))
+        )
+        least = _LEAST_SHARE * variance.max(axis=0)
         v[:, 0] += np.maximum(self._noise * (1.0 + np.asarray(noise_excess)), least)
         beyond = np.empty((0, n))
         if self.of_force is not None:
@@ -238,10 +244,10 @@ class Correction:
         while the regime is unknown; in the last case the variances of both sets are added.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
-        rest, over = 1.0 - weight, raw - held
+        static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative = self.curves.excess(states)
-        outside = rest * relative[0] + weight * relative[1]
-        shares = np.array([rest + unknown * weight, weight + unknown * rest])
+        outside = static_weight * relative[0] + weight * relative[1]
+        shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])
         by_source, direct = self.table.slopes(states)
         felt = self.felt(by_source * factors[0])
@@ -254,7 +260,7 @@ class Correction:
         v = self._spread(np.concatenate(variances), np.concatenate((slopes + on_board, felt)))
         v[:, 0] += (shares[:, np.newaxis] * self.curves.unexplained(board)).sum(axis=0)
         v += slow
-        is_beyond = bool(over.any())
+        is_beyond = bool(beyond_range.any())
         # A part that lags the board may still be outside when the board is back inside.
         parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
         parts_out = np.abs(parts - hold(parts, *self._span)).max(axis=0)
@@ -271,7 +277,7 @@ class Correction:
             v += self._spread(np.concatenate((bent, bent)), bends)
             # The variance is that of the calibrated ranges: it grows with the distance from them.
             v *= (1.0 + (outside + columns_out) ** 2)[:, np.newaxis]
-        doubt = unknown + weight * rest + outside * outside
+        doubt = unknown + weight * static_weight + outside * outside
         if not (is_beyond or doubt.any()):
             return v
         if self.table.differs:
@@ -279,9 +285,9 @@ class Correction:
                 self.table.factors(board, np.full_like(weight, w))[0] for w in (0.0, 1.0)
             )
             gap = self._weigh(held * (of_dynamic - of_static), gap)
-        held_back = self._weigh(over * factors[0], np.zeros_like(gap))
-        more = self._spread(np.array([doubt, np.ones_like(doubt)]), np.array([gap, held_back]))
-        return np.asarray(v + more)
+        held_back = self._weigh(beyond_range * factors[0], np.zeros_like(gap))
+        of_gaps = self._spread(np.array([doubt, np.ones_like(doubt)]), np.array([gap, held_back]))
+        return np.asarray(v + of_gaps)
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """

@@ -20,10 +20,10 @@ class Curves:
     """
     Bias and scale of both sets as functions of the board temperature; row 0 of a result is static.
 
-    Beyond the range of one set, within that of the other, the difference of the two is held.
-    Beyond both ranges the curves continue along their tangent at the edge for `TANGENT_SPANS` of
-    the span, and are constant from there on; a set whose range ends earlier than that of the other
-    set follows the tangent of the other set.
+    Where only one set's range ends, the difference of the two sets is held. Beyond both ranges the
+    curves continue along their tangent at the edge for `TANGENT_SPANS` of the span, and are
+    constant from there on; a set whose range ends earlier than that of the other set follows the
+    tangent of the other set.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -140,15 +140,17 @@ class Curves:
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
-        Differentiate the continuations by the free coefficients of one function, (n_free, n): the
-        tangent of the function in each set that follows this tangent, and its curve beyond the
-        range of the other set.
+        Differentiate values beyond the ranges by the free coefficients of one function, (n_free,
+        n): the function's tangent, in each set that follows it, and the held difference of the
+        sets.
         """
         function = self._functions.rows[regime][place]
-        span, other = (edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]])
+        own_range, other_range = (
+            edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]]
+        )
         here, edge = (
-            np.reshape(function.basis(hold(at, *span)), (-1, len(t)))
-            for at in (t, hold(t, *other))
+            np.reshape(function.basis(hold(at, *own_range)), (-1, len(t)))
+            for at in (t, hold(t, *other_range))
         )
         result = shares[1 - regime] * (here - edge)
         ends = zip(self._basis_slopes[regime][place], self._leads, self._beyond(t), strict=True)

@@ -28,9 +28,9 @@ from ..typing import Floats
 #: One temperature difference or an array of them [K].
 Kelvins: TypeAlias = float | Floats
 
-#: Length of the tangent that continues a curve beyond its range, in spans of that range. At its
-#: end a parabola differs from the tangent by a sixteenth of the difference at the far end of the
-#: range.
+#: Length of the tangent that continues a curve beyond its range, in spans of that range. At the
+#: tangent's end a parabola differs from the tangent by a sixteenth of the difference at the far
+#: end of the range.
 TANGENT_SPANS = 0.25
 #: Largest error of a function at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9

@@ -42,7 +42,7 @@ class NonlinearTerm:
 
     kind: Annotated[Kind, 'K2 f^2, Kq |f| f or K3 f^3.']
     coefficient: Annotated[Vector, 'At the reference temperature [g/g^2; of the cube g/g^3].']
-    per_kelvin: Annotated[Vector, 'Change per kelvin of the board; held outside the range.']
+    per_kelvin: Annotated[Vector, 'Change per kelvin of the board; constant outside the range.']
     prior_sd: Annotated[float, QUANTITIES['nonlinearity'], 'Prior sd of `coefficient`.']
     effective_parameters: Annotated[
         float, QUANTITIES['number'], 'Effective number of coefficients determined by the data.'

@@ -6,7 +6,7 @@ whose start was not seen), and hypothetical states: a soak and a ramp.
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
 of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
-stop; in a soak (q = 0) all of them are 0. The static set holds in a soak, the dynamic set in a
+stop; in a soak (q = 0) all of them are 0. The static set applies in a soak, the dynamic set in a
 ramp. Noise and the uncertainty of the thermometers are left out.
 """
 
@@ -35,10 +35,10 @@ class SlowUncertainty:
         if posterior is None:
             return
         layout = parameter_layout(calibration)
-        matrix, rest = posterior.matrix, posterior.variances
+        matrix, diagonal = posterior.matrix, posterior.variances
         for bias, scale, force in zip(layout.bias, layout.scale, layout.force, strict=True):
             parts = bias.rows, scale.rows, force
-            variances = [rest[part] for part in parts]
+            variances = [diagonal[part] for part in parts]
             rows = np.concatenate([matrix[part] for part in parts])
             if matrix.shape[1] > len(rows):
                 # The same covariance of one axis from fewer columns.
@@ -90,12 +90,12 @@ class SlowUncertainty:
         columns = states.T
         phi = self._correction.table.values(columns)
         regressors = self._correction.curves.regressors(columns, phi)
-        whole, away = np.zeros((2, len(states), 3))
+        of_state, of_difference = np.zeros((2, len(states), 3))
         for axis, ((rows, variances), _, _) in enumerate(self._blocks):
             felt = regressors[axis].T / self._K[axis]
-            for result, design in ((whole, felt), (away, felt - mean_of(felt))):
+            for result, design in ((of_state, felt), (of_difference, felt - mean_of(felt))):
                 result[:, axis] = ((design @ rows) ** 2).sum(axis=1) + design**2 @ variances
-        return whole, away
+        return of_state, of_difference
 
 
 def _products(bias: Floats, scale: Floats) -> Floats:

@@ -4,8 +4,8 @@
 Owns the limits of a calibration's bias and scale over its temperatures, relative to full scale.
 
 A bias is within the converter's range, so level and curve stay within twice the full scale. The
-largest value of a column, and the uncertainty, stay within a million times that: far beyond any
-instrument, and without overflow.
+largest value of a column, and the uncertainty, stay within a million times the limit of a bias:
+far beyond any instrument, and without overflow.
 """
 
 from __future__ import annotations
@@ -115,7 +115,9 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], most: floa
 
 
 def _check_scale(key: str, reached: tuple[float, float], lost: float) -> None:
-    """Refuse a relative scale that leaves its limits when the columns take or add `lost`."""
+    """
+    Refuse a relative scale that exceeds its limits when the columns add up to `lost` or -`lost`.
+    """
     for word, value, is_kept, limit in (
         ('above', reached[0] - lost, operator.gt, SMALLEST_RELATIVE_SCALE),
         ('below', reached[1] + lost, operator.lt, LARGEST_RELATIVE_SCALE),

@@ -5,10 +5,10 @@ Owns the kinds of regressors of the thermal response, one class each: a new kind
 
 The value is ``u = form.value(x)``, ``x = (n - centre) / width``. The number n is a quantity of the
 thermal state, the `source`; with `is_temperature` it is ``t - source``, the temperature of a part
-that lags the board. Here ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s,
-and ``q_s = g_s - rest``: rest is 0, or the gradient at rest, where self-heating makes the board
-warmer than the case. Even functions of q_s have the same value for heating and for cooling at the
-same rate.
+that lags the board. Notation: ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s, and
+``q_s = g_s - rest``: rest is 0, or the gradient at rest, where self-heating makes the board warmer
+than the case. Even functions of q_s have the same value for heating and for cooling at the same
+rate.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class Board(Term):
     )
 
     def source(self, column: Column) -> Quantity:
-        """Return ``T_board - L_tau(T_board)``, or for a bend without lag the board's own."""
+        """Return ``T_board - L_tau(T_board)``, or for a bend without lag the board temperature."""
         return _lag_of_part(column) if column.tau_s else state.Board()
 
 
@@ -141,7 +141,7 @@ class GradientLag(Term):
     kind, formula, positive = 'gradient_lag', 'lagged g_s', ('tau_s',)
     groups = (
         ('gradient_lag', 'parts between case and board'),
-        # Coefficients of this kind and those before it that change with temperature.
+        # Coefficients of the kinds from `gradient` to this one that change with temperature.
         ('product', 'lags, changing with temperature'),
         ('gradient_x_temperature', 'heat flow, changing with temperature'),
     )
@@ -213,7 +213,7 @@ class Bend(Board):
     centre_key, is_temperature, has_scale = 'knee_k', True, False
 
 
-#: All kinds by name, in the order of their classes: that of the names in the file's schema.
+#: All kinds by name, in the order of their classes, which is also the order in the file's schema.
 TERMS: Final[dict[str, Term]] = {cls.kind: cls() for cls in _CLASSES}
 #: All groups of columns, each with its name in a certificate.
 GROUPS: Final = {name: text for term in TERMS.values() for name, text in term.groups}
