@@ -84,7 +84,7 @@ def test_every_transient_fault_is_over_within_the_detector_s_settling_time():
     }
     assert {fault: s for fault, s in back.items() if s > settling_s()} == {}
     page = PAGE.read_text()
-    assert f'that is {settling_s():.0f} s' in page
+    assert f'the settling time is {settling_s():.0f} s' in page
     assert f'after {max(back.values()):.0f} s' in page
 
 
