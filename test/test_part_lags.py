@@ -44,6 +44,13 @@ def study_of(name, n=9, corners=HALF, **given):
     return unit, Study('', bags, one_test(positions(unit, HELD, spread(2, rng), rng)), FULL_SCALE)
 
 
+@pytest.fixture(scope='module')
+def parts():
+    """Fit a unit with a part of another time constant on each axis."""
+    unit, study = study_of('parts', part_s=PARTS_S)
+    return unit, study, strangers.fitted(study)
+
+
 def taus_of(calibration):
     return [
         sorted({one.tau_s for one in calibration.response if one.kind == 'board' and one.bias[k]})
@@ -57,9 +64,8 @@ def judged(calibration, study):
     return strangers.score(outs, [minutes(bag) for bag in bags], is_drift=False)
 
 
-def test_the_lags_are_those_of_the_parts_each_for_its_axis():
-    unit, study = study_of('parts', part_s=PARTS_S)
-    calibration = strangers.fitted(study)
+def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
+    unit, study, calibration = parts
     # A lag of 10 K that is wrong by 1 % moves a bias of 10 ug/K by 1 ug, twice its noise of a
     # minute; some hundred minutes of ramps determine a lag better than 1 %.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
@@ -193,9 +199,8 @@ def test_without_parts_or_ramps_the_fit_has_a_bank_of_lags(case):
     assert {term.tau_s for term in calibration.response if term.kind == 'board'} <= {*FINE_TAUS}
 
 
-def test_units_of_a_type_share_the_lags_of_the_bank():
-    _, study = study_of('parts', part_s=PARTS_S)
-    calibration = strangers.fitted(study)
+def test_units_of_a_type_share_the_lags_of_the_bank(parts):
+    _, study, calibration = parts
 
     def sibling(k, ratio):
         terms = tuple(replace(term, tau_s=ratio * term.tau_s) for term in calibration.response)
@@ -212,8 +217,8 @@ def test_units_of_a_type_share_the_lags_of_the_bank():
         assert np.sqrt(np.mean(off**2)) < 5.0 * UG
 
 
-def test_fit_says_how_far_the_parts_lag(tmp_path, cli):
-    unit, study = study_of('parts', part_s=PARTS_S)
+def test_fit_says_how_far_the_parts_lag(parts, tmp_path, cli):
+    unit, study, _ = parts
     tables = []
     for bag in study.bags:
         celsius = [np.interp(bag.time_s, *bag.temperatures[name]) for name in ('board', 'case')]
