@@ -114,16 +114,17 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
     # In a model without any curve the unseen curve is that over the board's temperature. From one
-    # attitude the curves of bias and scale factor cannot be separated: each may have powers that
-    # the curve of a part lacks.
+    # attitude the drifts of bias and scale factor cannot be separated: each may have the columns
+    # of the other, and powers that the curve of a part lacks.
     curves = [PART] * (PART in active) or [CURVE] * (CURVE not in active)
-    may = np.isin(groups, [*LAGS, *curves]) & typical.any(axis=0)
-    inactive = regression.inactive(posterior, may)
+    may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
+    inactive = regression.inactive(posterior, may & typical.any(axis=0))
     seen = np.diag(inactive.S).reshape(-1, 3)
     seen = seen.sum(axis=1) / np.maximum((seen > 0.0).sum(axis=1), 1)
     sd = np.zeros_like(typical)
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(seen, 1e-300))
-    sd = np.where(groups == PART, np.minimum(sd, typical), sd)
+    is_of_lags = np.isin(groups, LAGS)
+    sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
         # The effect of a lag is that of the curve at a delayed temperature, so the largest slope
         # of the curve limits it (RMS of the three axes).
@@ -131,9 +132,9 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
         steepest = posterior.state.weights[:, :, is_curve] / kelvins[is_curve]
         slopes = np.sqrt(np.mean(np.sum(steepest**2, axis=2), axis=1))
         of_curve = np.outer(slopes, kelvins)
-        typical = np.where(np.isin(groups, LAGS), np.minimum(typical, of_curve), typical)
+        typical = np.where(is_of_lags, np.minimum(typical, of_curve), typical)
     # All lags together have at most the effect of one lag: they share its prior variance.
-    is_lag = np.isin(groups, LAGS) & (sd > 0.0)
+    is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
