@@ -178,6 +178,20 @@ def test_the_guessed_map_is_printed(tmp_path, rng, cli):
     assert own['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}
 
 
+def test_a_guessed_map_is_printed_once(tmp_path, rng, cli):
+    for number in range(3):
+        level = np.eye(3)[number] + 0.002 * rng.standard_normal((4000, 3))
+        rows = [f'{k / 10:.1f},{x:.5f},{y:.5f},{z:.5f}' for k, (x, y, z) in enumerate(level)]
+        heading = 'time (s),ax,ay,az' if number < 2 else 'time_s,ax,ay,az'
+        (tmp_path / f'{number}.csv').write_text('\n'.join([heading, *rows]))
+    tables = [tmp_path / f'{number}.csv' for number in range(3)]
+    printed = cli('fit', *tables, '-o', tmp_path / 'unit.yaml', '--gravity', '9.81').stdout
+    assert f'{tables[1]}: column map of {tables[0]}\n' in printed
+    # Another heading is another map.
+    assert f'{tables[2]}: guessed column map' in printed
+    assert printed.count('stamp: {column: ') == 2
+
+
 @pytest.mark.parametrize(('one_g', 'bits'), [(4096.0, 15), (524288.0, 23), (1e8, 31)])
 def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
     rest = Rest(rng, level=(0.0, 0.0, one_g), sd=0.002 * one_g)

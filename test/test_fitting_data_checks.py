@@ -89,6 +89,18 @@ def test_what_a_test_lacks_is_said(good, name, changed, message):
     assert name != 'temperature' or set(findings) == {'positions', 'temperature'}
 
 
+def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, rng):
+    # WHY: bags of soaks with interpolated readings were refused. The noise of the board's reading
+    # enters its rate and, with the opposite sign, the gradient.
+    windows, up = good
+    noise = rng.standard_normal(len(windows.rate))
+    soaks = 5.0 + 15.0 * (windows.data.position % 3)
+    noisy = replace(windows, temperature=soaks, rate=0.2 / 60.0 * noise, gradient=-0.005 * noise)
+    findings = findings_of(noisy, up)
+    assert 'swapped' not in findings
+    assert 'no ramp' in findings['ramps'].message
+
+
 def test_a_missing_case_is_said(good):
     assert findings_of(*good, has_case=False)['case'].level == 'advice'
 

@@ -83,7 +83,7 @@ def convert(
     with out.progress('converting') as done:
         with flags_named():
             read = read_log(log, **given)
-        tell_guess(out, read)
+        tell_guess(out, read, {})
         report = write_log(read, output, force, done)
     _tell_conversion(out, report, output)
     written, further = report.log, dict(report.messages)
@@ -144,18 +144,23 @@ def flags_named() -> Iterator[None]:
             raise ValueError(flag) from mistake
 
 
-def tell_guess(out: Output, log: 'ForeignLog') -> None:
-    """Print a guessed column map."""
+def tell_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
+    """Print a guessed column map, or name the log of `shown` whose printed map is the same."""
     from ..convert.column_map import spoken_columns
     from ..convert.headings import map_lines
 
     if log.guessed is None:
         return
     if log.guessed.format is None:  # the table has known headings
+        lines = map_lines(log.guessed)
+        first = shown.setdefault('\n'.join(lines), log.path)
+        if first != log.path:
+            out.line(f'{log.path}: column map of {first}')
+            return
         out.line(
             f'{log.path}: guessed column map; if it is wrong, edit it and give it as --columns'
         )
-        for line in map_lines(log.guessed):
+        for line in lines:
             out.line(f'  {line}')
     else:
         out.line(f'{log.path}: guessed {spoken_columns(log.guessed)}; --columns overrides it')

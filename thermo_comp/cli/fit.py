@@ -95,8 +95,10 @@ def fit(
     if certificate_info is not None and report is None:
         raise options.usage('--certificate-info fills the page of --report: give both')
 
+    shown: dict[str, str] = {}
+
     def tell(log: 'ForeignLog') -> None:
-        tell_guess(out, log)
+        tell_guess(out, log, shown)
         out.sources([(log.path, log.chosen, None)])
 
     with flags_named():

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -211,7 +212,7 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
         yield _advice('case', text)
         return
     # The case temperature leads, so the gradient has the sign of the board's rate.
-    moving = np.abs(windows.rate) * 60.0 > RAMP_K_MIN
+    moving = np.abs(_ramp_rates(windows)) > RAMP_K_MIN
     if windows.data.weight[moving].sum() >= 30.0 * windows.data.weight.max():
         correlation = float(np.corrcoef(windows.gradient[moving], windows.rate[moving])[0, 1])
         if correlation <= -0.3:
@@ -223,8 +224,22 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
             )
 
 
+def _ramp_rates(windows: ThermalWindows) -> Floats:
+    """
+    Return the rate of the board temperature [K/min], shape (n,), 0 where the mean temperature does
+    not change by at least half of this rate from one window to the next: there the rate is noise.
+    """
+    rate, edges = windows.rate * 60.0, windows.data.edges
+    for begin, end in pairwise(edges.tolist()):
+        if end - begin > 1:
+            rows = slice(begin, end)
+            change = 60.0 * np.gradient(windows.temperature[rows], windows.data.time[rows])
+            rate[rows] *= change * np.sign(rate[rows]) > 0.5 * np.abs(rate[rows])
+    return np.asarray(rate)
+
+
 def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
-    rate = windows.rate * 60.0
+    rate = _ramp_rates(windows)
     heating, cooling = float(np.mean(rate > RAMP_K_MIN)), float(np.mean(rate < -RAMP_K_MIN))
     if heating + cooling < 0.02:
         yield _advice(
