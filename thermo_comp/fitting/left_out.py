@@ -34,6 +34,7 @@ import numpy as np
 from ..typing import Floats, Ints
 from .elimination import inverse_root
 from .regression import Point, Posterior, Regression
+from .start import white_noise_of
 from .unknowns import State
 
 # Smallest number of windows of a position from which its drift is scored.
@@ -88,6 +89,12 @@ class Folds:
             return 0.0, max(error for _, error in estimates)
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
+    def is_noise(self, other: Folds, noise: float) -> bool:
+        """Whether white noise explains the folds that the other model has as well."""
+        known = np.isfinite(self.square) & np.isfinite(other.square)
+        square = np.average(self.square[known], weights=self.windows[known])
+        return bool(square <= (2.0 * noise) ** 2)
+
 
 @dataclass(frozen=True)
 class Score:
@@ -101,6 +108,7 @@ class Score:
     drift: drift of each window by a fit without its position or, if that fit does not determine
         the drift, without its section, shape (n, 3)
     halves: drift of left-out halves of the program, at temperatures that occur in the other half
+    noise: white noise of a window, RMS of the axes [m/s^2]
     """
 
     positions: Folds
@@ -109,6 +117,7 @@ class Score:
     force: Floats
     drift: Floats
     halves: Folds
+    noise: float = 0.0
 
     @property
     def kinds(self) -> tuple[Folds, Folds, Folds]:
@@ -137,14 +146,22 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     The gain is the sum of the log gains of the drift. If the drifts are equal, the gain is the log
     gain of the norms of left-out positions, which must exceed two standard errors.
     """
-    positions, sections, norms = _gains(before, after)
-    drift = [gain for gain in (positions, sections) if gain]
+    *drifts, norms = _gains(before, after)
+    drift = [gain for gain in drifts if gain]
+    # A drift that white noise explains need not decrease if the other does: bags of soaks do not
+    # show what a bag of ramps shows.
+    must_gain = [
+        gain
+        for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
+        if gain and (gain[0] > gain[1] or not second.is_noise(first, after.noise))
+    ]
     # The RMS error of the two halves may rise by a quarter, which is about its scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
         return 0.0
     total = sum(gain for gain, _ in drift)
-    if total > _EQUAL * len(drift) and all(gain > error for gain, error in drift):
+    is_sure = bool(must_gain) and all(gain > error for gain, error in must_gain)
+    if is_sure and total > _EQUAL * len(drift):
         return total
     is_sure = norms is not None and norms[0] > max(2.0 * norms[1], _EQUAL)
     if is_sure and norms and all(abs(gain) < _EQUAL for gain, _ in drift):
@@ -178,7 +195,9 @@ def score_of(regression: Regression, posterior: Posterior) -> Score:
     halves = np.array_split(numbers, 2) if len(numbers) else []
     by_halves, _ = _by_sections(regression, posterior, halves, is_within=True)
     drift = np.where(np.isfinite(drift), drift, section_drift)
-    return Score(positions, sections, norms, force, drift, by_halves)
+    scale = regression.nominal_scale
+    noise = float(np.sqrt(np.mean(white_noise_of(regression.windows, scale) ** 2)))
+    return Score(positions, sections, norms, force, drift, by_halves, noise)
 
 
 def _by_positions(
