@@ -179,15 +179,15 @@ def test_the_guessed_map_is_printed(tmp_path, rng, cli):
 
 
 def test_a_guessed_map_is_printed_once(tmp_path, rng, cli):
-    for number in range(3):
-        level = np.eye(3)[number] + 0.002 * rng.standard_normal((4000, 3))
-        rows = [f'{k / 10:.1f},{x:.5f},{y:.5f},{z:.5f}' for k, (x, y, z) in enumerate(level)]
-        heading = 'time (s),ax,ay,az' if number < 2 else 'time_s,ax,ay,az'
-        (tmp_path / f'{number}.csv').write_text('\n'.join([heading, *rows]))
     tables = [tmp_path / f'{number}.csv' for number in range(3)]
+    for heading, level, table in zip(('time (s)', 'time (s)', 'time_s'), np.eye(3), tables,
+                                     strict=True):  # fmt: skip
+        rows = np.column_stack(
+            (np.arange(4000) / 10.0, level + 0.002 * rng.normal(size=(4000, 3)))
+        )
+        np.savetxt(table, rows, '%.5f', ',', header=f'{heading},ax,ay,az', comments='')
     printed = cli('fit', *tables, '-o', tmp_path / 'unit.yaml', '--gravity', '9.81').stdout
     assert f'{tables[1]}: column map of {tables[0]}\n' in printed
-    # Another heading is another map.
     assert f'{tables[2]}: guessed column map' in printed
     assert printed.count('stamp: {column: ') == 2
 
