@@ -75,7 +75,8 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     calibration = result.calibration
     assert len(result.positions) == 6
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-6)
-    np.testing.assert_allclose(calibration.misalignment_sd, 1e-3, rtol=0.01)
+    # The prior sd of a MEMS: 1 %.
+    np.testing.assert_allclose(calibration.misalignment_sd, 1e-2, rtol=0.01)
     # The second route: bias and scale are half the sum and half the difference of opposite faces.
     means = means_of(result)
     high, low = means.max(axis=0), means.min(axis=0)

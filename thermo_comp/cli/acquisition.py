@@ -14,10 +14,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..fitting import coverage
+from ..fitting.unknowns import misalignment_scale
 from ..recording.blocks import Block, Readings
 from ..recording.overview import ThermometerSurvey, survey_thermometer, thermal_findings
 from ..recording.stillness import CellAccumulator, Cells, still_intervals
 from ..typing import Floats, Ints
+from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s]; the wanted soak if that is shorter.
 _REST_S = 10.0
@@ -231,7 +233,11 @@ class Acquisition:
         one_g = np.sum((means - self._centre) * ups, axis=1)
         noise = np.array([rest.noise for rest in rests]) / one_g
         median = float(np.median(noise[np.isfinite(noise)])) if np.isfinite(noise).any() else 1.0
-        sds = np.hypot(noise / np.sqrt([max(rest.n, 1) for rest in rests]), _FLOOR_SD)
+        of_means = noise / np.sqrt([max(rest.n, 1) for rest in rests])
+        in_1_hz = of_means * np.sqrt([rest.still_s for rest in rests])
+        in_1_hz = in_1_hz[np.isfinite(in_1_hz)] * STANDARD_GRAVITY
+        misalignment_sd = misalignment_scale(float(np.median(in_1_hz)) if len(in_1_hz) else 0.0)
+        sds = np.hypot(of_means, _FLOOR_SD)
         positions: list[Position] = []
         for up, rest, ratio, sd in zip(ups, rests, noise / median, sds, strict=True):
             reason = self._reason(rest, up, ratio, positions)
@@ -241,7 +247,7 @@ class Acquisition:
         known = [position for position in positions if np.isfinite(position.up).all()]
         seen = np.array([position.up for position in known]).reshape(-1, 3)
         sds = np.array([position.sd_g for position in known])
-        covariance = coverage.constants_covariance(seen, sds)
+        covariance = coverage.constants_covariance(seen, sds, misalignment_sd)
         next_up = coverage.next_direction(covariance, known[-1].sd_g if known else _FLOOR_SD, seen)
         now, is_still = self._now(cells)
         hole, hole_deg = coverage.farthest(seen)

@@ -29,7 +29,7 @@ from .start import (
     white_noise_of,
     within_positions,
 )
-from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State, Windows
+from .unknowns import BIAS_SD, SCALE_SD, Prior, State, Windows, misalignment_scale
 from .windows import CURVE, ThermalWindows
 
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
@@ -127,15 +127,18 @@ def _initial_prior(
     # Initial sd of mounting offsets, and smallest initial noise [m/s^2]: 1 ug.
     least = 1e-5
     sigma = max(float(np.sqrt(np.mean(drift**2))), least)
+    noise = _noise_in_1_hz(windows, start)
+    misalignment_sd = misalignment_scale(noise)
     prior = Prior(
         bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, BIAS_SD),
         scale_sd=SCALE_SD,
-        misalignment_sd=MISALIGNMENT_SD,
+        misalignment_sd=misalignment_sd,
         column_sd=np.zeros((2, len(data.groups))),
         offset_sd=least,
         sigma=np.full(3, sigma),
-        offset_scale=_mounting_scale(windows, start),
+        offset_scale=_mounting_scale(noise),
+        misalignment_scale=misalignment_sd,
     )
     if data.forces is not None:
         prior = replace(prior, nonlinear_sd=starting_sd(data.forces, options))
@@ -177,25 +180,28 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     return np.asarray(np.append(taus, of_part) > longest_s / np.log(10.0))
 
 
-def _mounting_scale(windows: ThermalWindows, start: ConstantCalibration) -> float:
+def _noise_in_1_hz(windows: ThermalWindows, start: ConstantCalibration) -> float:
+    """Return the noise of the samples in 1 Hz [m/s^2], the median of the axes; 0 if unknown."""
+    data = windows.data
+    if not len(data.inner):
+        return 0.0
+    sigma = float(np.median(white_noise_of(data, start.scale)))
+    return sigma * np.sqrt(float(np.median(np.diff(data.time)[data.inner])))
+
+
+def _mounting_scale(noise: float) -> float:
     """
     Return the scale of the prior of mounting offsets [m/s^2]: three times the noise in 1 Hz,
     within bounds.
     """
-    data = windows.data
-    inner = data.inner
-    smallest = 1e-6  # [m/s^2]: 0.1 ug, better than navigation grade
-    if not len(inner):
-        return smallest
-    sigma = float(np.median(white_noise_of(data, start.scale)))
-    density = sigma * np.sqrt(float(np.median(np.diff(data.time)[inner])))
     # Bounds: 30 ug, as of sensors of navigation grade, and 0.5 mg, as of consumer MEMS; the tail
     # of the Student prior allows for more.
     least, most = 3e-4, 5e-3
     # Readings with almost no noise have a smaller lower bound: an offset 1e6 times as large as the
-    # noise cannot be estimated in double precision.
-    least = max(min(least, 100.0 * density), smallest)
-    return float(np.clip(3.0 * density, least, most))
+    # noise cannot be estimated in double precision. 1e-6 m/s^2: 0.1 ug, better than navigation
+    # grade.
+    least = max(min(least, 100.0 * noise), 1e-6)
+    return float(np.clip(3.0 * noise, least, most))
 
 
 def _candidates(

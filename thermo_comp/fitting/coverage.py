@@ -44,10 +44,13 @@ def norm_columns(up: Floats) -> Floats:
     return np.asarray(np.einsum('ni,nij->nj', up, force_columns(up)))
 
 
-def constants_covariance(up: Floats, sd: Floats) -> Floats:
+def constants_covariance(
+    up: Floats, sd: Floats, misalignment_sd: float = MISALIGNMENT_SD
+) -> Floats:
     """Return the covariance of the constants for positions `up` (n, 3) of noise `sd` (n,) [g]."""
     seen = norm_columns(up) / sd[:, None]
-    return np.asarray(np.linalg.inv(np.diag(PRIOR_SD**-2) + seen.T @ seen))
+    prior_sd = np.append(PRIOR_SD[:6], [misalignment_sd] * 3)
+    return np.asarray(np.linalg.inv(np.diag(prior_sd**-2) + seen.T @ seen))
 
 
 def worst_sd(covariance: Floats) -> float:

@@ -26,7 +26,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..typing import Bools, Floats, Ints
 from .gains import log_bayes_factors
 from .regression import Posterior, Regression
-from .unknowns import MISALIGNMENT_SD, Noise, Prior, State
+from .unknowns import Noise, Prior, State
 
 #: Degrees of freedom of the half-Student prior of the mounting's standard deviation; 4 as in [2]_.
 STUDENT_NU = 4.0
@@ -97,7 +97,7 @@ def _updated(
     gamma = float(determined[layout.misalignment].sum())
     if gamma > 1.0 and prior.informative is None:
         # Three elements of M determine their sd poorly: the built-in prior counts as a fourth.
-        square = np.sum(state.misalignment**2) + MISALIGNMENT_SD**2
+        square = np.sum(state.misalignment**2) + prior.misalignment_scale**2
         misalignment_sd = float(np.sqrt(square / (gamma + 1.0)))
     start_share = prior.start_share
     if layout.start.size:

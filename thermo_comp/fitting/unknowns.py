@@ -20,8 +20,19 @@ if TYPE_CHECKING:
 BIAS_SD = 1.0
 #: Built-in prior sd of a relative scale factor.
 SCALE_SD = 0.05
-#: Built-in prior sd of an element of the misalignment [rad].
+#: Built-in prior sd of an element of the misalignment [rad] of a triad of single sensors.
 MISALIGNMENT_SD = 1e-3
+
+
+def misalignment_scale(noise: float) -> float:
+    """
+    Return the built-in prior sd of an element of the misalignment [rad], for a sensor with this
+    noise in 1 Hz [m/s^2].
+
+    The sd is 1 mrad up to 10 ug, as of single sensors of navigation grade on machined faces, and
+    proportional to the noise above, up to 1 %, the cross-axis sensitivity of consumer MEMS.
+    """
+    return float(np.clip(10.0 * noise, MISALIGNMENT_SD, 1e-2))
 
 
 @dataclass(frozen=True)
@@ -174,6 +185,7 @@ class Prior:
     sigma: sd of the white noise of a typical window [m/s^2], shape (3,)
     noise: Gauss-Markov part of the noise
     offset_scale: scale of the half-Student prior of offset_sd [m/s^2]; 0: offset_sd is constant
+    misalignment_scale: misalignment_sd before the data [rad]
     tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
     start_share: variance of the initial lag states over that of the run-time prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
@@ -191,6 +203,7 @@ class Prior:
     sigma: Floats
     noise: Noise = field(default_factory=Noise)
     offset_scale: float = 0.0
+    misalignment_scale: float = MISALIGNMENT_SD
     tilt_sd: float = 1e-7
     start_share: float = 1.0
     nonlinear_sd: Floats = field(default_factory=lambda: np.zeros(0))
