@@ -189,6 +189,19 @@ def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
     assert score.ratio < 1.5
 
 
+def test_a_curve_that_the_soaks_do_not_show_is_claimed():
+    # Each axis is vertical at a temperature of its own: the constants explain all norms, whatever
+    # the curve. WHY: the curve was claimed to be zero, and the error was
+    # fifteen times the claim.
+    rng = rng_of('confounded soaks')
+    unit = navigation(rng)
+    faces = np.vstack((np.eye(3), -np.eye(3), np.eye(3)))
+    bags = positions(unit, SOAKS, faces, rng)
+    held = positions(unit, HELD, spread(2, rng), rng)
+    study = Study('', bags, one_test(held), FULL_SCALE)
+    assert judged(strangers.fitted(study), study).ratio < 1.5
+
+
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
     # WHY: bags of soaks do not show the lags, and their unchanged left-out drift refused the
     # columns that the bag of ramps needs: 325 ug instead of 260 ug with the soaks alone.

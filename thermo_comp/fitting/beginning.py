@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import FitError
 from ..typing import Bools, Floats
-from .coverage import distinct_directions
+from .coverage import distinct_directions, norm_columns
 from .data_checks import POSITIONS_NEEDED
 from .hyperparameters import Candidates
 from .nonlinear import starting_sd, with_terms
@@ -186,7 +186,7 @@ def _noise_in_1_hz(windows: ThermalWindows, start: ConstantCalibration) -> float
     if not len(data.inner):
         return 0.0
     sigma = float(np.median(white_noise_of(data, start.scale)))
-    return sigma * np.sqrt(float(np.median(np.diff(data.time)[data.inner])))
+    return float(sigma * np.sqrt(np.median(np.diff(data.time)[data.inner])))
 
 
 def _mounting_scale(noise: float) -> float:
@@ -218,22 +218,8 @@ def _candidates(
     is_candidate = np.isin(groups, list(allowed)) & (data.kelvins > 0.0)
     is_candidate &= windows.has_temperature
     parts = np.stack((is_candidate, is_candidate & data.in_scale))
-    within = within_positions(data.mean / start.scale, data.position)
-    drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
-    if data.n_positions >= POSITIONS_NEEDED:
-        # If each rest has one temperature, the drift appears as a difference between the rests'
-        # norms.
-        force = (position_means(data) - start.bias) / start.scale
-        sizes = sizes_of(windows, options)
-        errors = np.linalg.norm(force, axis=1) - sizes
-        if np.ptp(sizes) > 0.0:
-            # Nonlinearity over |f| is not a thermal drift: subtract a cubic of |f|.
-            powers = np.vander(sizes / sizes.max(), 4)
-            errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
-        drift = max(drift, float(np.std(errors)))
-    temperature_sd = float(np.std(windows.temperature)) or 1.0
     # The smallest typical slope of the bias is 0.1 ug/K, better than navigation grade.
-    slope = float(np.clip(drift / temperature_sd, 1e-6, STEEPEST[0] / 3.0))
+    slope = float(np.clip(_steepness(windows, start, options), 1e-6, STEEPEST[0] / 3.0))
     slopes = np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])
     fixed = np.zeros(parts.shape, dtype=bool)
     if has_one_direction:
@@ -252,6 +238,35 @@ def _candidates(
         typical[:, 0] = largest[:, 0] = STEEPEST
         forced[0] = fixed[:, 0] = True
     return Candidates(typical, largest, forced, fixed)
+
+
+def _steepness(windows: ThermalWindows, start: ConstantCalibration, options: FitOptions) -> float:
+    """Return the RMS change of the readings per kelvin, as if it were the bias's [m/s^2 per K]."""
+    data = windows.data
+    within = within_positions(data.mean / start.scale, data.position)
+    drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
+    kelvins = float(np.std(windows.temperature)) or 1.0
+    if data.n_positions < POSITIONS_NEEDED:
+        return drift / kelvins
+    # If each rest has one temperature, the drift appears as a difference between the rests' norms.
+    force = (position_means(data) - start.bias) / start.scale
+    sizes = sizes_of(windows, options)
+    norms = np.linalg.norm(force, axis=1)
+    errors = norms - sizes
+    if np.ptp(sizes) > 0.0:
+        # Nonlinearity over |f| is not a thermal drift: subtract a cubic of |f|.
+        powers = np.vander(sizes / sizes.max(), 4)
+        errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
+    if _has_soaks_only(windows):
+        # The constants explain a part of the differences: take the RMS change of the norms, per
+        # unit of all slopes, that the constants do not explain.
+        constants = norm_columns(force / norms[:, None])[:, :6]
+        celsius = windows.temperature[data.edges[:-1]]
+        of_slopes = (celsius - celsius.mean())[:, None] * constants
+        of_slopes -= constants @ np.linalg.lstsq(constants, of_slopes, rcond=None)[0]
+        kelvins = float(np.sqrt(np.mean(np.sum(of_slopes**2, axis=1))))
+        return float(np.std(errors)) / max(kelvins, 1e-9)
+    return max(drift, float(np.std(errors))) / kelvins
 
 
 def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
