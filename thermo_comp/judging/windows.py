@@ -175,16 +175,6 @@ def columns_of(windows: Windows, bags: Sequence[str]) -> dict[str, npt.NDArray[A
     }
 
 
-def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floats:
-    """Average the rows of each label, in the order of the labels."""
-    weight = np.ones(len(labels)) if weight is None else weight
-    _, place = np.unique(labels, return_inverse=True)
-    count = np.bincount(place, weight)
-    total = np.zeros((len(count), *values.shape[1:]))
-    np.add.at(total, place, (values.T * weight).T)
-    return np.asarray((total.T / count).T)
-
-
 # A structured array of partial sums or windows.
 _Table: TypeAlias = npt.NDArray[Any]
 # Fields that a window has once; the others except `excess` are averaged over its sums.
