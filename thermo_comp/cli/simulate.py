@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ..recording.writer import BagWriter
     from ..simulation.campaign import Position
     from ..simulation.run import SimulatedRun
+    from ..simulation.spin import Spin
     from ..simulation.unit import UnitModel
 
 
@@ -114,7 +115,7 @@ def simulate(
             count = Counter(counts=0, board=0, case=0)
             with BagWriter(name, metadata=metadata, level=level, overwrite=force) as writer:
                 if station.spin is not None:
-                    _write_rate(writer, station)
+                    _write_rate(writer, station.spin, station.program.duration_s)
                 for more in _write(writer, runs, specimen, imu):
                     count.update(more)
                     done(i + count['counts'] / n_cycles)
@@ -163,17 +164,15 @@ def _force_metadata(station: 'Position', gravity: float, *, is_known: bool) -> d
     return {known_force.MAGNITUDE: '; '.join(lines)}
 
 
-def _write_rate(writer: 'BagWriter', station: 'Position') -> None:
+def _write_rate(writer: 'BagWriter', spin: 'Spin', duration_s: float) -> None:
     """Write the rate of the table, along the vertical z."""
     import numpy as np
 
     from ..simulation.run import START_NS
 
-    if station.spin is None:
-        return
-    time = np.arange(0.0, station.program.duration_s, _RATE_STEP_S)
+    time = np.arange(0.0, duration_s, _RATE_STEP_S)
     rate = np.zeros((len(time), 3))
-    rate[:, 2] = station.spin.rate_at(time)
+    rate[:, 2] = spin.rate_at(time)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     writer.write_counts(_RATE_TOPIC, stamps, rate, 'table')
 
