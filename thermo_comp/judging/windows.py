@@ -75,7 +75,6 @@ class Windows:
     gyro: Floats
 
     def __len__(self) -> int:
-        """Return the number of windows."""
         return len(self.time)
 
     def select(self, rows: Bools) -> Windows:

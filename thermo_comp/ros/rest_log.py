@@ -21,7 +21,7 @@ import numpy as np
 
 from ..errors import OutputError
 from ..field.gather import RestFinder
-from ..field.rest import SUFFIX, Start, counted_rests, encode, most_thinnable, thinned
+from ..field.rest import SUFFIX, Start, counted_rests, encode, thinned
 from ..online.compensator import Compensator
 from ..thermal.state import Layout
 from ..typing import Floats, Stamps
@@ -92,14 +92,11 @@ class RestLog:
         except OSError as error:
             self.reason = error.strerror or str(error)
         while (line := self._lines.get()) is not None:
-            self._try(*line)
-
-    def _try(self, day: str, start: bytes, rest: bytes) -> None:
-        try:
-            self._write(day, start, rest)
-        except OSError as error:
-            self._is_torn = True
-            self._lose(error.strerror or str(error))
+            try:
+                self._write(*line)
+            except OSError as error:  # noqa: PERF203 - the next line may be written
+                self._is_torn = True
+                self._lose(error.strerror or str(error))
 
     def _write(self, day: str, start: bytes, rest: bytes) -> None:
         path = self._folder / f'{day}{SUFFIX}'
@@ -135,11 +132,11 @@ class RestLog:
     def _bound_folder(self) -> None:
         while True:
             sizes = {path.name: path.stat().st_size for path in self._folder.glob(f'*{SUFFIX}')}
-            day = most_thinnable(sizes, FOLDER_BYTES, _FLOOR)
-            if day is None:
+            oldest = next((day for day in sorted(sizes) if sizes[day] > _FLOOR), None)
+            if oldest is None or sum(sizes.values()) <= FOLDER_BYTES:
                 return
-            self._thin(self._folder / day)
-            if (self._folder / day).stat().st_size >= sizes[day]:
+            self._thin(self._folder / oldest)
+            if (self._folder / oldest).stat().st_size >= sizes[oldest]:
                 return
 
 
