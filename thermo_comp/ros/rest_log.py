@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from queue import Full, Queue
-from typing import Any
 
 import numpy as np
 
@@ -41,7 +40,7 @@ _EPOCH_NS = 946_684_800 * 10**9
 #: Backward step of the stamps [ns] from which a recording has begun anew.
 _JUMP_NS = 10**9
 # Plain form of a message (see `relay`): offsets from its end of counts, force and angular rate.
-_PLAIN, _COUNTS, _FORCE, _RATE = b'\0\1', -24, -96, -192
+_PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
 _SHORTEST = {False: 44, True: 316}  # shortest message [bytes]; True: an Imu
 
 
@@ -218,18 +217,16 @@ def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floa
     content = b''.join(messages)
     if len(content) != size * len(messages):
         content = b''.join([message for message in messages if len(message) == size])
-    at = size + (_FORCE if is_imu else _COUNTS)
-    # An angular rate and the first element of its covariance, which is -1 where there is none.
-    fields = [('plain', 'S4', 0), ('sec', '<i4', 4), ('nanosec', '<u4', 8), ('force', '3<f8', at)]
-    fields += [('rate', '4<f8', size + _RATE)] * is_imu
-    row = zip(('names', 'formats', 'offsets'), map(list, zip(*fields, strict=True)), strict=True)
-    kind: Any = {**dict(row), 'itemsize': size}
-    table: Any = np.frombuffer(content, np.dtype(kind))
-    is_plain = table['plain'] == _PLAIN
+    rows = np.frombuffer(content, np.uint8).reshape(-1, size)
+    is_plain = (rows[:, :4] == _PLAIN).all(axis=1)
     if not is_plain.all():
-        table = table[is_plain]
-    samples = table['force']
-    if is_imu and (table['rate'][:, 3] != -1.0).all():
-        samples = np.hstack((samples, table['rate'][:, :3]))
-    stamps = table['sec'] * np.int64(1_000_000_000) + table['nanosec']
-    return stamps, samples
+        rows = rows[is_plain]
+    at = size + (_FORCE if is_imu else _COUNTS)
+    samples = rows[:, at : at + 24].view('<f8')
+    if is_imu:
+        # An angular rate and the first element of its covariance, which is -1 without a rate.
+        rate = rows[:, size + _RATE : size + _RATE + 32].view('<f8')
+        if (rate[:, 3] != -1.0).all():
+            samples = np.hstack((samples, rate[:, :3]))
+    seconds, rest = rows[:, 4:8].view('<i4')[:, 0], rows[:, 8:12].view('<u4')[:, 0]
+    return seconds * np.int64(1_000_000_000) + rest, samples
