@@ -313,8 +313,7 @@ def _mean(cells: Cells, ranges: Sequence[tuple[int, int]]) -> Floats:
 
 
 def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
-    use = (readings.stamp_ns >= begin_ns) & (readings.stamp_ns < end_ns)
-    return Readings(readings.stamp_ns[use], readings.celsius[use], readings.after[use])
+    return readings.take((readings.stamp_ns >= begin_ns) & (readings.stamp_ns < end_ns))
 
 
 def _together(surveys: Sequence[Surveys]) -> Surveys:

@@ -19,7 +19,11 @@ if TYPE_CHECKING:
     from ..recording.writer import BagWriter
     from ..simulation.campaign import Position
     from ..simulation.run import SimulatedRun
+    from ..simulation.spin import Spin
     from ..simulation.unit import UnitModel
+
+#: Topic of the rotation rate, its interval [s], and sd of the stated radius [m].
+_RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
 
 
 def simulate(
@@ -114,7 +118,7 @@ def simulate(
             count = Counter(counts=0, board=0, case=0)
             with BagWriter(name, metadata=metadata, level=level, overwrite=force) as writer:
                 if station.spin is not None:
-                    _write_rate(writer, station)
+                    _write_rate(writer, station.spin, station.program.duration_s)
                 for more in _write(writer, runs, specimen, imu):
                     count.update(more)
                     done(i + count['counts'] / n_cycles)
@@ -129,30 +133,20 @@ def _metadata(
 ) -> dict[str, str]:
     """Return the metadata of a bag: serial, truth, and how a fit learns |f| in a rotation."""
     from .. import __version__
+    from ..fitting import known_force
 
     of_unit = picked(unit, 'scale_factor bias_at_reference')
     truth |= {'up': station.up.tolist(), **of_unit, 'misalignment': unit.M.tolist()}
-    return {
+    metadata = {
         'serial': unit.serial,
         'simulated_by': f'thermo_comp {__version__}',
         'truth': json.dumps(truth),
-        **_force_metadata(station, gravity, is_known=is_known),
     }
-
-
-#: Topic of the rotation rate, its interval [s], and sd of the stated radius [m].
-_RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
-
-
-def _force_metadata(station: 'Position', gravity: float, *, is_known: bool) -> dict[str, str]:
-    """Return the metadata from which a fit learns |f| in a rotation."""
-    from ..fitting import known_force
-
     spin = station.spin
     if spin is None:
-        return {}
+        return metadata
     if not is_known:
-        return {
+        return metadata | {
             known_force.ROTATION: _RATE_TOPIC,
             known_force.RADIUS: f'{spin.radius:g}',
             known_force.RADIUS_SD: f'{_RADIUS_SD_M:g}',
@@ -160,20 +154,18 @@ def _force_metadata(station: 'Position', gravity: float, *, is_known: bool) -> d
     end_s = station.program.duration_s
     rows = [section for section in spin.sections(gravity) if section[0] < end_s]
     lines = [f'{begin:g} {min(end, end_s):g} {size:.9g}' for begin, end, size in rows]
-    return {known_force.MAGNITUDE: '; '.join(lines)}
+    return metadata | {known_force.MAGNITUDE: '; '.join(lines)}
 
 
-def _write_rate(writer: 'BagWriter', station: 'Position') -> None:
+def _write_rate(writer: 'BagWriter', spin: 'Spin', duration_s: float) -> None:
     """Write the rate of the table, along the vertical z."""
     import numpy as np
 
     from ..simulation.run import START_NS
 
-    if station.spin is None:
-        return
-    time = np.arange(0.0, station.program.duration_s, _RATE_STEP_S)
+    time = np.arange(0.0, duration_s, _RATE_STEP_S)
     rate = np.zeros((len(time), 3))
-    rate[:, 2] = station.spin.rate_at(time)
+    rate[:, 2] = spin.rate_at(time)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     writer.write_counts(_RATE_TOPIC, stamps, rate, 'table')
 

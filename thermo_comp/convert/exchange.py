@@ -24,7 +24,7 @@ from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
 from ..unit.prediction import bias_and_scale, ramp_states
 from ..unit.provenance import Provenance
 from ..unit.rate_bias import MILLIDEGREE, Gyroscope, RateCurve, RateSet
-from .tools import TOOLS, Content, Tool, ql, turned
+from .tools import TOOLS, Content, ql, turned
 
 _GRID = 257
 #: White noise assumed for an imported gyroscope [rad/s/sqrt(Hz)].
@@ -51,22 +51,10 @@ def export_calibration(
     """
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')
-    content = _content(calibration, TOOLS[to], up)
-    text = TOOLS[to].write(content, number, device_id)
-    title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
-    # A note is a single line; imu_tk's reader knows no comments.
-    head = [] if to == 'imu_tk' else [f'# {one_line(line)}\n' for line in (title, *content.notes)]
-    return replace(content, text=''.join(head) + text)
-
-
-def _content(
-    calibration: Calibration, tool: Tool, up: tuple[float, float, float] | None
-) -> Content:
-    """Convert a calibration to the content of a tool's file, with notes on lost parts."""
-    curves = _static_curves(calibration)
-    own_reference_c = calibration.reference_temperature_c
-    reference_c = own_reference_c if tool.reference_c is None else tool.reference_c
+    tool, curves = TOOLS[to], _static_curves(calibration)
     if tool.is_thermal:
+        own_reference_c = calibration.reference_temperature_c
+        reference_c = own_reference_c if tool.reference_c is None else tool.reference_c
         content = _thermal(calibration, curves, reference_c, up)
         of_counts = 'offsets are counts divided by K: the driver must scale by these K'
     else:
@@ -84,7 +72,12 @@ def _content(
         max(calibration.slow_noise_m_s2_sqrt_h),
         1.0 / calibration.unit.cycle_time_s,
     )
-    return replace(content, notes=notes, noise=noise)
+    content = replace(content, notes=notes, noise=noise)
+    text = tool.write(content, number, device_id)
+    title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
+    # A note is a single line; imu_tk's reader knows no comments.
+    head = [] if to == 'imu_tk' else [f'# {one_line(line)}\n' for line in (title, *content.notes)]
+    return replace(content, text=''.join(head) + text)
 
 
 class _Curves(NamedTuple):

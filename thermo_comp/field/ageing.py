@@ -112,19 +112,15 @@ def rows_of(series: Series, scatter: float) -> Rows:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
         # Q is orthogonal, so the sum of n equal rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
-        mean = np.full(Q.shape[1], series.temperature[at].mean() - series.reference_temperature)
+        n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
+        summed = (series.miss, series.by_parameter, series.by_level, series.lack)
         parts.append(
             (
-                np.full(Q.shape[1], series.time[at].mean()),
-                np.full(Q.shape[1], start),
-                Q.T @ series.miss[at],
-                Q.T @ series.by_parameter[at],
-                Q.T @ series.by_level[at],
-                Q.T @ series.lack[at],
-                mean,
-                (Q**2).T @ series.noise[at],
-                (Q**2).sum(axis=0),
-                np.arange(Q.shape[1]),
+                *(np.full(n, series.time[at].mean()), np.full(n, start)),
+                *(Q.T @ column[at] for column in summed),
+                np.full(n, warmth),
+                *((Q**2).T @ series.noise[at], (Q**2).sum(axis=0)),
+                np.arange(n),
             )
         )
     rows = Rows(*[np.concatenate(part) for part in zip(*parts, strict=True)])
@@ -208,8 +204,12 @@ class Model:
             key=lambda result: result.fun,
         )
         ageing = Ageing(*np.exp(best.x).tolist())
+        return ageing, self.inverse(ageing)
+
+    def inverse(self, ageing: Ageing) -> Floats:
+        """Return the inverse covariance of the rows."""
         factor = cho_factor(self.covariance(ageing), lower=True)
-        return ageing, cho_solve(factor, np.eye(len(self.rows.y)))
+        return np.asarray(cho_solve(factor, np.eye(len(self.rows.y))))
 
 
 def usual(calibration: Calibration) -> Ageing:
@@ -245,9 +245,7 @@ def learn(series: Series, calibration: Calibration, since: float) -> tuple[Agein
                 break
             changes += (best,)
         everything = Model(rows, calibration, since, changes)
-        inverse = cho_solve(
-            cho_factor(everything.covariance(ageing), lower=True), np.eye(len(rows.y))
-        )
+        inverse = everything.inverse(ageing)
         left_out = (inverse @ rows.y) / np.sqrt(np.diag(inverse))
         bad = rows.start[np.abs(left_out) > 5.0]
         at = np.flatnonzero(is_used)

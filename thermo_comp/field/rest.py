@@ -171,13 +171,6 @@ def thinned(content: bytes) -> bytes:
     return b''.join(kept)
 
 
-def most_thinnable(sizes: dict[str, int], limit: int, floor: int) -> str | None:
-    """Return the oldest day above `floor` if the total exceeds `limit` [bytes], or None."""
-    if sum(sizes.values()) <= limit:
-        return None
-    return next((day for day in sorted(sizes) if sizes[day] > floor), None)
-
-
 def rests_of(
     contents: Iterable[bytes], is_wanted: Callable[[Start], bool]
 ) -> tuple[list[tuple[Start, Rest]], int]:

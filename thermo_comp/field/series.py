@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from ..thermal.state import BOARD, Layout
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration, parameter_layout
 from ..unit.correction import Correction
+from ..unit.metrics import means_by
 from ..unit.prediction import SlowUncertainty
 from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
@@ -197,12 +199,7 @@ def series_of(
     local = np.array([s.gravity if gravity is None else gravity for s, _ in rests])
     group = _grouped(beginnings, states[:, BOARD], mean / K)
     sizes = np.bincount(group)
-
-    def averaged(values: Floats) -> Floats:
-        total = np.zeros((len(sizes), *values.shape[1:]))
-        np.add.at(total, group, values)
-        return np.asarray((total.T / sizes).T)
-
+    averaged = partial(means_by, group)
     first = np.searchsorted(group, np.arange(len(sizes)))
     states, mean = averaged(states), averaged(mean)
     shares, local = averaged(shares.reshape(len(rests), n_lags)), averaged(local)

@@ -15,9 +15,10 @@ from ..text import counted
 from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G, spoken
+from ..unit.metrics import means_by
 from . import verdicts
 from .verdicts import Section, Sections, Verdict
-from .windows import Windows, means_by
+from .windows import Windows
 
 # Claimed sd above which a valid calibration is called wide [m/s^2].
 _WIDE_CLAIM = 1e3 * MICRO_G

@@ -11,10 +11,10 @@ import numpy as np
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration, rate_triad
 from ..unit.correction import Correction
-from ..unit.metrics import residual_statistics
+from ..unit.metrics import means_by, residual_statistics
 from ..unit.prediction import SlowUncertainty
 from ..unit.rate_bias import MILLIDEGREE
-from .windows import Windows, means_by
+from .windows import Windows
 
 #: Largest ratio of RMS error to claimed RMS at which a calibration is valid.
 LARGEST_RATIO = 2.0

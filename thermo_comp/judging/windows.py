@@ -75,7 +75,6 @@ class Windows:
     gyro: Floats
 
     def __len__(self) -> int:
-        """Return the number of windows."""
         return len(self.time)
 
     def select(self, rows: Bools) -> Windows:
@@ -126,6 +125,7 @@ def corrected_windows(
     gravity = np.nan if gravity is None else gravity
     table = _table(bags, calibration, window_s, gravity)
     raw, claimed_sd, noise_sd = table['mean'], *np.full((2, len(table)), np.nan)
+    is_inside = table['excess'] <= _EDGE
     if calibration is not None:
         constants, force = constants_of(calibration), table['force']
         raw = constants.force(raw)
@@ -137,11 +137,15 @@ def corrected_windows(
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
         claimed_sd = np.sqrt(variance + table['size_sd'] ** 2)
         noise_sd = np.sqrt(mean_white)
+        known = calibration.nonlinearity
+        is_inside &= table['size'] <= (
+            known.force_range_m_s2[1] if known else (1.0 + _USUAL) * gravity
+        )
     return Windows(
         window_s=window_s,
         gravity=gravity,
         is_dynamic=table['weight'] > 0.5,
-        is_inside=(table['excess'] <= _EDGE) & _is_seen(calibration, table['size'], gravity),
+        is_inside=is_inside,
         is_swapped=table['swapped'] > 0.0,
         raw=raw,
         claimed_sd=claimed_sd,
@@ -175,31 +179,12 @@ def columns_of(windows: Windows, bags: Sequence[str]) -> dict[str, npt.NDArray[A
     }
 
 
-def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floats:
-    """Average the rows of each label, in the order of the labels."""
-    weight = np.ones(len(labels)) if weight is None else weight
-    _, place = np.unique(labels, return_inverse=True)
-    count = np.bincount(place, weight)
-    total = np.zeros((len(count), *values.shape[1:]))
-    np.add.at(total, place, (values.T * weight).T)
-    return np.asarray((total.T / count).T)
-
-
 # A structured array of partial sums or windows.
 _Table: TypeAlias = npt.NDArray[Any]
 # Fields that a window has once; the others except `excess` are averaged over its sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')
 _TRIPLES = ('mean', 'force')
-
-
-def _is_seen(calibration: Calibration | None, size: Floats, gravity: float) -> Bools:
-    """Whether each |f| is within the calibrated forces."""
-    if calibration is None:
-        return np.ones(len(size), dtype=bool)
-    known = calibration.nonlinearity
-    most = known.force_range_m_s2[1] if known else (1.0 + _USUAL) * gravity
-    return np.asarray(size <= most)
 
 
 def _table(

@@ -24,7 +24,6 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_USUAL = Topics()
 _CHUNK_BYTES = 1 << 17  # lost if the process is killed [bytes]: half a minute at 100 Hz
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1

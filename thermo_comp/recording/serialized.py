@@ -56,7 +56,6 @@ class Messages:
         return cls(data, np.cumsum(size) - size, size, numbers, times)
 
     def __len__(self) -> int:
-        """Return the number of messages."""
         return len(self.start)
 
     def __iter__(self) -> Iterator[bytes]:

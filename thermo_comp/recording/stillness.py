@@ -245,13 +245,10 @@ def _quantum_of(samples: Floats) -> Floats:
 
 
 def still_intervals(
-    cells: Cells, min_rest_s: float, still_sd: float = STILL_SD, ratio: float = VARIANCE_RATIO
+    cells: Cells, min_rest_s: float, still_sd: float = STILL_SD
 ) -> list[tuple[int, int]]:
-    """
-    Find the runs of still cells: half-open ranges of cell numbers, in order. `still_sd` is the
-    largest scatter at rest [g], `ratio` the largest variance of a still cell / quiet level.
-    """
-    return long_enough(cells, still_runs(cells, still_sd, (ratio,))[0], min_rest_s)
+    """Find the runs of still cells: half-open ranges of cell numbers, in order."""
+    return long_enough(cells, still_runs(cells, still_sd, (VARIANCE_RATIO,))[0], min_rest_s)
 
 
 def long_enough(
@@ -265,7 +262,10 @@ def long_enough(
 def still_runs(
     cells: Cells, still_sd: float, ratios: Sequence[float]
 ) -> list[list[tuple[int, int]]]:
-    """Find the runs of still cells of any length, with each ratio; see `still_intervals`."""
+    """
+    Find the runs of still cells of any length, for each ratio of the largest variance of a still
+    cell to the quiet level; `still_sd` is the largest scatter at rest [g].
+    """
     full = _is_full(cells)
     believable = full & is_under(cells, still_sd) & ~_is_turning(cells)
     if not believable.any():

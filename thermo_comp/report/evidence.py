@@ -17,13 +17,13 @@ from ..fitting.sensors import learn_detector
 from ..judging.evaluation import Epoch, history_of, judge_bags
 from ..judging.judgement import Judgement
 from ..judging.verdicts import Verdict
-from ..judging.windows import WINDOW_S, Windows, corrected_windows, means_by, usual_window
+from ..judging.windows import WINDOW_S, Windows, corrected_windows, usual_window
 from ..replay import check_unit
 from ..text import counted
 from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.gravity import spoken
-from ..unit.metrics import norm_residual
+from ..unit.metrics import means_by, norm_residual
 from ..unit.provenance import Source
 from .trace import ShownBag, shown_bag, widest
 

@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..judging.windows import means_by
 from ..typing import Floats
 from ..unit.calibration import AXES, Calibration, rate_triad
 from ..unit.gravity import MICRO_G
+from ..unit.metrics import means_by
 from ..unit.rate_bias import MILLIDEGREE
 from . import style
 from .evidence import CHOSEN, Evidence, given

@@ -101,7 +101,7 @@ def render_report(
         combined=combined(contributions),
         conformity=conformity(evidence),
         over_temperature=over_temperature(evidence, info),
-        programs=_programs(evidence),
+        programs=programs(evidence.calibration) if evidence.calibration else (),
         groups={CURVE: 'curve over temperature', SET: 'difference of the sets', **GROUPS},
         withheld=withheld_because(evidence, info),
         is_gravity_known=unclaimed_gravity_sd(evidence, info) is not None,
@@ -155,13 +155,6 @@ def _seen(evidence: Evidence) -> list[str]:
     if shown is not None and all(stretch.regime == Regime.UNKNOWN for stretch in shown.stretches):
         collected.append('The regime was never known: the bag is too short for the detector.')
     return collected
-
-
-def _programs(evidence: Evidence) -> str:
-    """Name the soak and the ramps of the table over temperature."""
-    if evidence.calibration is None:
-        return ''
-    return ', '.join(program.label for program in programs(evidence.calibration))
 
 
 def _test_dates(evidence: Evidence) -> str:

@@ -80,7 +80,7 @@ class CompensationNode:
         self._reporter = Reporter(self._loop, self._relay)
         self._reader = Reader()
         self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
-        self._report_every(config.diagnostics_period)
+        self._loop.call_every(config.diagnostics_period, self._report)
         topics = [self.node.resolve_topic_name(sample.name) for sample in SAMPLES.values()]
         # Accept QoS overrides also of the input that is not open: it may be opened later.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
@@ -108,9 +108,6 @@ class CompensationNode:
         if self._relay.rests is not None:
             self._relay.rests.log.close()
         self.node.destroy_node()
-
-    def _report_every(self, period_s: float) -> None:
-        self._loop.call_every(period_s, self._report)
 
     def _report(self) -> None:
         self._relay.look()
@@ -167,7 +164,7 @@ class CompensationNode:
     def _run_with(self, running: Running) -> None:
         period_s, self._relay.running = self._config.diagnostics_period, running
         if running.config.diagnostics_period != period_s:
-            self._report_every(running.config.diagnostics_period)
+            self._loop.call_every(running.config.diagnostics_period, self._report)
 
     def _check(
         self, loaded: LoadedCalibration, config: parameters.NodeConfig, inputs: tuple[str, ...]

@@ -15,12 +15,12 @@ import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from queue import Empty, SimpleQueue
 
 from ..errors import CalibrationError
 from ..files import read_bounded
@@ -82,23 +82,19 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
 
 def read_within(name: str, directory: str, limit_s: float = LIMIT_S) -> LoadedCalibration:
     """Do `read` in a thread; CalibrationError if the file hangs."""
-    answers: SimpleQueue[LoadedCalibration | Exception] = SimpleQueue()
+    answer: Future[LoadedCalibration] = Future()
 
-    def answer() -> None:
+    def run() -> None:
         try:
-            answers.put(read(name, directory))
-        except Exception as error:  # noqa: BLE001 - returned as the answer
-            answers.put(error)
+            answer.set_result(read(name, directory))
+        except Exception as error:  # noqa: BLE001 - raised by `result`
+            answer.set_exception(error)
 
     # A daemon: if the file hangs, the end of the process does not wait for it.
-    threading.Thread(target=answer, name='first reading', daemon=True).start()
-    try:
-        received = answers.get(timeout=limit_s)
-    except Empty:
-        raise _hanging(name, limit_s) from None
-    if isinstance(received, Exception):
-        raise received
-    return received
+    threading.Thread(target=run, name='first reading', daemon=True).start()
+    if not wait([answer], limit_s).done:
+        raise _hanging(name, limit_s)
+    return answer.result()
 
 
 def _hanging(name: str, limit_s: float) -> CalibrationError:

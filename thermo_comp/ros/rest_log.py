@@ -15,13 +15,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from queue import Full, Queue
-from typing import Any
 
 import numpy as np
 
 from ..errors import OutputError
 from ..field.gather import RestFinder
-from ..field.rest import SUFFIX, Start, counted_rests, encode, most_thinnable, thinned
+from ..field.rest import SUFFIX, Start, counted_rests, encode, thinned
 from ..online.compensator import Compensator
 from ..thermal.state import Layout
 from ..typing import Floats, Stamps
@@ -41,7 +40,7 @@ _EPOCH_NS = 946_684_800 * 10**9
 #: Backward step of the stamps [ns] from which a recording has begun anew.
 _JUMP_NS = 10**9
 # Plain form of a message (see `relay`): offsets from its end of counts, force and angular rate.
-_PLAIN, _COUNTS, _FORCE, _RATE = b'\0\1', -24, -96, -192
+_PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
 _SHORTEST = {False: 44, True: 316}  # shortest message [bytes]; True: an Imu
 
 
@@ -92,14 +91,11 @@ class RestLog:
         except OSError as error:
             self.reason = error.strerror or str(error)
         while (line := self._lines.get()) is not None:
-            self._try(*line)
-
-    def _try(self, day: str, start: bytes, rest: bytes) -> None:
-        try:
-            self._write(day, start, rest)
-        except OSError as error:
-            self._is_torn = True
-            self._lose(error.strerror or str(error))
+            try:
+                self._write(*line)
+            except OSError as error:  # noqa: PERF203 - the next line may be written
+                self._is_torn = True
+                self._lose(error.strerror or str(error))
 
     def _write(self, day: str, start: bytes, rest: bytes) -> None:
         path = self._folder / f'{day}{SUFFIX}'
@@ -135,11 +131,11 @@ class RestLog:
     def _bound_folder(self) -> None:
         while True:
             sizes = {path.name: path.stat().st_size for path in self._folder.glob(f'*{SUFFIX}')}
-            day = most_thinnable(sizes, FOLDER_BYTES, _FLOOR)
-            if day is None:
+            oldest = next((day for day in sorted(sizes) if sizes[day] > _FLOOR), None)
+            if oldest is None or sum(sizes.values()) <= FOLDER_BYTES:
                 return
-            self._thin(self._folder / day)
-            if (self._folder / day).stat().st_size >= sizes[day]:
+            self._thin(self._folder / oldest)
+            if (self._folder / oldest).stat().st_size >= sizes[oldest]:
                 return
 
 
@@ -221,18 +217,16 @@ def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floa
     content = b''.join(messages)
     if len(content) != size * len(messages):
         content = b''.join([message for message in messages if len(message) == size])
-    at = size + (_FORCE if is_imu else _COUNTS)
-    # An angular rate and the first element of its covariance, which is -1 where there is none.
-    fields = [('plain', 'S4', 0), ('sec', '<i4', 4), ('nanosec', '<u4', 8), ('force', '3<f8', at)]
-    fields += [('rate', '4<f8', size + _RATE)] * is_imu
-    row = zip(('names', 'formats', 'offsets'), map(list, zip(*fields, strict=True)), strict=True)
-    kind: Any = {**dict(row), 'itemsize': size}
-    table: Any = np.frombuffer(content, np.dtype(kind))
-    is_plain = table['plain'] == _PLAIN
+    rows = np.frombuffer(content, np.uint8).reshape(-1, size)
+    is_plain = (rows[:, :4] == _PLAIN).all(axis=1)
     if not is_plain.all():
-        table = table[is_plain]
-    samples = table['force']
-    if is_imu and (table['rate'][:, 3] != -1.0).all():
-        samples = np.hstack((samples, table['rate'][:, :3]))
-    stamps = table['sec'] * np.int64(1_000_000_000) + table['nanosec']
-    return stamps, samples
+        rows = rows[is_plain]
+    at = size + (_FORCE if is_imu else _COUNTS)
+    samples = rows[:, at : at + 24].view('<f8')
+    if is_imu:
+        # An angular rate and the first element of its covariance, which is -1 without a rate.
+        rate = rows[:, size + _RATE : size + _RATE + 32].view('<f8')
+        if (rate[:, 3] != -1.0).all():
+            samples = np.hstack((samples, rate[:, :3]))
+    seconds, rest = rows[:, 4:8].view('<i4')[:, 0], rows[:, 8:12].view('<u4')[:, 0]
+    return seconds * np.int64(1_000_000_000) + rest, samples

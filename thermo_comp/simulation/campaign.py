@@ -39,7 +39,6 @@ _PROGRAMS = {
     # Three temperatures with time to settle, for runs on a centrifuge or a rate table.
     'three-soaks': '20 60min, 35@1 60min, 5@1 60min',
 }
-CYCLOGRAM_NAMES = tuple(_PROGRAMS)
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
 # Edges of the cube: one per pair of axes with sum 0, their opposites, the other edges.
 _EDGES = [
@@ -81,7 +80,7 @@ class Cyclogram:
 
 def parse_cyclogram(text: str) -> Cyclogram:
     """
-    Read a program as a user types it, or the name of a ready-made program, `CYCLOGRAM_NAMES`.
+    Read a program as a user types it, or the name of a ready-made program.
 
     Steps are separated by commas, semicolons or lines: ``TARGET[@RATE] [SOAK]`` with the target in
     degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is the

@@ -66,5 +66,4 @@ class ReadingQueue:
         return (max(entry[0] for entry in self._entries) - stamp_ns) * 1e-9
 
     def __len__(self) -> int:
-        """Return the number of waiting readings."""
         return len(self._entries)

@@ -43,7 +43,6 @@ class ThermometerSettings:
     ] = 600.0
 
     def __post_init__(self) -> None:
-        """Refuse values that no sensor has."""
         refuse_impossible(self)
 
     @property
@@ -101,7 +100,6 @@ class DetectorSettings:
     )
 
     def __post_init__(self) -> None:
-        """Refuse values that contradict each other."""
         refuse_impossible(self)
         if self.closes not in get_args(Closes):
             raise ValueError(f"`closes` must be 'board' or 'case', got {self.closes!r}")
@@ -126,5 +124,4 @@ class ThermalConfig:
     case_timeout_s: Positive = 30.0
 
     def __post_init__(self) -> None:
-        """Refuse values outside their ranges."""
         refuse_impossible(self)

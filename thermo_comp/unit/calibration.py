@@ -100,7 +100,6 @@ class Axes:
     z: AxisReference
 
     def __iter__(self) -> Iterator[AxisReference]:
-        """Iterate over the three axes in order."""
         return iter((self.x, self.y, self.z))
 
 

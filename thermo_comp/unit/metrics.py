@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..typing import Bools, Floats
+from ..typing import Bools, Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,16 @@ def norm_residual(specific_force: Floats, gravity: float | Floats) -> Floats:
     """Return ``|f| - g`` of forces (..., 3), which needs no attitude; `gravity`: the known |f|."""
     square = np.einsum('...i,...i->...', specific_force, specific_force)
     return np.asarray(np.sqrt(square) - gravity)
+
+
+def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floats:
+    """Average the rows of each label, in the order of the labels."""
+    weight = np.ones(len(labels)) if weight is None else weight
+    _, place = np.unique(labels, return_inverse=True)
+    count = np.bincount(place, weight)
+    total = np.zeros((len(count), *values.shape[1:]))
+    np.add.at(total, place, (values.T * weight).T)
+    return np.asarray((total.T / count).T)
 
 
 def statistics_by_regime(residual: Floats, is_dynamic: Bools) -> dict[str, ResidualStatistics]:

@@ -137,15 +137,10 @@ def nonlinear_coefficients(calibration: Calibration) -> list[Coefficients]:
     result = []
     for k, term in enumerate(terms):
         name, unit = names[term.kind]
-        result += [
-            Coefficients(name, unit, 1e6 * np.array(term.coefficient), 1e6 * sd[:, 0, k]),
-            Coefficients(
-                f'{name} per kelvin',
-                f'{unit}/K',
-                1e6 * np.array(term.per_kelvin),
-                1e6 * sd[:, 1, k],
-            ),
-        ]
+        at, slope = 1e6 * np.array((term.coefficient, term.per_kelvin))
+        at_sd, slope_sd = 1e6 * sd[:, :, k].T
+        result.append(Coefficients(name, unit, at, at_sd))
+        result.append(Coefficients(f'{name} per kelvin', f'{unit}/K', slope, slope_sd))
     return result
 
 

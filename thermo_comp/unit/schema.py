@@ -13,8 +13,7 @@ import dataclasses
 import math
 import re
 import typing
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import lru_cache
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
@@ -45,20 +44,6 @@ def build(hint: type[Value], data: Any, key: str = '') -> Value:
     """Build a value of a type hint from plain values; SchemaError with the key if they differ."""
     result: Value = _build(hint, data, key)
     return result
-
-
-@contextmanager
-def naming(key: str) -> Iterator[None]:
-    """Turn a ValueError that begins with a key in backticks into a SchemaError of that key."""
-    try:
-        yield
-    except SchemaError:
-        raise
-    except ValueError as error:
-        named = _NAMED_FIRST.fullmatch(str(error))
-        if named is None:
-            raise SchemaError(key, str(error)) from error
-        raise SchemaError(_joined(key, named['key']), named['rest']) from error
 
 
 def check_ranges(value: object, **spans: Bounds) -> None:
@@ -144,8 +129,13 @@ def _object(cls: type, data: Any, key: str) -> Any:
         for name, hint in hints.items()
         if name in data
     }
-    with naming(key):
+    try:
         return cls(**values)
+    except ValueError as error:
+        named = _NAMED_FIRST.fullmatch(str(error))
+        if named is None:
+            raise SchemaError(key, str(error)) from error
+        raise SchemaError(_joined(key, named['key']), named['rest']) from error
 
 
 def _sequence(arguments: tuple[Any, ...], data: Any, key: str) -> tuple[Any, ...]:
