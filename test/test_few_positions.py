@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Few positions: the parameters that they determine are right, the others stay at their prior."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +133,16 @@ def test_positions_without_temperature(rng):
     np.testing.assert_allclose(
         np.sqrt(np.diagonal(out.covariance[0])), np.hypot(left, 0.02), rtol=0.05
     )
+
+
+def test_the_assumed_repeatability_of_the_bias_is_said(rng):
+    def names(n, options):
+        return {finding.name for finding in fit([turned(rng, positions(n, 3))], options).findings}
+
+    # Nine norms are explained by nine constants, whatever the offsets of the mountings.
+    assert 'mountings' in names(9, OPTIONS)
+    assert 'mountings' not in names(9, replace(OPTIONS, mounting_sd=1e-3))
+    assert 'mountings' not in names(12, OPTIONS)
 
 
 def test_six_faces_claim_the_cross_axis_sensitivity_of_a_mems(rng):

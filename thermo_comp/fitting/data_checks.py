@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 #: Smallest number of distinct attitudes that determine bias and scale factor, which are six
 #: constants, and the misalignment in addition, which has three more.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT = 6, 9
+#: Smallest number of positions whose norms determine the sd of mounting offsets beside the nine
+#: constants.
+POSITIONS_FOR_MOUNTINGS = 12
 
 
 @dataclass(frozen=True)
@@ -294,6 +297,24 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
             f'{least.away_deg:.0f} deg away from every position the sd of |f| is '
             f'{spoken(least.sd_m_s2)}, in the positions {spoken(least.seen_sd_m_s2)}: record one '
             f'with {spoken_direction(np.array(least.up))}',
+        )
+
+
+def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator[Finding]:
+    """
+    Tell which repeatability of mountings and turn-ons is assumed if the norms do not determine it.
+
+    `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. The norms of nine positions
+    are explained by nine constants, whatever the offsets.
+    """
+    n = fit.windows.data.n_positions
+    is_assumed = options.mounting_sd is None and options.prior is None
+    if is_assumed and POSITIONS_NEEDED <= n < POSITIONS_FOR_MOUNTINGS:
+        yield _advice(
+            'mountings',
+            f'{n} positions do not show how well the bias repeats after the unit is mounted or '
+            f'switched on again; the uncertainty assumes {spoken(offset_sd)}: state '
+            f'--mounting-sd, or record {POSITIONS_FOR_MOUNTINGS} positions or more',
         )
 
 

@@ -239,6 +239,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     K = fit.posterior.state.kappa * start.scale
     has_temperature = fit.windows.has_temperature
     findings += data_checks.judge_result(K, residuals, claim.offset_sd, options, has_temperature)
+    findings += data_checks.judge_mountings(fit, claim.offset_sd, options)
     try:
         nonlinearity = of_file(fit.regression, terms, options)
         calibration = build_calibration(
