@@ -87,6 +87,19 @@ def test_a_part_between_board_and_case():
     assert judged(calibration, study).norm < 2.0
 
 
+def test_a_noisy_sensor_in_one_warm_up():
+    # WHY: a spline of 60 nodes over 50 K explained the drift with twice the time constant of an
+    # axis, and left 80 ug; a curve of few nodes determines the time constants.
+    thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
+    rng = rng_of('noisy thaw', 2)
+    unit = navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
+    unit = replace(unit, density=30.0, bias_curve=5.0 * unit.bias_curve, counts=0.0)
+    bags = positions(unit, thaw, spread(12, rng), rng)
+    study = Study('', bags, {}, {'input': 'm/s^2'})
+    taus = np.array(taus_of(strangers.fitted(study)))
+    assert taus == pytest.approx(unit.part_s[:, None], rel=0.03)
+
+
 def test_bags_of_one_warm_up_predict_another():
     # Every bag is the same thaw from a freezer, in which the board's temperature determines its
     # lags.

@@ -15,7 +15,7 @@ both over x.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline
@@ -30,6 +30,27 @@ from .windows import ThermalWindows
 
 # Ratio of a time constant of the columns to the next smaller one: half an octave.
 _STEP = 2.0**0.5
+
+
+class _Shape(NamedTuple):
+    """
+    The shape of the curves over the temperatures of the parts.
+
+    n_nodes: largest number of nodes of the spline of the bias
+    most_noise: ratio of the RMS residual to white noise up to which noise explains the residual
+    has_stress: whether bias and scale also depend on m, by a coefficient that is linear in x: the
+        stress between a part and the board
+    """
+
+    n_nodes: int
+    most_noise: float
+    has_stress: bool = False
+
+
+# Fewest nodes of the spline of the bias.
+_FEWEST_NODES = 4
+# A curve of few nodes determines a lag best, but has no kinks; so its residual must be noise.
+_SHAPES = (_Shape(_FEWEST_NODES, 1.1), _Shape(60, 1.5), _Shape(60, 1.5, has_stress=True))
 
 
 @dataclass(frozen=True)
@@ -59,11 +80,11 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         return None
     noise = white_noise_of(data, start.scale)
     accepted = None
-    for has_stress in (False, True):
+    for shape in _SHAPES:
 
-        def curves(n_windows: int, *, has_stress: bool = has_stress) -> _PartCurves:
+        def curves(n_windows: int, *, shape: _Shape = shape) -> _PartCurves:
             rows = slice(None, None, max(len(data.time) // n_windows, 1))
-            return _PartCurves(windows, start, rows, has_stress=has_stress)
+            return _PartCurves(windows, start, rows, shape)
 
         # Every k-th window: 500 of them are sufficient for a search, 3000 for its result.
         searched = curves(500).lags(noise)
@@ -76,12 +97,12 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
         x, y, z = (Part(round(lag[0], 1), round(lag[1], 1), round(lag[2], 4)) for lag in lags)
         parts = Parts((x, y, z), factors, float(noise.mean()))
-        # An RMS residual of up to 1.5 times the white noise is attributed to noise.
-        if (square <= (1.5 * noise) ** 2).all():
+        if (square <= (shape.most_noise * noise) ** 2).all():
             return parts
         # A larger residual has another cause, e.g. slow noise: the lags are then accepted only if
         # they reduce the RMS residual of each axis to an eighth or less of that without a lag.
-        if accepted is None and min(map(subset.reduction, lags, range(3))) >= 8.0:
+        is_last = shape.n_nodes > _FEWEST_NODES
+        if is_last and accepted is None and min(map(subset.reduction, lags, range(3))) >= 8.0:
             accepted = parts
     return accepted
 
@@ -91,12 +112,10 @@ class _PartCurves:
     Bias and scale factor of each axis as functions of x (see the module), for any lags.
 
     `rows`: the windows that are used
-    `has_stress`: whether bias and scale also depend on m, by a coefficient that is linear in x:
-        the stress between a part and the board
     """
 
     def __init__(
-        self, windows: ThermalWindows, start: ConstantCalibration, rows: slice, *, has_stress: bool
+        self, windows: ThermalWindows, start: ConstantCalibration, rows: slice, shape: _Shape
     ) -> None:
         data, columns = windows.data, windows.model.columns
         of_board = [k for k, column in enumerate(columns) if column.group == 'board']
@@ -123,7 +142,7 @@ class _PartCurves:
         if self._has_case:
             gradients = np.column_stack((windows.gradient, windows.raw @ np.transpose(of_case)))
             self._gradient = CubicSpline(knots, gradients[rows], axis=1)
-        self._has_stress = has_stress
+        self._shape = shape
         force = (position_means(data) - start.bias) / start.scale
         self._force = force[data.position[rows]]
         self._measured = self._centred(data.mean[rows] / start.scale)
@@ -259,14 +278,14 @@ class _PartCurves:
                     x += of_case * share * self._gradient(at)
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
-        # The spline of the bias has a node every 0.6 K, but at least 4 and at most 60 nodes.
-        n_nodes = int(np.clip(span / 0.6, 4, 60))
+        # The spline of the bias has a node every 0.6 K or more.
+        n_nodes = int(np.clip(span / 0.6, _FEWEST_NODES, self._shape.n_nodes))
         inner = np.linspace(low, low + span, n_nodes)
         knots = np.pad(inner, 3, mode='edge')
         bias = BSpline.design_matrix(np.clip(x, low, low + span), knots, 3).toarray()
         rows = np.arange(len(x))
         u = (x / span)[:, None]
-        stress = (self._t - x)[:, None] * u ** np.arange(2.0 * self._has_stress)
+        stress = (self._t - x)[:, None] * u ** np.arange(2.0 * self._shape.has_stress)
         scale = self._force[:, [axis]] * np.hstack((u ** np.arange(1, 4), stress))
         # The lag of the part at the start of each bag is unknown and decays.
         begin = np.zeros((len(x), int(self._bag[-1]) + 1))
