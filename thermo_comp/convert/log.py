@@ -208,7 +208,9 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
         if not low <= typical <= high:
             guess = ': that looks like kelvins' if KELVINS[0] < typical < KELVINS[1] else ''
             raise RecordingError(
-                f'the {name} temperature is {typical:.4g} degC in the median{guess}', path=log.path
+                f'the {name} temperature is {typical:.4g} degC in the median{guess}; expected '
+                f'{low:g} to {high:g}: the unit in a column map may be degC, K, degF or raw',
+                path=log.path,
             )
 
 
@@ -302,6 +304,8 @@ def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> 
     if not np.isfinite(magnitude):
         return None
     believed, reason = believed_unit(magnitude)
+    if stated != 'counts' and believed == 'unknown':
+        return reason
     if stated != 'counts':
         return None if believed == stated else f'{reason}: that looks like {believed}'
     if counts_per_g is not None and abs(magnitude / counts_per_g - 1.0) > _TOLERANCE:
