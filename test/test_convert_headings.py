@@ -193,6 +193,12 @@ def test_a_slow_log_of_one_attitude_is_in_seconds(tmp_path, step, since):
     assert columns.stamp.unit == 's'
 
 
+def test_some_repeated_rows_leave_a_time_a_time(tmp_path):
+    # WHY: a table in which one row in seven was written twice had `not a rising time`.
+    times = [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)]
+    assert guess_columns(slow_table(tmp_path / 'log.csv', 'time', times)).stamp.unit == 's'
+
+
 def test_stamps_since_1970_state_their_unit(tmp_path):
     # No temperature, one attitude: the size of the stamps alone decides. A count of us since
     # power-up that has the size of a date in s has steps of hours then.

@@ -21,11 +21,11 @@ from ..plain_yaml import read_plain_yaml
 from ..quantities import Bounds, Positive
 from ..recording.blocks import Readings
 from ..recording.topics import is_thermometer
-from ..typing import Floats
+from ..typing import Floats, Ints
 from ..unit.schema import SchemaError, build
 from .headings import Headings, read_headings
 from .log import NO_STAMP, ForeignLog, Unit, believed_unit, find_stillness
-from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, read_parquet, read_text
+from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, TimeUnit, read_parquet, read_text
 
 Triple = tuple[Column, Column, Column]
 
@@ -43,6 +43,9 @@ _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Range of temperatures per length of a log [K/s] that no log reaches: a hair dryer warms a board
 #: by some 0.1 K/s.
 _FASTEST_K_S = 0.5
+_RISING = 0.7  # smallest part of the rows with a later time than the row before; some are repeated
+#: Parts of a counter's range at its ends: from the last to the first it has begun again.
+_WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
 _GIVE_MAP = f'give {_A_MAP}'
 
@@ -153,7 +156,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
     used = {name: column for name, column in thermometers.items() if column is not None}
     wanted = [*accel.columns, *(gyro.columns if gyro else ()), *(t.column for t in used.values())]
     table = _read(path, list(dict.fromkeys(wanted)), columns.stamp, columns.format)
-    stamp_ns = table.stamp_ns
+    stamp_ns, continued = _without_wraps(table, columns.stamp.unit)
     known = stamp_ns != NO_STAMP
     temperatures = {}
     for name, thermometer in used.items():
@@ -179,7 +182,25 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
         frame_id=columns.frame_id,
         serial=columns.serial or '',
         n_short=table.n_short,
+        continued=continued,
     )
+
+
+def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int, ...]]:
+    """
+    Continue the times of a counter of 32 bits that begins again at 0, as Arduino's micros() after
+    71.6 min; return the stamps and the lines where it does.
+    """
+    stamp_ns, rows = table.stamp_ns.copy(), np.flatnonzero(table.stamp_ns != NO_STAMP)
+    if unit not in ('ms', 'us') or not len(rows):
+        return stamp_ns, ()
+    size_ns = 2**32 * 10 ** STAMP_EXPONENTS[unit]
+    share = stamp_ns[rows] / size_ns
+    ends = np.zeros(len(rows), dtype=bool)
+    if share.min() >= 0.0 and share.max() < 1.0:
+        ends[1:] = (share[:-1] > 1.0 - _WRAP_EDGE) & (share[1:] < _WRAP_EDGE)
+    stamp_ns[rows] += np.cumsum(ends) * size_ns
+    return stamp_ns, tuple(table.line[rows[ends]].tolist())
 
 
 def _read(
@@ -286,8 +307,8 @@ def _stamp(
             path=path,
         )
     steps = np.diff(times)
-    if len(steps) and (steps > 0.0).mean() > 0.9:
-        step, first = float(np.median(steps)), float(times[0])
+    if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
+        step, first = float(np.median(steps[steps > 0.0])), float(times[0])
         # A slow log of a unit that never turns: the temperature shows that it took longer.
         shortest_s = span / _FASTEST_K_S
         longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
@@ -304,13 +325,13 @@ def _stamp(
 
 def _no_time(column: Column | None, steps: Floats) -> str:
     """Return what is wrong with the times of a column."""
-    if len(steps) and (steps == 0.0).mean() > 0.1 and (steps >= 0.0).all():
+    if len(steps) and (steps > 0.0).mean() <= _RISING and (steps >= 0.0).mean() > 0.9:
         shown = f'{(steps == 0.0).mean():.0%}'
         return (
             f'its column {column!r} has the time of the row before in {shown} of the rows: '
             f'give {_A_MAP}, with `stamp: {{rate_hz: HZ}}` for samples at a fixed rate'
         )
-    if len(steps) and (steps > 0.0).mean() > 0.9:
+    if len(steps) and (steps >= 0.0).mean() > 0.9:
         return (
             f'its column {column!r} rises by {np.median(steps):.3g} from row to row, which is no '
             f'plausible interval of samples in s, ms, us or ns: {_GIVE_MAP}'
