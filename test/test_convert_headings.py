@@ -149,6 +149,8 @@ def test_the_right_triad_and_thermometers_are_taken():
         ('millis,ax_g,ay_g,az_g,gx_dps,gy_dps,gz_dps,TempF', 'ax_g', ('ms', 'g', 'degF')),
         ('stamp,ax_mg,ay_mg,az_mg,temp_f', 'ax_mg', ('', 'mg', 'degF')),
         ('seconds,ax,ay,az,imu_temp_k', 'ax', ('s', '', 'K')),
+        ('t [s],ax [g],ay [g],az [g],T [°C]', 'ax [g]', ('s', 'g', 'degC')),
+        ('t,imu0_ax,imu0_ay,imu0_az,T_board,T_case', 'imu0_ax', ('', '', 'degC')),
         ('elapsed_h,ax,ay,az,temp (°F)', 'ax', ('h', '', 'degF')),
         (  # the fields of sensor_msgs/Imu, as PlotJuggler writes them
             '__time,/imu/angular_velocity/x,/imu/angular_velocity/y,/imu/angular_velocity/z,'
@@ -247,6 +249,32 @@ def test_a_slower_thermometer_leaves_cells_blank(tmp_path, rng):
     log = table_log(path, guess_columns(path))
     assert len(log.accel) == N
     np.testing.assert_allclose(log.temperatures['board'].celsius, 20.0 + np.arange(12.0))
+
+
+@pytest.mark.parametrize(
+    ('comment', 'sign'), [('# t ax ay az temp', ' '), ('#t [s],ax,ay,az,temp', ',')]
+)
+def test_headings_in_a_comment_are_read(tmp_path, comment, sign):
+    # WHY: numpy.savetxt and EuRoC write the headings as a comment, which was left out.
+    path = slow_table(tmp_path / 'log.csv', 't', [k / 10 for k in range(900)])
+    rows = path.read_text().replace(',', sign).splitlines()[1:]
+    path.write_text('\n'.join(['# logger 3', comment, *rows]) + '\n')
+    columns = guess_columns(path)
+    assert columns.board.column == 'temp'
+    assert len(table_log(path, columns).accel) == 900
+    # A comment of as many words is no heading.
+    path.write_text('\n'.join(['# one two three four five', *rows]) + '\n')
+    with pytest.raises(RecordingError, match='5 columns without headings'):
+        guess_columns(path)
+
+
+def test_two_columns_of_one_name_are_named_with_the_file(tmp_path):
+    # WHY: it was `Invalid value: column 'temp' is given twice`, a mistake of the command line.
+    path = slow_table(tmp_path / 'log.csv', 't', [k / 10 for k in range(900)])
+    rows = [f'{row},20.0' for row in path.read_text().splitlines()[1:]]
+    path.write_text('\n'.join(['t,ax,ay,az,temp,temp', *rows]) + '\n')
+    with pytest.raises(RecordingError, match=r"log\.csv: 2 columns are called 'temp'"):
+        table_log(path, guess_columns(path))
 
 
 def test_a_table_with_decimal_commas_is_refused_by_this_name(tmp_path):

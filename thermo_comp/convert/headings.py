@@ -30,14 +30,16 @@ _LONG_TIMES = {
     **dict.fromkeys(('h', 'hr', 'hrs', 'hour', 'hours'), 'h'),
     **dict.fromkeys(('day', 'days'), 'days'),
 }
-_ACCEL = re.compile('acc|force|^ac?(_|$)')
-_GYRO = re.compile('gyr|omega|rot|rate|angular|^(g|gy|w)(_|$)')
+_ACCEL = re.compile('acc|force|(^|_)ac?(_|$)')
+_GYRO = re.compile('gyr|omega|rot|rate|angular|(^|_)(g|gy|w)(_|$)')
 # The field of sensor_msgs/Imu; the same words are those of phones for |f| without gravity, which
 # the check of the reading at rest refuses.
 _ROS_ACCEL = re.compile('(^|_)linear_acceleration$')
 # Words in headings of triads that are neither accelerometer nor gyroscope.
 _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|vel(?!ocity)')
-_TEMPERATURE = re.compile('temp|tmp|celsius|(^|_)t_?c($|_)')
+_TEMPERATURE = re.compile(
+    'temp|tmp|celsius|(^|_)t_?c($|_)|^t_(board|case|imu|die|chip|sensor|air|amb|room|baro)'
+)
 _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
 # Units as they stand in brackets or, in lower case with underscores, at the end of a heading.
 _ACCELS = {
@@ -53,6 +55,7 @@ _DEGREES = {
     **dict.fromkeys(('k', 'kelvin', 'degk', 'tempk'), 'K'),
     **dict.fromkeys(('f', '°f', 'degf', 'deg f', 'fahrenheit', 'tempf'), 'degF'),
 }
+_CELSIUS = ('c', '°c', 'ºc', 'degc', 'deg c', 'celsius')
 
 Column = str | int
 Columns = tuple[Column, Column, Column]
@@ -74,7 +77,7 @@ class Headings:
 def read_headings(headings: Sequence[str]) -> Headings | None:
     """Find the columns by their names; None where no accelerometer is among them."""
     names = {_plain(heading): heading for heading in reversed(headings)}
-    times = [one for name, one in names.items() if _TIME.search(name)]
+    times = [one for name, one in names.items() if _TIME.search(name) and not _is_warm(one)]
     found = dict(_triads(names))
     triads = {key: three for key, three in found.items() if not _OTHER.search(key)}
     accel = next((key for key in triads if _ACCEL.search(key)), '' if '' in triads else None)
@@ -86,8 +89,8 @@ def read_headings(headings: Sequence[str]) -> Headings | None:
     gyro = next((key for key in triads if _GYRO.search(key)), None)
     time = times[-1] if times else ''
     thermometers: dict[str, tuple[str, str]] = {}
-    for heading in headings:
-        if _TEMPERATURE.search(_plain(heading)):
+    for heading in dict.fromkeys(headings):
+        if _is_warm(heading):
             is_outside = _OUTSIDE.search(_plain(heading)) and thermometers
             usual = 'case' if is_outside or 'board' in thermometers else 'board'
             name = usual if usual not in thermometers else f't{len(thermometers)}'
@@ -117,6 +120,13 @@ def _given(value: Any) -> Any:
         pairs = ((field, getattr(value, field.name)) for field in fields(value))
         return {f.name: _given(x) for f, x in pairs if x != f.default or f.name == 'unit'}
     return list(map(_given, value)) if isinstance(value, tuple) else value
+
+
+def _is_warm(heading: str) -> bool:
+    """Whether a heading is that of a temperature, by its words or by its unit in brackets."""
+    unit = _UNIT.search(heading)
+    is_unit = unit is not None and unit[1].strip().lower() in {*_DEGREES, *_CELSIUS}
+    return is_unit or _TEMPERATURE.search(_plain(heading)) is not None
 
 
 def _plain(heading: str) -> str:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
 from io import TextIOWrapper
-from itertools import chain, islice
+from itertools import chain, islice, takewhile
 from math import nan
 from operator import itemgetter
 from pathlib import Path
@@ -29,6 +29,7 @@ from ..errors import RecordingError
 from ..files import open_regular
 from ..quantities import NotNegative, Positive
 from ..typing import Floats, Ints
+from .headings import read_headings
 from .log import NO_STAMP, library
 
 Column = str | int
@@ -109,6 +110,8 @@ def read_text(
             given = _DELIMITERS.get(style.delimiter or '', style.delimiter)
             delimiter, width = layout(head, given)
             headings, rows = _begin(_rows(file, delimiter), width, style.header)
+            if not headings and style.header is None:
+                headings = _commented(head, delimiter, width)
             return _collect(path, headings, rows, columns, stamp)
     except (UnicodeError, csv.Error) as failure:
         raise RecordingError(f'not a table of text ({failure})', path=path) from failure
@@ -180,6 +183,17 @@ def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str],
         has_header = not n_numbers[begin]
     headings = first[begin][1] if has_header and first else []
     return [cell.strip() for cell in headings], chain(first[begin + bool(headings) :], rows)
+
+
+def _commented(head: str, delimiter: str, width: int) -> list[str]:
+    """Return the headings in the last comment before a table, as numpy.savetxt writes them."""
+    comments = list(
+        takewhile(lambda line: not line.strip() or _is_comment(line), head.splitlines())
+    )
+    text = next((line for line in reversed(comments) if line.strip()), '').strip().lstrip('#%/ ')
+    cells = text.split() if delimiter == ' ' else next(csv.reader([text], delimiter=delimiter), [])
+    cells = [cell.strip() for cell in cells]
+    return cells if len(cells) == width and read_headings(cells) is not None else []
 
 
 def _number(cell: str) -> float | None:
