@@ -63,6 +63,10 @@ class TestUsage:
             (('replay', 'a', '-o', 'b', '-c', 'c', '--temperature-timeout', '0'),
              r'`temperature_timeout_s` must be greater than 0'),
             (('fit', 'a', '-o', 'b'), r'give --gravity, or --latitude and --height'),
+            (
+                ('fit', 'a', '-o', 'b', '--gravity', '9.81', '--latitude', '48'),
+                r'give --gravity, or --latitude and --height, not both',
+            ),
             (('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', 'nan'),
              r'--reference-temperature: must be at least -273.15, got nan'),
             (('play', 'a', '--rate', 'inf'),

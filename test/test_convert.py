@@ -122,6 +122,55 @@ def test_an_offset_is_taken_away(tmp_path):
     np.testing.assert_allclose(read[:, 0], columns['ax'], atol=1e-9)
 
 
+@pytest.mark.parametrize('unit', ['ms', 'us'])
+def test_a_counter_of_32_bits_continues_at_its_end(tmp_path, unit):
+    # WHY: Arduino's micros() begins again after 71.6 min; a fit read a part of such a log.
+    path, _ = table(tmp_path / 'log.csv')
+    lines = path.read_text().splitlines()
+    ticks = [(2**32 - 2000 + 10 * k) % 2**32 for k in range(400)]
+    rows = [f'{at},{row.partition(",")[2]}' for at, row in zip(ticks, lines[1:], strict=True)]
+    path.write_text('\n'.join([lines[0], *rows]))
+    log = table_log(path, column_map(stamp={'column': 'ms', 'unit': unit}))
+    step_ns = 10 * {'ms': 10**6, 'us': 10**3}[unit]
+    assert np.diff(log.stamp_ns).tolist() == [step_ns] * 399
+    report = write_log(log, tmp_path / 'bag')
+    assert (report.findings['continued'].count, report.findings['continued'].lines) == (1, (202,))
+    assert report.findings['backwards'].count == 0
+    # A clock that is set back elsewhere is no end of a counter.
+    lines[200] = lines[200].replace(lines[200].partition(',')[0], '1000.0')
+    path.write_text('\n'.join(lines))
+    report = write_log(table_log(path, column_map()), tmp_path / 'other')
+    assert (report.findings['continued'].count, report.findings['backwards'].count) == (0, 1)
+
+
+def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
+    # WHY: all readings after the restart stood before all samples after it.
+    path, _ = table(tmp_path / 'log.csv')
+    lines = path.read_text().splitlines()
+    for k in range(201, 401):
+        at, _, rest = lines[k].partition(',')
+        lines[k] = f'{float(at) - 2500.0},{rest}'  # by 2.5 s, in the middle of the log
+    path.write_text('\n'.join(lines))
+    write_log(table_log(path, column_map()), tmp_path / 'bag')
+    board = read_recording(tmp_path / 'bag').columns.temperatures['board']
+    # One change in 40 rows. A reading precedes the sample of its row.
+    assert board.after.tolist() == list(range(0, 400, 40))
+
+
+def test_readings_that_are_no_temperatures_are_left_out(tmp_path):
+    # WHY: a DS18B20 without contact reads -127 degC; 46 such readings in a log of two hours left
+    # an error of 0.68 mg instead of 0.02 mg after a fit.
+    path, _ = table(tmp_path / 'log.csv')
+    lines = path.read_text().splitlines()
+    for k in (50, 51, 300):
+        lines[k] = lines[k].rpartition(',')[0] + ',-127'
+    path.write_text('\n'.join(lines))
+    report = write_log(table_log(path, column_map()), tmp_path / 'bag')
+    assert report.findings['impossible'].count == 2  # held for two rows, it is one reading
+    board = read_recording(tmp_path / 'bag').columns.temperatures['board']
+    assert board.celsius.min() == 25.0
+
+
 def test_every_odd_row_is_accounted_for(tmp_path):
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()

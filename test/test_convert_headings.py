@@ -142,6 +142,162 @@ def test_the_right_triad_and_thermometers_are_taken():
     assert read_headings(['time', 'magx', 'magy', 'magz']) is None
 
 
+@pytest.mark.parametrize(
+    ('headings', 'accel', 'units'),
+    [  # units of the time, the accelerometer and the board
+        ('time_us,AcX,AcY,AcZ,Tmp,GyX,GyY,GyZ', 'AcX', ('us', '', 'degC')),
+        ('millis,ax_g,ay_g,az_g,gx_dps,gy_dps,gz_dps,TempF', 'ax_g', ('ms', 'g', 'degF')),
+        ('stamp,ax_mg,ay_mg,az_mg,temp_f', 'ax_mg', ('', 'mg', 'degF')),
+        ('seconds,ax,ay,az,imu_temp_k', 'ax', ('s', '', 'K')),
+        ('t [s],ax [g],ay [g],az [g],T [°C]', 'ax [g]', ('s', 'g', 'degC')),
+        ('t,imu0_ax,imu0_ay,imu0_az,T_board,T_case', 'imu0_ax', ('', '', 'degC')),
+        ('elapsed_h,ax,ay,az,temp (°F)', 'ax', ('h', '', 'degF')),
+        (  # the fields of sensor_msgs/Imu, as PlotJuggler writes them
+            '__time,/imu/angular_velocity/x,/imu/angular_velocity/y,/imu/angular_velocity/z,'
+            '/imu/linear_acceleration/x,/imu/linear_acceleration/y,/imu/linear_acceleration/z,temp',
+            '/imu/linear_acceleration/x',
+            ('', '', 'degC'),
+        ),
+        (  # EuRoC
+            'timestamp [ns],w_S_x [rad s^-1],w_S_y [rad s^-1],w_S_z [rad s^-1],'
+            'a_S_x [m s^-2],a_S_y [m s^-2],a_S_z [m s^-2],temp',
+            'a_S_x [m s^-2]',
+            ('ns', 'm/s^2', 'degC'),
+        ),
+    ],
+)
+def test_units_at_the_end_of_a_heading_and_names_of_loggers(headings, accel, units):
+    # WHY: `temp_f` was read as degC, and common headings were not recognised.
+    names = read_headings(headings.split(','))
+    assert names.accel[0] == accel
+    assert (names.time_unit, names.accel_unit, names.thermometers['board'][1]) == units
+
+
+def slow_table(path, heading, times, first=20.0, last=45.0):
+    """Write a log of one attitude in which the temperature changes by 25 K."""
+    up = np.tile([0.0, 5.88, 7.84], (len(times), 1))
+    up += 0.01 * np.random.default_rng(0).standard_normal(up.shape)
+    temperature = np.linspace(first, last, len(times))
+    rows = [
+        f'{at},{x:.4f},{y:.4f},{z:.4f},{t:.2f}'
+        for at, (x, y, z), t in zip(times, up, temperature, strict=True)
+    ]
+    path.write_text('\n'.join([f'{heading},ax,ay,az,temp', *rows]) + '\n')
+    return path
+
+
+@pytest.mark.parametrize('step', [1, 5])
+@pytest.mark.parametrize('since', [0, 1_774_747_800])
+def test_a_slow_log_of_one_attitude_is_in_seconds(tmp_path, step, since):
+    # WHY: a test of two hours at 1 Hz was read as 8 s at 1 kHz, even with stamps since 1970.
+    times = [since + step * k for k in range(4000)]
+    columns = guess_columns(slow_table(tmp_path / 'log.csv', 'time', times))
+    assert columns.stamp.unit == 's'
+
+
+def test_some_repeated_rows_leave_a_time_a_time(tmp_path):
+    # WHY: a table in which one row in seven was written twice had `not a rising time`.
+    times = [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)]
+    assert guess_columns(slow_table(tmp_path / 'log.csv', 'time', times)).stamp.unit == 's'
+
+
+def test_stamps_since_1970_state_their_unit(tmp_path):
+    # No temperature, one attitude: the size of the stamps alone decides. A count of us since
+    # power-up that has the size of a date in s has steps of hours then.
+    for unit, since, step in (('s', START_NS // 10**9, 2), ('ms', START_NS // 10**6, 5000),
+                              ('us', START_NS // 10**9, 10_000)):  # fmt: skip
+        path = slow_table(tmp_path / f'{unit}.csv', 'time', [since + step * k for k in range(900)],
+                          last=20.0)  # fmt: skip
+        assert guess_columns(path).stamp.unit == unit
+
+
+@pytest.mark.parametrize(
+    ('heading', 'times', 'reason'),
+    [
+        ('time [min]', [k / 600 for k in range(900)], r"'time \[min\]' is in min: the times must"),
+        ('time', [k // 10 for k in range(900)], "'time' has the time of the row before in 90%"),
+        ('date', [46110 + k / 864000 for k in range(900)], 'no plausible interval of samples'),
+        ('time', list(range(900, 0, -1)), "'time' is not a rising time"),
+    ],
+)
+def test_times_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
+    # WHY: minutes were read as seconds; the other cases had one sentence, which did not apply.
+    with pytest.raises(RecordingError, match=reason):
+        guess_columns(slow_table(tmp_path / 'log.csv', heading, times))
+
+
+@pytest.mark.parametrize('cell', ['29/03/2026 01:30:00', '01:30:00.5'])
+def test_a_date_that_is_not_iso_is_shown(tmp_path, cell):
+    # WHY: the message was that no row holds numbers in the accelerometer and stamp columns.
+    path = slow_table(tmp_path / 'log.csv', 'date', [cell] * 900)
+    with pytest.raises(
+        RecordingError, match=f"no cell of its column 'date' is a date of ISO 8601.*'{cell}'"
+    ):
+        table_log(path, guess_columns(path))
+
+
+def test_a_slower_thermometer_leaves_cells_blank(tmp_path, rng):
+    # WHY: a blank last cell in most rows was taken for the end of the row, so the row with the
+    # headings, which has one cell more, was no part of the table.
+    accel = 9.8 * (UP + 0.002 * rng.standard_normal(UP.shape))
+    rows = [
+        f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f},{20 + k / 100 if k % 100 == 0 else ""}'
+        for k, (x, y, z) in enumerate(accel)
+    ]
+    path = tmp_path / 'log.csv'
+    path.write_text('\n'.join(['time,ax,ay,az,temp', *rows]) + '\n')
+    log = table_log(path, guess_columns(path))
+    assert len(log.accel) == N
+    np.testing.assert_allclose(log.temperatures['board'].celsius, 20.0 + np.arange(12.0))
+
+
+@pytest.mark.parametrize(
+    ('comment', 'sign'), [('# t ax ay az temp', ' '), ('#t [s],ax,ay,az,temp', ',')]
+)
+def test_headings_in_a_comment_are_read(tmp_path, comment, sign):
+    # WHY: numpy.savetxt and EuRoC write the headings as a comment, which was left out.
+    path = slow_table(tmp_path / 'log.csv', 't', [k / 10 for k in range(900)])
+    rows = path.read_text().replace(',', sign).splitlines()[1:]
+    path.write_text('\n'.join(['# logger 3', comment, *rows]) + '\n')
+    columns = guess_columns(path)
+    assert columns.board.column == 'temp'
+    assert len(table_log(path, columns).accel) == 900
+    # A comment of as many words is no heading.
+    path.write_text('\n'.join(['# one two three four five', *rows]) + '\n')
+    with pytest.raises(RecordingError, match='5 columns without headings'):
+        guess_columns(path)
+
+
+def test_two_columns_of_one_name_are_named_with_the_file(tmp_path):
+    # WHY: it was `Invalid value: column 'temp' is given twice`, a mistake of the command line.
+    path = slow_table(tmp_path / 'log.csv', 't', [k / 10 for k in range(900)])
+    rows = [f'{row},20.0' for row in path.read_text().splitlines()[1:]]
+    path.write_text('\n'.join(['t,ax,ay,az,temp,temp', *rows]) + '\n')
+    with pytest.raises(RecordingError, match=r"log\.csv: 2 columns are called 'temp'"):
+        table_log(path, guess_columns(path))
+
+
+def test_a_table_with_decimal_commas_is_refused_by_this_name(tmp_path):
+    # WHY: cells were divided at the decimal commas, and the message named no accelerometer.
+    path = tmp_path / 'log.csv'
+    path.write_text('t;ax;ay;az\n' + '0,01;0,0;0,1;9,8\n' * 100)
+    with pytest.raises(RecordingError, match='has decimal commas, as in 0,01: use points'):
+        guess_columns(path)
+
+
+def test_a_temperature_and_a_force_of_other_units_are_refused(tmp_path):
+    times = [k / 10 for k in range(900)]
+    path = slow_table(tmp_path / 'log.csv', 'time', times, 20_000.0, 21_000.0)
+    with pytest.raises(RecordingError, match='expected -90 to 200: the unit in a column map may'):
+        write_log(table_log(path, guess_columns(path)), tmp_path / 'bag')
+    # A phone's linear acceleration has no gravity in it.
+    names = [f'Linear acceleration {axis} (m/s^2)' for axis in 'xyz']
+    rows = [f'{at},0.01,0.02,{0.01 * (k % 3)}' for k, at in enumerate(times)]
+    path.write_text('\n'.join([','.join(['time', *names]), *rows]) + '\n')
+    with pytest.raises(RecordingError, match=r'is not gravity in any known unit$'):
+        write_log(table_log(path, guess_columns(path)), tmp_path / 'bag')
+
+
 def test_headings_that_name_nothing_are_listed(tmp_path):
     path = tmp_path / 'log.csv'
     path.write_text('a,b,c\n1,2,3\n2,3,4\n')

@@ -12,7 +12,7 @@ from builders import GRAVITY, axis_set, calibration, regime_set
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.fitting.sources import digest
 from thermo_comp.judging.evaluation import evaluate
-from thermo_comp.judging.judgement import judge
+from thermo_comp.judging.judgement import AxisShift, judge, what_moved
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.judging.windows import Windows, columns_of
 from thermo_comp.online.batch import process_block
@@ -40,6 +40,7 @@ def resting(
     shaken_s=None,
     error=0.0,
     serial='',
+    reading_s=1,
 ):
     """Write a unit at rest, z up, whose z axis drifts with its temperature."""
     rng = np.random.default_rng(3)
@@ -57,8 +58,10 @@ def resting(
         shaken = (seconds >= shaken_s[0]) & (seconds < shaken_s[1])
         counts[shaken] += 300.0 * rng.standard_normal((int(shaken.sum()), 3))
     with BagWriter(path, metadata={'serial': serial} if serial else None) as writer:
-        since = np.arange(round(minutes * 60.0))
-        readings = begin + (end - begin) * since / (minutes * 60.0) + 1e-7 * (since % 2)
+        since = np.arange(0, round(minutes * 60.0), reading_s)
+        readings = (
+            begin + (end - begin) * since / (minutes * 60.0) + 1e-7 * (since // reading_s % 2)
+        )
         for topic in (TOPICS.board, TOPICS.case):
             writer.write_temperature(topic, START_NS + since * 10**9, readings)
         writer.write_counts(TOPICS.counts, stamps, counts)
@@ -96,6 +99,15 @@ CLAIMING = corrected_by(SLOPE, 1e-5)
 
 
 class TestWindows:
+    @pytest.mark.parametrize('reading_s', [30, 50])
+    def test_a_slow_thermometer_leaves_all_windows(self, tmp_path, reading_s):
+        # WHY: at 2 Hz a sum lasts 20 s. It was dropped as a stamp that leaps ahead if no reading
+        # was within 15 s: `evaluate` found no window where `replay` corrected each sample.
+        bag = resting(tmp_path / 'bag', 30.0, minutes=30.0, rate_hz=2.0, reading_s=reading_s)
+        windows = judged(bag, corrected_by(SLOPE)).windows
+        assert len(windows) >= 28
+        np.testing.assert_allclose(windows.residual, 0.0, atol=1e-9)
+
     def test_residuals_are_those_of_the_hand(self, tmp_path):
         # 10 K above the reference the z axis reads 20 counts more: 20 / 300 m/s^2.
         bag = resting(tmp_path / 'bag', 30.0)
@@ -318,6 +330,9 @@ class TestVerdict:
         _, upper = CLAIMING.static.temperature_range_c
         judgement = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
         assert judgement.kind is Verdict.OUTSIDE
+        # WHY: windows outside the calibrated rates alone were said to lie `at 6.7 to 29.0 degC`,
+        # without the rates and without the calibrated ranges.
+        assert '+0.00 K/min; calibrated at 5.0 to 35.0 degC and -1.00 to +1.00' in judgement.reason
         assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in judgement.reason
         # Noise of the thermometer does not put a soak at the edge of the range outside of it.
         edge = judged(resting(tmp_path / 'edge', upper + 0.01), CLAIMING)
@@ -350,6 +365,12 @@ class TestShifts:
         assert [text.split(' +')[0] for text in judgement.moved] == ['x bias', 'y scale']
         assert judgement.verdict == 'recalibrate'
         assert '; moved: x bias +' in judgement.reason
+
+    def test_a_large_shift_is_written_without_an_exponent(self):
+        # WHY: the verdict read `x bias +829 +- 1.3e+02 ug`.
+        one = AxisShift(829.4 * MICRO_G, 129.2 * MICRO_G, 0.0, 1.0)
+        small = AxisShift(-1.234 * MICRO_G, 0.0567 * MICRO_G, 0.0, 1.0)
+        assert what_moved((one, small)) == ('x bias +829 +- 129 ug', 'y bias -1.234 +- 0.057 ug')
 
     def test_a_unit_as_it_was_has_not_moved(self):
         judgement = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)

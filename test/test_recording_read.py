@@ -352,6 +352,18 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
             open_recording(several, require=('board',))
 
 
+def test_two_thermometers_of_other_names_are_offered(tmp_path):
+    # WHY: `fit` read neither, and the only message was that no temperature was recorded.
+    path = written(tmp_path / 'two', 'imu/die', 'baro/air')
+    with open_recording(path, require=('accel',)) as reader:
+        assert 'board' not in reader.topics
+        assert reader.info.chosen == (
+            'no temperature/board: is it /baro/air or /imu/die? name it with --topic board=TOPIC'
+        )
+    with open_recording(path, Topics(board='/imu/die'), require=('accel',)) as reader:
+        assert reader.info.chosen is None
+
+
 def test_reading_twice_gives_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 100)
     path = tmp_path / 'bag.mcap'

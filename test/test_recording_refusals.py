@@ -106,7 +106,11 @@ def test_what_is_no_bag(tmp_path):
     os.mkfifo(tmp_path / 'pipe.mcap')
     refused(tmp_path / 'pipe.mcap', 'not a bag: neither a file nor a directory')
     for name, content, reason in (
-        ('notes.txt', b'hello', r'not a bag: expected a directory, \.mcap, \.db3 or \.bag'),
+        (
+            'notes.txt',
+            b'hello',
+            r'not a bag: expected a directory, \.mcap, \.db3 or \.bag; `thermo_comp convert`',
+        ),
         ('text.mcap', b'hello, this is no bag at all', 'not an MCAP file'),
         ('empty.mcap', b'', 'the file is empty'),
         ('begun.mcap', b'\x89MCAP0\r\n\x01', 'cut off inside its header'),

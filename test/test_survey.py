@@ -72,6 +72,20 @@ def test_what_a_fit_would_miss_is_named(tmp_path, temperature, options, text):
     assert [one for one in text if not any(one in found for found in findings)] == []
 
 
+@pytest.mark.parametrize(
+    ('back_s', 'text'),
+    [
+        (600.0, '3000 stamps do not rise: those'),
+        (7200.0, 'than an hour (1 times): a fit takes it'),
+    ],
+)
+def test_a_clock_that_is_set_back(tmp_path, back_s, text):
+    # WHY: the survey counted steps: a clock set back by ten minutes in the middle of a recording
+    # was `1 stamps do not rise`, and a fit left out ten minutes of samples.
+    result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0), gap_s=-back_s)
+    assert any(text in finding for finding in result.findings)
+
+
 def test_one_direction_only(tmp_path):
     heating = np.interp(np.arange(3600.0), [0, 600, 3000, 3600], [5.0, 5.0, 35.0, 35.0])
     findings = survey(tmp_path / 'bag', heating).findings

@@ -27,6 +27,8 @@ _FINDINGS = {
     'non_numeric': 'rows left out, no number',
     'out_of_range': 'rows left out, stamp before 1970 or after 2038',
     'clipped': 'rows clipped, kept',
+    'impossible': 'temperatures left out, below -90 or above 200 degC',
+    'continued': 'rows at which a 32-bit time began again at 0, continued',
     'backwards': 'rows whose time goes back, kept',
     'repeated': 'rows whose time stands still, kept',
 }

@@ -184,7 +184,9 @@ def place(
     height: float | None = option('Height above the ellipsoid in m.'),
 ) -> tuple[float | None, float]:
     """Return local gravity, None if not stated, and its usual standard deviation."""
-    if gravity is not None or (latitude is None and height is None):
+    if gravity is not None and not (latitude is None and height is None):
+        raise usage('give --gravity, or --latitude and --height, not both')
+    if latitude is None and height is None:
         return gravity, 0.0
     if latitude is None or height is None:
         raise usage('give --gravity, or --latitude and --height')

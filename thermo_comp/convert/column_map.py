@@ -21,11 +21,11 @@ from ..plain_yaml import read_plain_yaml
 from ..quantities import Bounds, Positive
 from ..recording.blocks import Readings
 from ..recording.topics import is_thermometer
-from ..typing import Floats
+from ..typing import Floats, Ints
 from ..unit.schema import SchemaError, build
 from .headings import Headings, read_headings
 from .log import NO_STAMP, ForeignLog, Unit, believed_unit, find_stillness
-from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, read_parquet, read_text
+from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, TimeUnit, read_parquet, read_text
 
 Triple = tuple[Column, Column, Column]
 
@@ -37,6 +37,15 @@ _STEPS_S = (5e-5, 0.5)
 #: (scatter below `_QUIET` g) cannot be in ms: then intervals up to `_SLOW_S` s are plausible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
+#: Range of stamps since 1970 [s], 2000 to 2038, and their largest interval; a count of us since
+#: power-up may be in this range, but its intervals are longer.
+_SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
+#: Range of temperatures per length of a log [K/s] that no log reaches: a hair dryer warms a board
+#: by some 0.1 K/s.
+_FASTEST_K_S = 0.5
+_RISING = 0.7  # smallest part of the rows with a later time than the row before; some are repeated
+#: Parts of a counter's range at its ends: from the last to the first it has begun again.
+_WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
 _GIVE_MAP = f'give {_A_MAP}'
 
@@ -147,7 +156,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
     used = {name: column for name, column in thermometers.items() if column is not None}
     wanted = [*accel.columns, *(gyro.columns if gyro else ()), *(t.column for t in used.values())]
     table = _read(path, list(dict.fromkeys(wanted)), columns.stamp, columns.format)
-    stamp_ns = table.stamp_ns
+    stamp_ns, continued = _without_wraps(table, columns.stamp.unit)
     known = stamp_ns != NO_STAMP
     temperatures = {}
     for name, thermometer in used.items():
@@ -173,7 +182,25 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
         frame_id=columns.frame_id,
         serial=columns.serial or '',
         n_short=table.n_short,
+        continued=continued,
     )
+
+
+def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int, ...]]:
+    """
+    Continue the times of a counter of 32 bits that begins again at 0, as Arduino's micros() after
+    71.6 min; return the stamps and the lines where it does.
+    """
+    stamp_ns, rows = table.stamp_ns.copy(), np.flatnonzero(table.stamp_ns != NO_STAMP)
+    if unit not in ('ms', 'us') or not len(rows):
+        return stamp_ns, ()
+    size_ns = 2**32 * 10 ** STAMP_EXPONENTS[unit]
+    share = stamp_ns[rows] / size_ns
+    ends = np.zeros(len(rows), dtype=bool)
+    if share.min() >= 0.0 and share.max() < 1.0:
+        ends[1:] = (share[:-1] > 1.0 - _WRAP_EDGE) & (share[1:] < _WRAP_EDGE)
+    stamp_ns[rows] += np.cumsum(ends) * size_ns
+    return stamp_ns, tuple(table.line[rows[ends]].tolist())
 
 
 def _read(
@@ -216,8 +243,9 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
         for name, (column, degrees) in named.thermometers.items()
     }
     times = None if named.time is None else values([named.time])[:, 0]
+    span = max((_span(values([item.column])) for item in thermometers.values()), default=0.0)
     return ColumnMap(
-        _stamp(path, named, times, rate_hz, accel),
+        _stamp(path, named, times, rate_hz, accel, span),
         build(Accel, {'columns': list(named.accel), 'unit': unit, 'output': output}),
         thermometers.pop('board', None),
         thermometers.pop('case', None),
@@ -248,27 +276,67 @@ def spoken_columns(columns: ColumnMap) -> str:
     return ', '.join(parts)
 
 
+def _span(values: Floats) -> float:
+    """Return the range of most of a column's values; a few may be invalid."""
+    low, high = np.nanquantile(values, (0.02, 0.98)) if np.isfinite(values).any() else (0.0, 0.0)
+    return float(high - low)
+
+
 def _stamp(
-    path: Path, named: Headings, times: Floats | None, rate_hz: float | None, accel: Floats
+    path: Path,
+    named: Headings,
+    times: Floats | None,
+    rate_hz: float | None,
+    accel: Floats,
+    span: float,
 ) -> Stamp:
-    """Guess the unit of the times by their heading, or else by the sample interval."""
+    """Guess the unit of the times by their heading, or else by their size and interval."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
     if rate_hz is not None:
         raise RecordingError(f'--rate-hz: its column {named.time!r} has the times', path=path)
-    if not np.isfinite(times).any():
+    times = times[np.isfinite(times)]
+    if not len(times):
         return Stamp(named.time, 'iso')
-    if named.time_unit:
+    if named.time_unit in STAMP_EXPONENTS:
         return build(Stamp, {'column': named.time, 'unit': named.time_unit})
-    steps = np.diff(times[np.isfinite(times)])
-    step = float(np.median(steps)) if len(steps) else 0.0
-    is_time = len(steps) > 0 and (steps > 0.0).mean() > 0.9
-    # Take the largest unit that gives a plausible interval: 5 is not plausible in s, but in ms.
-    longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
-    for unit, exponent in STAMP_EXPONENTS.items():
-        if is_time and _STEPS_S[0] < step * 10.0 ** (exponent - 9) < longest:
-            return Stamp(named.time, unit)
-    raise RecordingError(f'its column {named.time!r} is not a rising time: {_GIVE_MAP}', path=path)
+    if named.time_unit:
+        raise RecordingError(
+            f'its column {named.time!r} is in {named.time_unit}: the times must be in s, ms, us '
+            'or ns, or dates',
+            path=path,
+        )
+    steps = np.diff(times)
+    if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
+        step, first = float(np.median(steps[steps > 0.0])), float(times[0])
+        # A slow log of a unit that never turns: the temperature shows that it took longer.
+        shortest_s = span / _FASTEST_K_S
+        longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
+        # The largest unit with a plausible interval: 5 is not plausible in s, but in ms.
+        for unit, exponent in STAMP_EXPONENTS.items():
+            size = 10.0 ** (exponent - 9)
+            begin, step_s = first * size, step * size
+            is_date = _SINCE_1970_S[0] <= begin < _SINCE_1970_S[1] and step_s < _SINCE_1970_STEP_S
+            is_next_too_short = step_s * len(times) / 1000.0 < shortest_s
+            if is_date or (_STEPS_S[0] < step_s and (step_s < longest or is_next_too_short)):
+                return Stamp(named.time, unit)
+    raise RecordingError(_no_time(named.time, steps), path=path)
+
+
+def _no_time(column: Column | None, steps: Floats) -> str:
+    """Return what is wrong with the times of a column."""
+    if len(steps) and (steps > 0.0).mean() <= _RISING and (steps >= 0.0).mean() > 0.9:
+        shown = f'{(steps == 0.0).mean():.0%}'
+        return (
+            f'its column {column!r} has the time of the row before in {shown} of the rows: '
+            f'give {_A_MAP}, with `stamp: {{rate_hz: HZ}}` for samples at a fixed rate'
+        )
+    if len(steps) and (steps >= 0.0).mean() > 0.9:
+        return (
+            f'its column {column!r} rises by {np.median(steps):.3g} from row to row, which is no '
+            f'plausible interval of samples in s, ms, us or ns: {_GIVE_MAP}'
+        )
+    return f'its column {column!r} is not a rising time: {_GIVE_MAP}'
 
 
 def _turns_at_once(accel: Floats) -> bool:

@@ -125,11 +125,11 @@ def _thermal(
     offset = gain[:, None] * offset + ((gain - 1.0) * loads)[:, None]
     cubics, misfit = _cubics(d, offset)
     if misfit > 0.01 * MICRO_G:
-        notes.append(f'bias functions replaced by cubics, off by {misfit / MICRO_G:.2g} ug')
+        notes.append(f'bias functions replaced by cubics, off by {spoken(misfit)}')
     folded = 'folded into the offset at one attitude'
     if curves.scale_drift > 1e-8:
-        ppm = f'{1e6 * curves.scale_drift:.2g} ppm'
-        notes.append(f'scale over temperature is {folded if up else "lost"}: up to {ppm}')
+        lost = _ppm(curves.scale_drift)
+        notes.append(f'scale over temperature is {folded if up else "lost"}: up to {lost}')
     constant = float(np.max(np.abs(gain - 1.0)))
     if constant > 1e-8:
         rest = folded if up else 'lost, calibrate the six faces in the autopilot afterwards'
@@ -149,6 +149,12 @@ def _thermal(
     return Content(np.eye(3), cubics, reference_c, range_c, notes, rate_bias=rate_bias)
 
 
+def _ppm(part: float) -> str:
+    """Format a part in ppm, with two digits or as a whole number."""
+    value = 1e6 * part
+    return f'{value:.2g} ppm' if value < 99.5 else f'{value:.0f} ppm'
+
+
 def _constant(calibration: Calibration, curves: _Curves) -> Content:
     """Return bias, scale and misalignment at the reference temperature, for tumble tests."""
     drift = 'the calibration has no correction for temperature'
@@ -156,7 +162,7 @@ def _constant(calibration: Calibration, curves: _Curves) -> Content:
         drift = (
             f'over the calibrated range the bias moves by up to '
             f'{spoken(float(np.max(np.abs(curves.bias))))}, the scale by '
-            f'{1e6 * curves.scale_drift:.2g} ppm'
+            f'{_ppm(curves.scale_drift)}'
         )
     reference_c = calibration.reference_temperature_c
     notes = [f'the file holds at {reference_c:g} degC: {drift}']

@@ -14,16 +14,48 @@ from typing import Any
 import yaml
 
 _UNIT = re.compile(r'[\[(]([^\])]*)[\])]')
-_TIME = re.compile(r'(^|_)(time|timestamp|stamp|now|date|datetime|epoch|elapsed|utc|t|ts)(_|$)')
-_TIMES = {'s': 's', 'sec': 's', 'seconds': 's', 'ms': 'ms', 'us': 'us', 'µs': 'us', 'ns': 'ns'}
-_ACCEL, _GYRO = re.compile('acc|force|^a$'), re.compile('gyr|omega|rot|rate|angular|^g$|^w$')
+_TIME = re.compile(
+    r'(^|_)(time|timestamp|stamp|now|date|datetime|epoch|elapsed|utc|t|ts)(_|$)'
+    r'|^(seconds|millis|micros|nanos|(milli|micro|nano)seconds)(_|$)'
+)
+_TIMES = {
+    **dict.fromkeys(('s', 'sec', 'secs', 'second', 'seconds'), 's'),
+    **dict.fromkeys(('ms', 'msec', 'millis', 'milliseconds'), 'ms'),
+    **dict.fromkeys(('us', 'µs', 'μs', 'usec', 'micros', 'microseconds'), 'us'),
+    **dict.fromkeys(('ns', 'nsec', 'nanos', 'nanoseconds'), 'ns'),
+}
+# Units of time that a column map does not have; a table in them is refused.
+_LONG_TIMES = {
+    **dict.fromkeys(('min', 'mins', 'minute', 'minutes'), 'min'),
+    **dict.fromkeys(('h', 'hr', 'hrs', 'hour', 'hours'), 'h'),
+    **dict.fromkeys(('day', 'days'), 'days'),
+}
+_ACCEL = re.compile('acc|force|(^|_)ac?(_|$)')
+_GYRO = re.compile('gyr|omega|rot|rate|angular|(^|_)(g|gy|w)(_|$)')
+# The field of sensor_msgs/Imu; the same words are those of phones for |f| without gravity, which
+# the check of the reading at rest refuses.
+_ROS_ACCEL = re.compile('(^|_)linear_acceleration$')
 # Words in headings of triads that are neither accelerometer nor gyroscope.
 _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|vel(?!ocity)')
-_TEMPERATURE = re.compile('temp|tmp|celsius|(^|_)t_?c($|_)')
+_TEMPERATURE = re.compile(
+    'temp|tmp|celsius|(^|_)t_?c($|_)|^t_(board|case|imu|die|chip|sensor|air|amb|room|baro)'
+)
 _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
-_ACCELS = {'g': 'g', 'mg': 'mg', 'm/s^2': 'm/s^2', 'm/s2': 'm/s^2', 'm/s²': 'm/s^2'}
-_RATES = {'deg/s': 'deg/s', '°/s': 'deg/s', 'dps': 'deg/s', 'rad/s': 'rad/s'}
-_DEGREES = {'k': 'K', 'kelvin': 'K', 'f': 'degF', '°f': 'degF', 'degf': 'degF'}
+# Units as they stand in brackets or, in lower case with underscores, at the end of a heading.
+_ACCELS = {
+    'g': 'g',
+    'mg': 'mg',
+    **dict.fromkeys(('m/s^2', 'm/s2', 'm/s²', 'm s^-2', 'm_s_2', 'm_s2', 'ms2', 'mps2'), 'm/s^2'),
+}
+_RATES = {
+    **dict.fromkeys(('deg/s', '°/s', 'dps', 'deg_s'), 'deg/s'),
+    **dict.fromkeys(('rad/s', 'rad s^-1', 'rad_s', 'rads'), 'rad/s'),
+}
+_DEGREES = {
+    **dict.fromkeys(('k', 'kelvin', 'degk', 'tempk'), 'K'),
+    **dict.fromkeys(('f', '°f', 'degf', 'deg f', 'fahrenheit', 'tempf'), 'degF'),
+}
+_CELSIUS = ('c', '°c', 'ºc', 'degc', 'deg c', 'celsius')
 
 Column = str | int
 Columns = tuple[Column, Column, Column]
@@ -34,7 +66,7 @@ class Headings:
     """The recognised columns, by heading or number, with their stated units; '' if not stated."""
 
     time: Column | None
-    time_unit: str
+    time_unit: str  # also min, h, days
     accel: Columns
     accel_unit: str
     gyro: Columns | None
@@ -45,27 +77,31 @@ class Headings:
 def read_headings(headings: Sequence[str]) -> Headings | None:
     """Find the columns by their names; None where no accelerometer is among them."""
     names = {_plain(heading): heading for heading in reversed(headings)}
-    times = [one for name, one in names.items() if _TIME.search(name)]
-    triads = dict(_triads(names))
+    times = [one for name, one in names.items() if _TIME.search(name) and not _is_warm(one)]
+    found = dict(_triads(names))
+    triads = {key: three for key, three in found.items() if not _OTHER.search(key)}
     accel = next((key for key in triads if _ACCEL.search(key)), '' if '' in triads else None)
+    if accel is None:
+        accel = next((key for key in found if _ROS_ACCEL.search(key)), None)
+        triads |= {} if accel is None else {accel: found[accel]}
     if accel is None:
         return None
     gyro = next((key for key in triads if _GYRO.search(key)), None)
     time = times[-1] if times else ''
     thermometers: dict[str, tuple[str, str]] = {}
-    for heading in headings:
-        if _TEMPERATURE.search(_plain(heading)):
+    for heading in dict.fromkeys(headings):
+        if _is_warm(heading):
             is_outside = _OUTSIDE.search(_plain(heading)) and thermometers
             usual = 'case' if is_outside or 'board' in thermometers else 'board'
             name = usual if usual not in thermometers else f't{len(thermometers)}'
-            thermometers[name] = heading, _DEGREES.get(_unit(heading), 'degC')
+            thermometers[name] = heading, _stated(heading, _DEGREES) or 'degC'
     return Headings(
         time or None,
-        _TIMES.get(_unit(time) or _plain(time).rpartition('_')[2], ''),
+        _stated(time, _TIMES | _LONG_TIMES),
         triads[accel],
-        _ACCELS.get(_unit(triads[accel][0]), ''),
+        _stated(triads[accel][0], _ACCELS),
         triads[gyro] if gyro is not None else None,
-        _RATES.get(_unit(triads[gyro][0]), '') if gyro is not None else '',
+        _stated(triads[gyro][0], _RATES) if gyro is not None else '',
         thermometers,
     )
 
@@ -86,14 +122,26 @@ def _given(value: Any) -> Any:
     return list(map(_given, value)) if isinstance(value, tuple) else value
 
 
+def _is_warm(heading: str) -> bool:
+    """Whether a heading is that of a temperature, by its words or by its unit in brackets."""
+    unit = _UNIT.search(heading)
+    is_unit = unit is not None and unit[1].strip().lower() in {*_DEGREES, *_CELSIUS}
+    return is_unit or _TEMPERATURE.search(_plain(heading)) is not None
+
+
 def _plain(heading: str) -> str:
     """Convert a heading to lower case with underscores, without its unit."""
     return re.sub(r'[^0-9a-z]+', '_', _UNIT.sub('', heading).strip().lower()).strip('_')
 
 
-def _unit(heading: str) -> str:
+def _stated(heading: str, units: dict[str, str]) -> str:
+    """Return the unit in the brackets of a heading or else at its end; '' if there is none."""
     match = _UNIT.search(heading)
-    return match[1].strip().lower() if match else ''
+    if match:
+        return units.get(match[1].strip().lower(), '')
+    name = _plain(heading)
+    ends = (unit for unit in units if name == unit or name.endswith(f'_{unit}'))
+    return units.get(max(ends, key=len, default=''), '')
 
 
 def _triads(names: dict[str, str]) -> Iterator[tuple[str, tuple[str, str, str]]]:
@@ -102,6 +150,6 @@ def _triads(names: dict[str, str]) -> Iterator[tuple[str, tuple[str, str, str]]]
         for at in (match.start() for match in re.finditer('x', name)):
             three = [f'{name[:at]}{axis}{name[at + 1 :]}' for axis in 'xyz']
             key = f'{name[:at]}{name[at + 1 :]}'.replace('__', '_').strip('_')
-            if all(heading in names for heading in three) and not _OTHER.search(key):
+            if all(heading in names for heading in three):
                 x, y, z = (names[heading] for heading in three)
                 yield key, (x, y, z)

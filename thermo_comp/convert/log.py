@@ -49,6 +49,7 @@ NO_STAMP = np.iinfo(np.int64).min  # the stamp of a row without a stamp
 _PLAUSIBLE_CELSIUS = (-90.0, 200.0)
 _RUN_ROWS = 100_000  # number of rows processed at a time, to bound the memory
 _EXAMPLES = 5
+_RESTART_NS = 10**9  # a larger backward step is a restart of the clock, as for the compensator
 SLOW_HZ = 5.0  # slower logs are only good for soaks
 
 
@@ -69,6 +70,7 @@ class ForeignLog:
     frame_id: str = 'imu_link'
     serial: str = ''
     n_short: int = 0  # number of rows left out
+    continued: tuple[int, ...] = ()  # lines where a 32-bit counter began again, and was continued
     metadata: Mapping[str, str] = field(default_factory=dict)
     missing: str | None = None  # description of unreadable parts
     chosen: str | None = None  # note on topics chosen by type
@@ -154,8 +156,9 @@ def write_log(
     line, stamp_ns = line[usable], log.stamp_ns
     stillness = find_stillness(stamp_ns, log.accel)
     _refuse_wrong_units(log, stillness)
+    log, n_impossible = _without_impossible(log)
     newest = np.maximum.accumulate(stamp_ns)
-    _write(log, Path(output), force, newest, progress)
+    _write(log, Path(output), force, progress)
     steps = np.diff(newest)
     low, high = log.clip or (-np.inf, np.inf)
     beyond = (log.accel <= low) | (log.accel >= high)
@@ -171,6 +174,8 @@ def write_log(
             'non_numeric': not_numeric,
             'out_of_range': out_of_range,
             'clipped': _finding(np.any(beyond, axis=1), line),
+            'impossible': Finding(n_impossible),
+            'continued': Finding(len(log.continued), log.continued[:_EXAMPLES]),
             'backwards': _finding(np.diff(stamp_ns, prepend=stamp_ns[0]) < 0, line),
             'repeated': _finding(np.diff(stamp_ns, prepend=stamp_ns[0] - 1) == 0, line),
         },
@@ -208,19 +213,47 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
         if not low <= typical <= high:
             guess = ': that looks like kelvins' if KELVINS[0] < typical < KELVINS[1] else ''
             raise RecordingError(
-                f'the {name} temperature is {typical:.4g} degC in the median{guess}', path=log.path
+                f'the {name} temperature is {typical:.4g} degC in the median{guess}; expected '
+                f'{low:g} to {high:g}: the unit in a column map may be degC, K, degF or raw',
+                path=log.path,
             )
 
 
-def _write(
-    log: ForeignLog, output: Path, force: bool, newest: Ints, progress: Callable[[float], None]
-) -> None:
+def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
+    """
+    Return log times that never go back, as stamps may, and the shift after each restart of the
+    clock; a thermometer takes the `shifts` of the samples, so that its readings stay among them.
+    """
+    is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
+    if shifts is None or len(shifts) != is_restart.sum():
+        shifts = np.zeros(int(is_restart.sum()), np.int64)
+        newest = np.maximum.reduceat(stamp_ns, [0, *np.flatnonzero(is_restart)])
+        first = stamp_ns[is_restart]
+        for k in range(len(shifts)):
+            shifts[k] = newest[k] + 1 + (shifts[k - 1] if k else 0) - first[k]
+    moved = stamp_ns + np.concatenate(([0], shifts))[np.cumsum(is_restart)]
+    return np.maximum.accumulate(moved), shifts
+
+
+def _without_impossible(log: ForeignLog) -> tuple[ForeignLog, int]:
+    """Leave out single readings that are no temperatures, as -127 degC of a lost DS18B20."""
+    low, high = _PLAUSIBLE_CELSIUS
+    kept, n = {}, 0
+    for name, readings in log.temperatures.items():
+        is_good = (readings.celsius >= low) & (readings.celsius <= high)
+        kept[name] = readings.take(is_good)
+        n += int((~is_good).sum())
+    return replace(log, temperatures=kept), n
+
+
+def _write(log: ForeignLog, output: Path, force: bool, progress: Callable[[float], None]) -> None:
     """Write the messages; log times never go back, so backward stamps keep their order."""
     topics, n = Topics(), len(log.stamp_ns)
+    newest, shifts = _log_times(log.stamp_ns)
     per_g = PER_G.get(log.unit, log.counts_per_g or 1.0)
     factor = STANDARD_GRAVITY / per_g if log.input == 'imu' else 1.0
     waiting = [
-        (thermometer(name), readings, np.maximum.accumulate(readings.stamp_ns))
+        (thermometer(name), readings, _log_times(readings.stamp_ns, shifts)[0])
         for name, readings in log.temperatures.items()
         if len(readings.celsius)
     ]
@@ -302,6 +335,8 @@ def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> 
     if not np.isfinite(magnitude):
         return None
     believed, reason = believed_unit(magnitude)
+    if stated != 'counts' and believed == 'unknown':
+        return reason
     if stated != 'counts':
         return None if believed == stated else f'{reason}: that looks like {believed}'
     if counts_per_g is not None and abs(magnitude / counts_per_g - 1.0) > _TOLERANCE:

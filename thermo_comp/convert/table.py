@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
 from io import TextIOWrapper
-from itertools import chain, islice
+from itertools import chain, islice, takewhile
 from math import nan
 from operator import itemgetter
 from pathlib import Path
@@ -29,12 +29,14 @@ from ..errors import RecordingError
 from ..files import open_regular
 from ..quantities import NotNegative, Positive
 from ..typing import Floats, Ints
+from .headings import read_headings
 from .log import NO_STAMP, library
 
 Column = str | int
 TimeUnit = Literal['s', 'ms', 'us', 'ns', 'iso']
 
 _SNIFF_BYTES = 65536
+_LAYOUT_ROWS = 50  # rows at the end of the sniffed text that decide the layout
 _PREAMBLE_ROWS = 1000  # longest preamble of a logger
 _MOST_ROWS_PER_BYTE = 4  # largest number of rows per byte of a Parquet file with measurements
 #: Powers of ten from a unit of time to nanoseconds.
@@ -108,6 +110,8 @@ def read_text(
             given = _DELIMITERS.get(style.delimiter or '', style.delimiter)
             delimiter, width = layout(head, given)
             headings, rows = _begin(_rows(file, delimiter), width, style.header)
+            if not headings and style.header is None:
+                headings = _commented(head, delimiter, width)
             return _collect(path, headings, rows, columns, stamp)
     except (UnicodeError, csv.Error) as failure:
         raise RecordingError(f'not a table of text ({failure})', path=path) from failure
@@ -118,17 +122,27 @@ def read_text(
 def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
     Return the delimiter of a text table and the number of cells per row: the delimiter that splits
-    most lines into one number of cells (a blank is any run of white space). Only the last lines of
-    `head` count, because a logger's preamble may come first; the very last line may be cut.
+    most lines into one number of cells (a blank is any run of white space). The last lines of
+    `head` decide, because a logger's preamble may come first; the very last line may be cut.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
-    lines = (lines[:-1] if len(lines) > 2 else lines)[-50:]
+    lines = lines[:-1] if len(lines) > 2 else lines
     candidates: list[tuple[int, str, int]] = []
-    for sign in (',', ';', '\t', '|', ' ') if delimiter is None else (delimiter,):
-        widths = [_n_cells(row) for _, row in _rows(lines, sign)]
-        width = max(set(widths), key=widths.count, default=0)
-        candidates.append((widths.count(width) if width > 1 else 0, sign, width))
+    # The comma is late: it may be the decimal sign of a table with another delimiter.
+    for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
+        rows = [row for _, row in _rows(lines, sign)]
+        width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
+        # The last columns are blank in most rows if they are those of a slower thermometer.
+        whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
+        is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
+        candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))
     return max(candidates, key=itemgetter(0))[1:]
+
+
+def _most_frequent(numbers: Sequence[int]) -> tuple[int, int]:
+    """Return the most frequent number and its frequency."""
+    most = max(set(numbers), key=numbers.count, default=0)
+    return most, numbers.count(most)
 
 
 def _is_comment(cell: str) -> bool:
@@ -171,6 +185,17 @@ def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str],
     return [cell.strip() for cell in headings], chain(first[begin + bool(headings) :], rows)
 
 
+def _commented(head: str, delimiter: str, width: int) -> list[str]:
+    """Return the headings in the last comment before a table, as numpy.savetxt writes them."""
+    comments = list(
+        takewhile(lambda line: not line.strip() or _is_comment(line), head.splitlines())
+    )
+    text = next((line for line in reversed(comments) if line.strip()), '').strip().lstrip('#%/ ')
+    cells = text.split() if delimiter == ' ' else next(csv.reader([text], delimiter=delimiter), [])
+    cells = [cell.strip() for cell in cells]
+    return cells if len(cells) == width and read_headings(cells) is not None else []
+
+
 def _number(cell: str) -> float | None:
     """Read a cell as a number, including NaN and infinity; None if it is not a number."""
     try:
@@ -208,6 +233,12 @@ def _collect(
             values[name].append(nan if value is None else value)
         if at is not None:
             stamps.append(exact_ns(row[at], stamp.unit))
+    if at is not None and stamp.unit == 'iso' and stamps and max(stamps) == NO_STAMP:
+        raise RecordingError(
+            f'no cell of its column {stamp.column!r} is a date of ISO 8601, as '
+            f'2026-03-29T01:30:00.5Z; the first is {first[1][at].strip()!r}',
+            path=path,
+        )
     return Table(
         line=np.array(line),
         values={name: np.array(column) for name, column in values.items()},

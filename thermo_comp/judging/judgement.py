@@ -145,24 +145,37 @@ def judge(
         rate=verdicts.judge_rates(windows.select(windows.is_usual), calibration),
         by_force=verdicts.by_force(windows, claimed),
     )
-    kind, reason = _verdict(judgement, claims, calibration.needs_temperature)
+    kind, reason = _verdict(judgement, claims, calibration)
     return replace(judgement, kind=kind, reason=reason)
 
 
-def _verdict(judgement: Judgement, claims: bool, is_thermal: bool) -> tuple[Verdict, str]:
+def _ranges(celsius: Floats, k_min: Floats) -> str:
+    """Return the ranges of temperatures and of their rates as text."""
+    return (
+        f'{np.min(celsius):.1f} to {np.max(celsius):.1f} degC and '
+        f'{np.min(k_min):+.2f} to {np.max(k_min):+.2f} K/min'
+    )
+
+
+def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tuple[Verdict, str]:
     sections, windows, tolerance = judgement.sections, judgement.windows, judgement.tolerance
     full, outside, left_out = sections['all'], sections['outside'], judgement.left_out_rms
     if not full.n:
-        span = f'at {np.min(windows.board):.1f} to {np.max(windows.board):.1f} degC'
-        text = f'all {_windows(outside.n, windows)} lie there, {span}; {_numbers(outside)}'
-        return Verdict.OUTSIDE, text
+        seen = _ranges(windows.board, windows.rate * 60.0)
+        sets = calibration.static, calibration.dynamic
+        known = _ranges(
+            np.ravel([one.temperature_range_c for one in sets]),
+            np.ravel([one.rate_range_k_min for one in sets]),
+        )
+        text = f'all {_windows(outside.n, windows)} lie there, at {seen}; calibrated at {known}'
+        return Verdict.OUTSIDE, f'{text}; {_numbers(outside)}'
     worst = max([s.rms for s in sections.regimes or [full]] + [judgement.headline_rms])
     ratio = sections.worst_ratio
     # Without a claimed sd `claimed_rms` is NaN, and the comparison false.
     is_wide = full.claimed_rms > (tolerance or min(verdicts.WIDE_PART * full.raw_rms, _WIDE_CLAIM))
     if windows.is_swapped.any():
         kind = Verdict.SWAPPED
-    elif full.rms >= full.raw_rms and is_thermal:
+    elif full.rms >= full.raw_rms and calibration.needs_temperature:
         kind = Verdict.NO_BETTER
     elif tolerance is not None and worst > tolerance:
         kind = Verdict.RECALIBRATE
@@ -250,7 +263,9 @@ def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
             ('scale', 1e6 * shift.scale, 1e6 * shift.scale_sd, 'ppm'),
         ):
             if abs(value) > _SURE_SDS * sd:
-                collected.append(f'{axis} {name} {value:+.3g} +- {sd:.2g} {unit}')
+                # Two digits of the sd, without an exponent.
+                digits = max(0, 1 - int(np.floor(np.log10(sd)))) if sd > 0.0 else 3
+                collected.append(f'{axis} {name} {value:+.{digits}f} +- {sd:.{digits}f} {unit}')
     return tuple(collected)
 
 

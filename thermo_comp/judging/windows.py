@@ -259,6 +259,9 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     # The checks for stuck samples and gravity do not apply to a mean.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
+    # A sum is many samples: a distance of more than 15 s to the sum and the reading before it, as
+    # with a slow thermometer, is no sample whose stamp alone is wrong.
+    compensator.leap_ns = np.iinfo(np.int64).max
     thermal = compensator.thermal
     readings = iter(readings_in_order(bag, thermal.inputs))
     reading = next(readings, None)

@@ -14,7 +14,7 @@ from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..topics import TEMPERATURE
 from ..typing import Ints
-from .blocks import Readings, RecordingInfo
+from .blocks import LONGEST_PAUSE_NS, Readings, RecordingInfo
 from .causes import CauseCounter
 from .fields import temperature_fields
 from .reader import RecordingReader, open_recording
@@ -155,6 +155,11 @@ def survey_recording(
             f'the unit never rests for 3 s, and a fit needs rests: {why_restless(reduced)}',
         ),
         (clock.n_backwards, f'{clock.n_backwards} stamps do not rise: those samples are left out'),
+        (
+            clock.n_restarts,
+            f'the time goes back by more than an hour ({clock.n_restarts} times): a fit takes it '
+            'for a pause of an hour',
+        ),
         (clock.n_gaps, f'{clock.n_gaps} gaps, the longest {clock.longest_gap_s:.3g} s'),
     ]
     duration_s = (clock.last_ns - clock.first_ns) * 1e-9
@@ -179,19 +184,29 @@ class _Clock:
     n: int = 0
     first_ns: int = 0
     last_ns: int = 0
+    newest_ns: int = 0  # since the last restart
     step_ns: float = 0.0
-    n_backwards: int = 0
+    n_backwards: int = 0  # number of stamps that do not rise above all before
+    n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`
     n_gaps: int = 0
     longest_gap_s: float = 0.0
 
     def add(self, stamp_ns: Ints) -> None:
         """Take the next stamps, at least one."""
         if not self.n:
-            self.first_ns = self.last_ns = int(stamp_ns[0])
-        steps = np.diff(stamp_ns, prepend=self.last_ns)[not self.n :]
+            self.first_ns = self.last_ns = self.newest_ns = int(stamp_ns[0])
+        later = stamp_ns[not self.n :]
+        steps = np.diff(later, prepend=self.last_ns)
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
+        # After a step back by an hour or less samples are left out until the time has caught up.
+        restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
+        self.n_restarts += len(restarts)
+        for number, part in enumerate(np.split(later, restarts)):
+            before = int(part[0]) - 1 if number else self.newest_ns
+            newest = np.maximum.accumulate(np.concatenate(([before], part)))
+            self.n_backwards += int((part <= newest[:-1]).sum())
+            self.newest_ns = int(newest[-1])
         rising = steps[steps > 0]
-        self.n_backwards += len(steps) - len(rising)
         if not self.step_ns and len(rising):
             self.step_ns = float(np.median(rising))
         gaps = rising[rising > _GAP_INTERVALS * self.step_ns]

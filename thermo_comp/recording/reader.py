@@ -275,7 +275,11 @@ def _described(path: Path) -> _Description:
     if not path.is_file():
         raise RecordingError('not a bag: neither a file nor a directory', path)
     if path.suffix not in {'.mcap', '.db3', '.bag'}:
-        raise RecordingError('not a bag: expected a directory, .mcap, .db3 or .bag', path)
+        raise RecordingError(
+            'not a bag: expected a directory, .mcap, .db3 or .bag; `thermo_comp convert` makes a '
+            'bag of a table or log',
+            path,
+        )
     return _Description(path.suffix[1:], (path,))
 
 

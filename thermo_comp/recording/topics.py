@@ -217,6 +217,8 @@ def select_topics(
     if corrected and 'accel' not in name_of:
         chosen.append(_said_corrected(corrected))
     name_of |= _further(present, topics, name_of, is_read=bool(require))
+    if 'accel' in name_of and 'board' not in name_of:
+        chosen.append(_said_unnamed(present, topics.board, set(name_of.values())))
     named = {**topics.further, 'board': topics.board, 'case': topics.case}
     fields = {role: split_field(named.get(role, ''))[1] for role in name_of if role != 'accel'}
     fields = {
@@ -280,6 +282,19 @@ def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
 
 def _said_corrected(name: str) -> str:
     return f'{shown(name)} is corrected already: thermo_comp wrote it, it is not an input'
+
+
+def _said_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
+    """Note that several topics may be the board's thermometer, so none is read; '' if none is."""
+    names = [
+        shown(name)
+        for name, (kind, count) in present.items()
+        if count and kind == TEMPERATURE and name not in taken
+    ]
+    if not names:
+        return ''
+    text = ' or '.join(sorted(names))
+    return f'no {board}: is it {text}? name it with --topic board=TOPIC'
 
 
 def _further(
