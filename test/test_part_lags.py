@@ -202,6 +202,31 @@ def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
     assert score.ratio < 1.5
 
 
+@pytest.mark.parametrize('given', [{}, {'mounting_sd': 3e-4}])
+def test_six_faces_in_three_soaks(given):
+    # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces, and drifts of
+    # 10 mg ended in such a fit: 40 mg. With a stated repeatability the fit divided by zero.
+    rng = rng_of('faces in soaks', 1)
+    unit = replace(cheap(rng), skew=np.zeros(3))
+    faces = np.vstack((np.eye(3), -np.eye(3))).repeat(3, axis=0)
+    bags = positions(unit, SOAKS, faces, rng, rate_hz=10.0)
+    held = positions(unit, program(19.0, 90.0), spread(2, rng), rng, rate_hz=10.0)
+    study = Study('', bags, one_test(held), {'full_scale': 32767.0, **given})
+    # The noise of a mean of 25 min is 4 ug, and quanta of 0.5 mg leave some ten times as much.
+    assert judged(strangers.fitted(study), study).vector < 100.0
+
+
+def test_a_curve_between_two_soaks_is_claimed():
+    # WHY: the powers of the curve that two temperatures do not show were claimed to be zero, an
+    # eighth of the error.
+    rng = rng_of('two soaks')
+    unit = cheap(rng)
+    bags = positions(unit, SOAKS[::2], spread(18, rng), rng, rate_hz=10.0)
+    held = positions(unit, program(19.0, 90.0), spread(3, rng), rng, rate_hz=10.0)
+    study = Study('', bags, one_test(held), {'full_scale': 32767.0})
+    assert judged(strangers.fitted(study), study).ratio < 2.0
+
+
 def test_a_curve_that_the_soaks_do_not_show_is_claimed():
     # Each axis is vertical at a temperature of its own: the constants explain all norms, whatever
     # the curve. WHY: the curve was claimed to be zero, and the error was

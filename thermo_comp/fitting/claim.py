@@ -39,6 +39,10 @@ from .start import within_positions
 from .unknowns import Layout, Prior, State
 from .windows import CURVE, PART
 
+# Largest effect of a column of the curve that the data do not show, relative to that of the seen
+# column of the largest slope: curves over temperature deviate from a line by up to a half.
+_UNSEEN_SHARE = 0.5
+
 
 @dataclass(frozen=True)
 class Claim:
@@ -113,10 +117,9 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
-    # In a model without any curve the unseen curve is that over the board's temperature. From one
-    # attitude the drifts of bias and scale factor cannot be separated: each may have the columns
-    # of the other, and powers that the curve of a part lacks.
-    curves = [PART] * (PART in active) or [CURVE] * (CURVE not in active)
+    # A curve may have columns that the temperatures of the soaks do not show. From one attitude the
+    # drifts of bias and scale factor cannot be separated: each may have the columns of the other.
+    curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
     seen = np.diag(inactive.S).reshape(-1, 3)
@@ -133,6 +136,9 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
         slopes = np.sqrt(np.mean(np.sum(steepest**2, axis=2), axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.where(is_of_lags, np.minimum(typical, of_curve), typical)
+        unseen = _UNSEEN_SHARE * of_curve
+        typical = np.where(groups == CURVE, np.minimum(typical, unseen), typical)
+        sd = np.where(groups == CURVE, np.minimum(sd, unseen), sd)
     # All lags together have at most the effect of one lag: they share its prior variance.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))

@@ -156,9 +156,8 @@ class Growth:
         Fit the curve with its first column, then with more of them as long as each is likelier by
         `TRIAL_GAIN`: norms alone are explained by many curves.
         """
-        prior = replace(
-            constants.posterior.prior, offset_sd=constants.posterior.prior.offset_scale
-        )
+        prior = constants.posterior.prior
+        prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
         typical, state = self._candidates.typical, constants.posterior.state
         number = np.cumsum(self._names == CURVE)
         curves = [
