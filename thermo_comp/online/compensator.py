@@ -31,16 +31,16 @@ from .status import CompensatorConfig, Counters, GravityResidual
 #: Smallest backward step of the stamps that is a jump of time, as of a bag that loops [ns].
 TIME_JUMP_NS: Final = 1_000_000_000
 #: A forward step of the stamps above both limits ([ns], [cycles]) is accepted only if a reading or
-#: a second sample confirms it: a single damaged stamp would erase the memory.
+#: a second sample confirms it: a single damaged stamp would erase the thermal memory.
 LEAP_NS: Final = 15_000_000_000
 LEAP_CYCLES: Final = 10.0
-#: Age above which a board temperature is stale: number of reading intervals, at least this [s].
+#: Age above which a board temperature is stale: number of reading intervals, and lower bound [s].
 STALE_INTERVALS: Final = 5.0
 SHORTEST_STALE_S: Final = 0.5
-#: Texts about a status, for diagnostics and offline reports.
+#: Texts about the status of a compensator, for diagnostics and offline reports.
 SWAPPED: Final = (
     'the board leads the case in ramps: are temperature/board and temperature/case swapped, or is '
-    'it heated from inside?'
+    'the unit heated from inside?'
 )
 HELD: Final = 'outside the calibrated range, held at its edge'
 CONTINUED: Final = (
@@ -50,7 +50,8 @@ CONTINUED: Final = (
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]
-Real = TypeVar('Real', float, Floats)  # the value of one sample, or an array of many
+# Type of a quantity: the value of one sample, or an array of many samples.
+Real = TypeVar('Real', float, Floats)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +66,10 @@ class CompensatorStatus:
     #: Result of `ThermalTracker.sample`; empty until there is a board temperature.
     state: tuple[float, ...] = ()
     regime: Regime = Regime.UNKNOWN
-    direction: int = 0  # -1 cooling, +1 heating, 0 neither
-    is_settled: bool = False  # the unknown initial lag states have decayed
-    #: Ages of the last used readings at the last sample [s]; infinite without a reading.
+    direction: int = 0  # temperature change: -1 cooling, +1 heating, 0 neither
+    is_settled: bool = False  # whether the unknown initial lag states have decayed
+    #: Ages of each thermometer's last used reading at the last sample [s]; infinite without a
+    #: reading.
     board_age_s: float = math.inf
     case_age_s: float = math.inf
     is_board_stale: bool = True
@@ -76,7 +78,7 @@ class CompensatorStatus:
     excess: Excess = Excess(0.0, 0.0, 0.0, 0.0)  # noqa: RUF009 - it is immutable
     #: Whether the board has led the case in a ramp: most likely the two topics are swapped.
     is_lead_reversed: bool = False
-    gravity: GravityResidual | None = None  # None before the platform has been at rest
+    gravity: GravityResidual | None = None  # residual at rest; None before the first rest
     #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.
     is_refuted: bool = False
     #: Bias sd of each axis' angular rate [rad/s]; empty without a gyroscope.
@@ -186,7 +188,8 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Until a temperature arrives every sample takes this branch and is counted here.
+            # Until a temperature arrives, every sample is handled as an event, so that it is
+            # counted as dropped.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -203,7 +206,8 @@ class Compensator:
             is_good &= is_sound(rate_line)
             self.rate_line = rate_line.tolist()
         if not is_good:
-            # While the correction is not finite every sample takes this branch and is dropped.
+            # While the correction is not finite, every sample is handled as an event, so that it
+            # is dropped.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None
@@ -229,12 +233,12 @@ class Compensator:
         is_far = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
         if is_far and (leapt_ns is None or stamp_ns <= leapt_ns):
             self.leapt_ns = stamp_ns
-            self.event_ns = EVER_NS  # the next sample takes this branch, too
+            self.event_ns = EVER_NS  # the next sample is checked again
             return True
         return False
 
     def jump_back(self, stamp_ns: int) -> None:
-        """Restart at a sample before which time has jumped back: a bag that loops."""
+        """Restart at a sample before which time has jumped back, as in a bag that loops."""
         # Waiting readings with later stamps belong to the time before the jump.
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self.thermal.reset()
@@ -244,7 +248,7 @@ class Compensator:
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Take the regime flags that are due: (stamp of the deciding reading, S)."""
+        """Take the regime flags since the last call: (stamp of the deciding reading, S)."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 
@@ -270,15 +274,16 @@ class Compensator:
         """
         Build a compensator that continues from the last sample with another model or settings.
 
-        Thermometers, regime and memory are kept as far as the new model has the same. The original
-        does not change, so a failure has no effect; only one of the two compensators may continue.
+        The states of thermometers, regime and memory that the new model also has are kept. The
+        original does not change, so a failure has no effect; only one of the two compensators may
+        continue.
         """
         new = copy(self)
         new.take_over(model, config)
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Go on with another model or settings; a compensator that was copied does not change."""
+        """Continue with another model or settings; the original of a copy does not change."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckCheck(config.stuck_timeout_s)
         self.config, self.thermal = config, copy(self.thermal)
@@ -305,7 +310,8 @@ class Compensator:
         board_age_s, case_age_s = (
             math.inf if one is None else (stamp_ns - one) * 1e-9 for one in (board_ns, case_ns)
         )
-        # Stale at half the time-out at the latest, so that a warning precedes the error.
+        # The board temperature is stale at half the time-out at the latest: a warning precedes the
+        # error.
         timeout_s = self.config.temperature_timeout_s
         usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
         state = thermal.sample(stamp_ns)
@@ -333,11 +339,11 @@ class Compensator:
 def corrected(
     line: Iterable[Real], misalignment: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
-    """Return force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s into a segment."""
+    """Return force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s after a segment began."""
     (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
      ax, lx, qx, ay, ly, qy, az, lz, qz) = line  # fmt: skip
     yx, zx, zy, var_yx, var_zx, var_zy = misalignment
-    # Eq. (7), solved for the input of each axis.
+    # Eq. (7) of the paper, solved for the input of each axis.
     x = (x - (bx + bx1 * dt)) / (sx + sx1 * dt)
     y = (y - (by + by1 * dt)) / (sy + sy1 * dt)
     z = (z - (bz + bz1 * dt)) / (sz + sz1 * dt)
@@ -363,6 +369,6 @@ def corrected(
 def corrected_rate(
     line: Iterable[Real], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real]:
-    """Return the angular rate x, y, z and the variance of each axis, `dt` s into a segment."""
+    """Return the angular rate x, y, z and each axis' variance, `dt` s after a segment's start."""
     bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = line
     return x - (bx + bx1 * dt), y - (by + by1 * dt), z - (bz + bz1 * dt), xx, yy, zz

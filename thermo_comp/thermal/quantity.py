@@ -25,5 +25,7 @@ class Quantity:
 
     @property
     def by_board(self) -> float:
-        """Derivative by the board temperature, at given lags and other thermometers' readings."""
+        """
+        Derivative by the board temperature; lags and other thermometers' readings are constant.
+        """
         return float(self.input == 'board')

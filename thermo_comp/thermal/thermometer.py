@@ -25,23 +25,24 @@ from typing import Final
 
 from .settings import ThermometerSettings
 
-OUTLIER_SIGMAS: Final = 6.0  # innovation limit in sd, beyond which a reading is down-weighted
+OUTLIER_SIGMAS: Final = 6.0  # innovation in sd beyond which a reading is down-weighted
 OUTLIER_LIMITS: Final = 5.0  # innovation / OUTLIER_SIGMAS, beyond which a reading is rejected
 RESTART_READINGS: Final = 4  # outliers in a row on one side that count as a real change
-SOAK_S: Final = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
-QUIET_SHARE: Final = 5e-3  # acceleration, quiet / bending mode, of a sensor without wide cells
-CELL_SHARE: Final = 0.2  # acceleration, quiet / bending mode, of a sensor with wide cells
+SOAK_S: Final = 900.0  # mean time in the quiet mode [s]; that in the bending mode is the lag
+QUIET_SHARE: Final = 5e-3  # acceleration in quiet / bending mode, for a sensor without wide cells
+CELL_SHARE: Final = 0.2  # acceleration in quiet / bending mode, for a sensor with wide cells
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
 _DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
-#: Range of readings accepted as temperatures [degC]: from absolute zero.
+#: Range of readings accepted as temperatures [degC]; the lower end is absolute zero.
 COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
-HORIZON_INTERVALS: Final = 5.0  # reading intervals of linear extrapolation; held beyond
+# Horizon of linear extrapolation [reading intervals]; beyond it the temperature is held.
+HORIZON_INTERVALS: Final = 5.0
 NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor is averaged
 
 # The filters of the two modes are written out in floats: a matrix library costs more per call.
 State = tuple[float, float, float, float, float, float, float, float, float]
-"""Temperature, rate, acceleration; then P00, P01, P02, P11, P12, P22 of their covariance."""
+"""Temperature, rate, acceleration; then elements 00, 01, 02, 11, 12, 22 of their covariance."""
 
 _NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # nothing is known
 
@@ -55,7 +56,7 @@ class Thermometer:
     `interval_s`: typical interval; `n_in_row`: readings since the last start; `n_restarts`: starts
     after a gap or a step; `is_ready`: two readings exist, so a rate does. `measured` and its
     variance: the last reading, or for a sensor with cells the equivalent Gaussian measurement
-    (infinite variance: no information). `bending`: probability of that mode.
+    (infinite variance: no information). `bending`: probability of the bending mode.
     """
 
     def __init__(self, settings: ThermometerSettings) -> None:
@@ -64,8 +65,8 @@ class Thermometer:
         noise, quantum = settings.noise_sd_c, settings.quantum_c
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
-        self._noise_scale = 1.0  # actual noise variance / declared
-        self._n_turns = 8.0  # number of innovations in `_noise_scale`; its prior counts as 8
+        self._noise_scale = 1.0  # actual / declared noise variance
+        self._n_turns = 8.0  # number of innovations in `_noise_scale`; the prior counts as 8
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s
@@ -96,7 +97,9 @@ class Thermometer:
         self._n_strange = 0
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
-        """Take a reading [degC]; False if not used: not a temperature, not newer, an outlier."""
+        """
+        Take a reading [degC]; return False if it is no temperature, not newer, or an outlier.
+        """
         if not COLDEST <= reading_c <= HOTTEST:
             return False
         if self.stamp_ns is None:
@@ -132,12 +135,14 @@ class Thermometer:
         is_turning = surprise * self._surprise < 0.0
         self._surprise = surprise
         if is_turning and not self._has_cells:
-            # Only innovations that change sign are noise; a bend makes a run of one sign.
+            # Only innovations that change sign are noise; a change of the rate makes a run of
+            # equal signs.
             excess = min(surprise * surprise / spread - 1.0, 8.0)
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
             self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
-        # The cheap test first: the limit of an outlier is at least OUTLIER_SIGMAS deviations.
+        # The cheap test comes first: an outlier differs by at least OUTLIER_SIGMAS standard
+        # deviations.
         if surprise * surprise > OUTLIER_SIGMAS**2 * spread and abs(surprise) > (
             limit := OUTLIER_SIGMAS * sqrt(spread)
             + 5.0 * self._bend * dt * dt
@@ -177,7 +182,7 @@ class Thermometer:
         self._quiet = quiet
         self._bent = bent
         self.bending = bending
-        # The mixture of both modes, without the acceleration, see `acceleration`.
+        # The estimate is the mixture of both modes; for its acceleration see `acceleration`.
         t, v, _, p00, p01, _, p11, _, _ = quiet
         apart, dv = bent[0] - t, bent[1] - v
         both = bending * (1.0 - bending)
@@ -200,7 +205,7 @@ class Thermometer:
         return True
 
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
-        """Extrapolate temperature, rate and variance to a stamp; held beyond a few intervals."""
+        """Extrapolate temperature, rate and variance to a stamp, for a few intervals at most."""
         if self.stamp_ns is None:
             return nan, nan, inf
         if not self.is_ready:
@@ -210,7 +215,8 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # Beyond the horizon the rate may change, and a ramp may begin without a reading.
+            # Beyond the extrapolation horizon the rate may change, and a ramp may begin without a
+            # reading.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
@@ -227,7 +233,7 @@ class Thermometer:
 
     @property
     def acceleration(self) -> tuple[float, float]:
-        """Estimate of the second derivative [K/s^2] and its variance [K^2/s^4]."""
+        """Estimate of the temperature's second derivative [K/s^2] and its variance [K^2/s^4]."""
         if self.stamp_ns is None:
             return nan, inf
         state = mix(self._quiet, self._bent, self.bending)
@@ -288,7 +294,7 @@ class Thermometer:
 
 
 def mix(state: State, other: State, share: float) -> State:
-    """Mix a state with a share of another: the covariance contains the distance of the two."""
+    """Mix a state with a share of another; the covariance contains the states' difference."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     u, w, b, r00, r01, r02, r11, r12, r22 = other
     dt, dv, da = u - t, w - v, b - a
@@ -314,7 +320,7 @@ def predict(state: State, dt: float, lag: float, power: float) -> State:
     decay = 1.0 / (1.0 + dt / lag)
     grown = power * dt
     driven = grown * half
-    # the transition times the covariance, above its diagonal
+    # the transition matrix times the covariance, above the diagonal
     c01 = p01 + dt * p11 + half * p12
     c02 = p02 + dt * p12 + half * p22
     c12 = p12 + dt * p22

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the thermal state of a unit at any stamp: its thermometers, regime, memory, set weight.
+Owns the tracker of a unit's thermal state: thermometers, regime, memory, weight of the sets.
 
 The compensator, the fit and the report all run this class, so a regressor means the same when it
 is fitted and when it is applied. The class is causal and reads no clock: each reading has a
@@ -19,7 +19,7 @@ from .settings import DetectorSettings, ThermalConfig
 from .state import MEMORY_SETTLED_SD, USUAL_BOARD_LAG_S, Layout
 from .thermometer import Thermometer
 
-#: Relative sd of the gradient estimated from the board's rate while a sensor is lost.
+#: Relative sd of the gradient that is estimated from the board's rate while a sensor is lost.
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
 #: Time without a reading / thermal lag, after which the regime is unknown.
 UNWATCHED_SHARE: Final = 0.25
@@ -73,12 +73,12 @@ class ThermalTracker:
         self._unwatched_s = min(max(UNWATCHED_SHARE * lag_s, config.case_timeout_s), longest_s)
 
     def reconfigure(self, config: ThermalConfig, board_lag_s: float, stamp_ns: int | None) -> None:
-        """Use another configuration from a stamp on, without a step in the weight."""
+        """Use another configuration from a stamp on, without a step in the weight of the sets."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
         self._configure(config, board_lag_s)
-        # Copy: another tracker may share this check.
+        # The check is copied, because another tracker may share it.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
@@ -88,7 +88,7 @@ class ThermalTracker:
         return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self._case_timeout_s
 
     def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
-        """Take a reading [degC]; False if not used: not newer, an outlier or not plausible."""
+        """Take a reading [degC]; return False if it is not newer, an outlier or not plausible."""
         sensor, check = self.thermometers[name], self.checks[name]
         if not self._use(name, sensor, check, stamp_ns, celsius):
             return False
@@ -101,7 +101,7 @@ class ThermalTracker:
         if sensor is self.case:
             self.checks[BOARD_INPUT].watch_other()
             if check.fault is not Fault.STILL or self.detector.regime is not Regime.DYNAMIC:
-                # A sensor that stands still does not prove that a ramp has ended.
+                # Constant readings of a faulty sensor do not prove that a ramp has ended.
                 self._decide(stamp_ns, sensor)
             self.lead.update(self.detector.regime is Regime.STATIC)
         return True
@@ -126,7 +126,7 @@ class ThermalTracker:
     def _use(
         self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
-        """Update a thermometer; a jump adds to the memory's variance, a gap resets it."""
+        """Update a thermometer; a jump adds to the memory's variance, a gap resets the memory."""
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
@@ -208,10 +208,10 @@ class ThermalTracker:
         for name in self.spec.rates:
             sensor = self.thermometers[name]
             is_live = self.is_live(stamp_ns, sensor)
-            # The rate of a lost sensor is taken to be that of the board, with an sd of 100 %.
+            # The rate of a lost sensor is taken to be the board's rate, with an sd of 100 %.
             pairs += [sensor.rate, sensor.var_rate] if is_live else [rate, rate * rate]
         var_board += self.checks[BOARD_INPUT].doubt(stamp_ns)
-        # If the lead is reversed, the topics of case and board may be swapped.
+        # If the board leads the case in a ramp, the topics of case and board may be swapped.
         is_reversed = self.lead.is_reversed
         var_board += gradients[0] * gradients[0] if is_reversed else self.lead.doubt
         if not self.memory.is_empty:
