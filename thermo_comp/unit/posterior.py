@@ -17,16 +17,16 @@ from ..quantities import QUANTITIES
 from ..typing import Floats
 from .functions import TemperatureFunction
 
-#: Share of a variance that single precision does not resolve.
+#: Share of a variance that is below the resolution of single precision.
 _NEGLIGIBLE = 1e-7
-#: Smallest eigenvalue of a correlation matrix that rounding explains.
+#: Smallest (negative) eigenvalue of a correlation matrix that rounding explains.
 _MOST_NEGATIVE = -1e-6
 _FLOAT32 = np.dtype('<f4')
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Covariance of all parameters, by `ParameterLayout`: factor @ factor.T + diag(rest)."""
+    """Covariance of all parameters (order: `ParameterLayout`): factor @ factor.T + diag(rest)."""
 
     rank: Annotated[int, QUANTITIES['number'], 'Number of columns of the factor.']
     factor: Annotated[
@@ -62,7 +62,7 @@ class Posterior:
 
     @cached_property
     def variances(self) -> Floats:
-        """The variances added on the diagonal, shape (n_parameters,)."""
+        """The variances added to the covariance's diagonal, shape (n_parameters,)."""
         return _decoded('rest', self.rest)
 
     def covariance(self) -> Floats:
@@ -92,7 +92,7 @@ class Block(NamedTuple):
 
     @property
     def rows(self) -> slice:
-        """All parameters of the block."""
+        """Indices of all parameters of the block."""
         return slice(self.static, self.end)
 
 
@@ -134,7 +134,8 @@ def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')
-    # Scale to correlations: entries in counts^2 and relative^2 differ by 10 decades.
+    # The covariance is scaled to correlations: entries in counts^2 and relative^2 differ by 10
+    # decades.
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     with np.errstate(over='ignore'):
         correlation = (covariance + covariance.T) / 2.0 / scale / scale[:, np.newaxis]
@@ -158,7 +159,7 @@ def _encoded(numbers: npt.NDArray[np.floating[Any]]) -> str:
 
 
 def _single(numbers: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
-    # An overflow becomes inf, which the reader refuses.
+    # A number that overflows single precision becomes inf, which the reader refuses.
     with np.errstate(over='ignore'):
         return numbers.astype(_FLOAT32)
 
