@@ -34,8 +34,8 @@ from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
 
 _DAY_NS = 86_400e9
-#: Parts of the name of an update's source, before the time of its last rest, and before the days
-#: by which its covariance was aged.
+#: Parts of the name of an update's source: before the time of the last rest, and before the number
+#: of days by which the covariance was aged.
 _UNTIL, _AGED = 'rests until ', ', claim aged '
 
 
@@ -75,7 +75,7 @@ class Series:
         return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
 
     def at(self, chosen: Bools | slice) -> Series:
-        """Return the chosen rests; their starts are numbered anew."""
+        """Return the selected rests; the starts of these rests are numbered from 0."""
         parts: dict[str, Any] = {
             name: value[chosen]
             for name, value in vars(self).items()
@@ -102,7 +102,7 @@ def read_rests(
 
     Returns the rests, the provenance of an update aged `ahead` days, and notes for the user.
 
-    Rests before the calibration are left out, unless all rests are before it; for an update, rests
+    Rests before the calibration are left out, unless all rests are before the calibration; rests
     that an earlier update used are always left out. Raises RecordingError if no rest is left.
     """
     files: list[Path] = []
@@ -174,7 +174,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
         ahead = float(aged.removesuffix(' d') or 0.0)
     except ValueError:
         return -np.inf, -np.inf, False
-    # A covariance aged by a century or more makes the file invalid.
+    # With a covariance aged by a century or more the calibration file would be invalid.
     if np.isnat(moment) or not 0.0 <= ahead < 36525.0:
         return -np.inf, -np.inf, False
     begin = int(moment.astype(np.int64)) / _DAY_NS
@@ -184,7 +184,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
 def series_of(
     rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
 ) -> Series:
-    """Evaluate rests at the logged or given gravity; RecordingError if their log lacks a lag."""
+    """Evaluate rests at the logged or given gravity; RecordingError if the log lacks a lag."""
     correction = Correction(calibration)
     layout, K = Layout(correction.memory), correction.K[:, 0]
     places = {spec: _places(spec, correction.memory) for spec in {s.memory for s, _ in rests}}
@@ -239,7 +239,9 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the places of a state's elements, and of its lags' shares, in the log's state."""
+    """
+    Return the places in a log's state of the elements, and of the lag shares, of another state.
+    """
     try:
         logged, target = Layout(memory).numbers, Layout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)
@@ -282,7 +284,7 @@ def _along(
     v: Floats,
     x: Floats,
 ) -> Floats:
-    """Project the error variance, less a sample's noise, on the direction of the force."""
+    """Return the error variance along the force, without the noise of a sample."""
     parts = np.array(
         [slow.at(s, p) for s, p in zip(states.tolist(), shares.tolist(), strict=True)]
     )

@@ -20,23 +20,27 @@ _STEP = re.compile(
 )
 _SECONDS = {'h': 3600.0, 'min': 60.0, 's': 1.0}
 _PROGRAMS = {
-    # The range and the style of the paper's Fig. 3: up, down and back, with long soaks.
+    # The temperature range and the style of the paper's Fig. 3: up, down and back, with long
+    # soaks.
     'paper': '20 60min, 35@0.5 90min, 20 60min, 5 90min, 20 60min, 35 60min',
-    # Four hours, one bag of a calibration: the whole range, both directions, two ramp rates.
+    # Four hours, for one bag of a thermal test: the whole temperature range, ramps in both
+    # directions, two rates.
     'chamber': '20 20min, 35@0.75 35min, 5@0.6 45min, 20@0.75 35min, 8@1 23min',
-    # The shortest program with the whole range, both directions and short soaks.
+    # The shortest program with the whole temperature range, ramps in both directions and short
+    # soaks.
     'three-hours': '20 10min, 35@0.8 30min, 5@1.2 40min, 22@0.5 22.25min',
-    # Nine and a half hours: slow and fast ramps in both directions, which bound all others.
+    # Nine and a half hours: slow and fast ramps in both directions; other ramps have rates in
+    # between.
     'long': '20 30min, 35@0.5 60min, 5@1 60min, 25@0.3 40min, 10@0.7 45min, 33@0.9 40min, '
     '15@0.35 40min, 20@0.5 19.92063492063492min',
-    # Rates, soak temperatures and an order that no fit has used.
+    # Ramp rates, soak temperatures and their order differ from those of all programs for a fit.
     'held-out': '12 40min, 31@0.35 45min, 17@0.9 30min, 26@0.6 50min, 7@0.7 60min, 22@0.25 40min',
     'slow': '20 60min, 35@0.1 60min, 5@0.2 60min, 20@0.15 60min',
     'fast': '20 45min, 35@3 75min, 5@2 90min, 25@1.5 75min, 10@3 60min',
-    # Ninety minutes, for the sample bags: both regimes and both directions.
+    # The program of the sample bags: both regimes, and ramps in both directions.
     'demo': '15 12min, 30@1 22min, 8@1.1 21min',
     'soak': '20 4h',
-    # Three temperatures with time to settle, for runs on a centrifuge or a rate table.
+    # Soaks at three temperatures, long enough to settle, for runs on a centrifuge or a rate table.
     'three-soaks': '20 60min, 35@1 60min, 5@1 60min',
 }
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
@@ -45,22 +49,24 @@ _EDGES = [
     *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
     *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
 ]
-# Corners: three diagonals with their opposites first.
+# Corners of the cube: the ends of three space diagonals first.
 _CORNERS = [
     *[(1, 1, 1), (-1, -1, -1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1), (1, -1, 1)],
     *[(-1, -1, 1), (1, 1, -1)],
 ]
-# Sd of the tilt about each transverse direction, as the block is not levelled [deg].
+# Sd of the tilt about each transverse direction [deg]: the mounting block is not levelled.
 _SPREAD_DEG = 3.0
-# Attitudes of three positions: each axis has both signs of gravity.
+# Attitudes of a test with three positions: each axis measures both signs of gravity.
 _THREE = np.array([(1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
 PLAN_NAMES = (
     *('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out'),
     *('centrifuge', 'rate-table'),
 )
-# Ends of the soaks; lead of a run before such an end, time at each rate, time between rates [s].
+# Runs at several rates, times in s: ends of the soaks; time from the start of a run to the end of
+# its soak; time at each rate; time between rates.
 _SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
-# Centrifuge: 1 m, 2 to 10 g beside the vertical 1 g; rate table: 0.25 m, up to 1000 deg/s.
+# Radius and rates [rad/s]. Centrifuge: 1 m, 2 to 10 g horizontally; rate table: 0.25 m, up to 1000
+# deg/s.
 _CENTRIFUGE = 1.0, tuple(math.sqrt(g * STANDARD_GRAVITY) for g in (2.0, 4.0, 7.0, 10.0))
 _RATE_TABLE = 0.25, tuple(math.radians(rate) for rate in (400.0, 600.0, 800.0, 1000.0))
 
@@ -74,7 +80,7 @@ class Cyclogram:
 
     @property
     def duration_s(self) -> float:
-        """Length of the program, s."""
+        """Duration of the program, s."""
         return self.time_s[-1]
 
 
@@ -153,8 +159,8 @@ def positions(n: int, seed: int = 0) -> Floats:
 @dataclass(frozen=True, eq=False)
 class Position:
     """
-    A position of a test: the chamber's program, the direction of the specific force, and the
-    rotation that adds to it.
+    A position of a test: the chamber's program, the direction of the specific force at rest, and a
+    rotation that adds to this force.
     """
 
     program: Cyclogram
@@ -174,7 +180,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')
     rng = generator(seed, Stream.CYCLOGRAM, PLAN_NAMES.index(name))
     if name == 'held-out':
-        # Random attitudes without a vertical axis, which no other plan has.
+        # The attitudes are random and have no vertical axis, unlike those of all other plans.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(parse_cyclogram('held-out'), ups)
     if name in ('centrifuge', 'rate-table'):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a run: a unit in a chamber over a program, whole or block by block, and its truth."""
+"""Owns a simulated run: a unit in a chamber over a program, whole or in blocks, and the truth."""
 
 import math
 import sys
@@ -23,13 +23,14 @@ from .unit import REFERENCE_C, Stream, SwitchedLoad, UnitModel, first_charge, ge
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 _NS = 1_000_000_000
-_GRID_S = 1.0  # step of the thermal grid; bias and scale are linear between its points
+_GRID_S = 1.0  # step of the thermal grid [s]; bias and scale are linear between grid points
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
     """
-    The truth of a run on the thermal grid (m points) and at the accelerometer's n cycles.
+    The true bias, scale and force of a run, on the thermal grid (m points) and at the
+    accelerometer's n cycles.
 
     Bias is in counts per cycle (`rate_bias`: rad/s), scale is relative; `bias_grid` includes the
     random walk, which no model predicts. `cycle_s` are the middles of the cycles; `specific_force`
@@ -59,7 +60,7 @@ class Truth:
 
     def on_cycles(self, grid: Floats) -> Floats:
         """Interpolate linearly from the grid to each cycle."""
-        # No np.interp, whose rounding depends on the number of points.
+        # np.interp is not used, because its rounding depends on the number of points.
         place = self.cycle_s / self.grid_s[1]
         left = np.minimum(place.astype(np.int64), len(self.grid_s) - 2)
         share = (place - left)[:, None]
@@ -137,7 +138,7 @@ def simulate_blocks(
     if n_cycles < 1:
         raise ValueError(f'the program of {duration} s is shorter than one cycle')
     direction = np.asarray(up, dtype=float)
-    # Only a switched load makes the heat flow random.
+    # Only a load that switches at random times makes the temperatures random.
     truth = _heat_flow(unit, cyclogram, seed if unit.load else 0)
     truth = replace(
         truth,
@@ -162,7 +163,7 @@ def _blocks(
     seed: int,
     start_ns: int,
 ) -> Iterator[SimulatedRun]:
-    """Yield a run by blocks; `cycles`: number, largest number of a block, per second."""
+    """Yield a run by blocks; `cycles`: number of cycles, most in a block, cycles per second."""
     unit, (n_cycles, block_size, rate_hz) = truth.unit, cycles
     K = np.array(unit.scale_factor)
     to_axes = np.asarray(np.linalg.inv(unit.M), np.float64)
@@ -180,7 +181,7 @@ def _blocks(
         if spin is not None:
             force = spin.forces(truth.specific_force, part.cycle_s)
             part = replace(part, specific_force=force)
-        # Eq. (2), (8) and (9)
+        # Eq. Eqs. (2), (8) and (9) of the paper
         s = _along_axes(part, to_axes)
         charge = part.bias + K * part.scale * s + noise_sd * noise(len(cycle))
         counts, remainder = unit.converter(charge, remainder)
@@ -204,7 +205,9 @@ def _blocks(
 
 
 def _along_axes(part: Truth, to_axes: Floats) -> Floats:
-    """Return the force along the sensitivity axes, with the nonlinear part of their readings."""
+    """
+    Return the force along the sensitivity axes plus the nonlinear part of the axes' readings.
+    """
     s: Floats = np.zeros(3)
     for j in range(3):
         s = s + part.specific_force[..., j, None] * to_axes[:, j]
@@ -238,7 +241,9 @@ def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
 
 
 def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Bools]:
-    """Return the knots including the switching times of a load, and its state between them."""
+    """
+    Return the knots including the switching times of a load, and the load's state between knots.
+    """
     n = 2 + int(knots[-1] // load.spell[0])
     flips = np.cumsum(generator(seed, Stream.LOAD).uniform(*load.spell, size=n))
     fine = np.unique(np.concatenate([knots, flips[flips <= knots[-1]]]))
