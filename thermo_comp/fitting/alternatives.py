@@ -28,7 +28,8 @@ def model_of(
     bags: Sequence[ReducedBag], options: FitOptions, parts: tuple[Part, Part, Part] | None = None
 ) -> Model:
     """
-    Return the model of the prior, or else a model with all columns that the bags can determine.
+    Return the model of the prior or, without a prior, a model with all columns that the bags can
+    determine.
 
     `parts`: the lag of each axis, see `Model`; None for the bank of time constants
     """
@@ -72,7 +73,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves of the program limit the number of columns, which is equal in both models.
+    # Left-out halves of the program are not compared: they limit the number of columns, which is
+    # equal in both models.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -84,7 +86,7 @@ def windows_of(
     undisturbed: Floats | None = None,
 ) -> ThermalWindows:
     """
-    Return the windows of bags, with |f| of each position.
+    Return the windows of bags, with the known |f| of each position.
 
     `tracks`: thermal states of the bags, if they were computed before
     `undisturbed`: factors of the weights of the windows, see `Parts`
@@ -97,8 +99,8 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows with one lag per axis, or with a bank of time constants.
 
-    The bank is fitted if no lag per axis is found, or if the lags leave more left-out drift than
-    noise explains. The bank replaces the lags per axis if it is better on left-out data.
+    The bank is fitted if no lag per axis is found, or if the left-out drift with the lags exceeds
+    noise. The bank replaces the lags per axis if it is better on left-out data.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'

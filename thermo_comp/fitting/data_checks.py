@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest number of distinct attitudes that determine bias and scale factor, which are six
-#: constants, and the misalignment in addition, which has three more.
+#: Smallest numbers of distinct attitudes: that determine bias and scale factor (six constants),
+#: and that determine the misalignment (three constants) in addition.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT = 6, 9
 #: Smallest number of positions whose norms determine the sd of mounting offsets beside the nine
 #: constants.
@@ -43,7 +43,7 @@ POSITIONS_FOR_MOUNTINGS = 12
 
 @dataclass(frozen=True)
 class Finding:
-    """A finding of the checks: its name, with which a user allows a refusal, and its message."""
+    """A finding of the checks: the name by which a user can allow a refusal, and the message."""
 
     name: str
     level: Literal['refusal', 'advice', 'good']
@@ -71,7 +71,9 @@ def enforce(findings: Iterable[Finding], options: FitOptions) -> list[Finding]:
 
 
 def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
-    """Refuse the prior of another unit: its small uncertainties do not apply to this unit."""
+    """
+    Refuse a prior of another unit: the small uncertainties of a unit do not apply to another.
+    """
     if prior is None or prior.provenance.model == POPULATION:
         return
     if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:
@@ -84,7 +86,7 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
-    """Judge the raw data: saturation, motion, numbers that are no counts, jumps, angular rates."""
+    """Check the raw data: saturation, motion, numbers that are no counts, jumps, angular rates."""
     part = sum(bag.n_saturated for bag in bags) / max(sum(bag.n_samples for bag in bags), 1)
     if part > 0.001:
         yield Finding(
@@ -150,7 +152,7 @@ def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[str]:
     usual = 2 * alive.sum(axis=0) >= len(rests)
     for (name, rest), is_alive in zip(rests, alive, strict=True):
         is_dead = ~is_alive & usual & (np.ptp(rest.mean, axis=0) == 0.0)
-        # A working axis shows noise or drift within a thousand samples.
+        # The samples of a working axis show noise or drift within a thousand samples.
         for axis in np.flatnonzero(is_dead & (rest.count.sum() >= 1000)):
             hours = (rest.end_ns - rest.start_ns) / 3600e9
             letter, value = 'xyz'[axis], rest.mean[0, axis]
@@ -182,7 +184,7 @@ def judge_copies(names: Sequence[str]) -> list[Finding]:
 
 
 def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterator[Finding]:
-    """Judge temperatures, ramps and directions `up`, shape (n, 3), of the still windows."""
+    """Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest."""
     yield _judge_positions(up)
     if not windows.has_temperature:
         text = 'no temperature was recorded: the calibration holds at the temperature of the test'
@@ -229,8 +231,9 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
     """
-    Return the rate of the board temperature [K/min], shape (n,), 0 where the mean temperature does
-    not change by at least half of this rate from one window to the next: there the rate is noise.
+    Return the rate of the board temperature [K/min], shape (n,); 0 where the mean temperature
+    changes by less than half of this rate from one window to the next, because such a rate is
+    noise.
     """
     rate, edges = windows.rate * 60.0, windows.data.edges
     for begin, end in pairwise(edges.tolist()):
@@ -362,7 +365,7 @@ def judge_result(
     options: FitOptions,
     has_temperature: bool = True,
 ) -> Iterator[Finding]:
-    """Judge the residuals; `slow`: sd of the bias that no temperature explains [m/s^2]."""
+    """Check the residuals; `slow`: sd of the bias that no temperature explains [m/s^2]."""
     overall = rows[-1]
     raw, fitted = overall.raw.rms / MICRO_G, overall.fitted.rms / MICRO_G
     others = ''

@@ -35,14 +35,16 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     scaled = matrix / root[..., None, :]
     scaled /= root[..., :, None]
     index = np.arange(matrix.shape[-1])
-    jitters = 1e-13, 1e-11, 1e-9, 1e-7  # added one after another until a factor exists
+    # Relative jitters, added one after another until a factor exists.
+    jitters = 1e-13, 1e-11, 1e-9, 1e-7
     for jitter in jitters:
         scaled[..., index, index] += jitter
         try:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
             if matrix.ndim > 2:
-                # Factor the matrices one by one: only some of them need more jitter.
+                # The matrices are factored one by one, because only some matrices need more
+                # jitter.
                 return np.stack([factored(*pair) for pair in zip(matrix, square, strict=True)])
             if jitter == jitters[-1]:
                 raise
@@ -68,11 +70,11 @@ def inverse_root(factor: Floats) -> Floats:
 @dataclass(frozen=True)
 class Blocks:
     """
-    Eliminated blocks of equal size, those of all positions or of all bags.
+    Eliminated blocks of the normal equations, of equal size: of all positions or of all bags.
 
-    root: inverse of the Cholesky factor of each block, shape (n, k, k)
-    turned: this inverse times the cross block with the remaining unknowns and, in the last column,
-        times the gradient, shape (n, k, m + 1)
+    root: inverse of each block's Cholesky factor, shape (n, k, k)
+    turned: `root` times the cross block with the remaining unknowns and, in the last column, times
+        the gradient, shape (n, k, m + 1)
     """
 
     root: Floats
@@ -104,7 +106,7 @@ class Blocks:
 @dataclass(frozen=True)
 class Reduced:
     """
-    The normal equations of the unit's n unknowns, with all others eliminated.
+    The normal equations of the unit's n unknowns, with all other unknowns eliminated.
 
     layout: places of the unknowns
     starts_prior: precision of the initial lag states, and precision times state, (2, n_bags, r)
@@ -138,7 +140,9 @@ class Reduced:
         return sum(block.log_determinant for block in blocks)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add the prior on the sum of the initial lag states, now `total`, about 0."""
+        """
+        Add the prior, with mean 0, of the sum of the initial lag states, which is now `total`.
+        """
         cross = self.bags.solved.sum(axis=0, keepdims=True)
         cross[..., -1] += total
         block = self.bags.inverse.sum(axis=0, keepdims=True) + variance * np.eye(len(total))
@@ -171,13 +175,13 @@ class Reduced:
 
     @cached_property
     def _rest(self) -> Blocks:
-        """The block of each position's bag without this position."""
+        """The block of the bag of each position, without the position's contribution."""
         bag = self.layout.bag
         others = (bag[:, None] == bag) - np.eye(len(bag))
         return _of_bags(others, self.shares, self.starts_prior[:, bag])
 
     def without(self, p: int, normal: Normal) -> Floats:
-        """Return `whole` without a position, given its normal equations."""
+        """Return `whole` without a position, given the position's normal equations."""
         turned = self.positions.turned[p, :, len(self.bags.root[0]) :]
         before, after = self.bags.turned[self.layout.bag[p]], self._rest.turned[p]
         gone = _of_unit(normal.unit, self.layout) - turned.T @ turned
@@ -230,7 +234,7 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -
     index = np.arange(n_own)
     block[:, index, index] += precision[layout.own]
     cross[..., -1] -= (precision * away)[layout.own]
-    # Attitudes without any information keep their value.
+    # Attitudes about which the data have no information keep their value.
     block[:, index, index] += np.einsum('pii->pi', block) <= 0.0
     positions = Blocks.of(block, cross)
     diagonal = np.einsum('pii->pi', starts[..., :r])
@@ -256,7 +260,7 @@ def _of_unit(normal: Floats, layout: Layout) -> Floats:
 
 
 def _of_bags(among: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blocks:
-    """Eliminate the initial lag states of bags, each with the positions `among` them, (m, n)."""
+    """Eliminate the initial lag states of bags; `among`: positions of each bag, shape (m, n)."""
     if not shares[0].size:
         return Blocks(np.zeros((len(among), 0, 0)), np.zeros((len(among), *shares[0].shape[1:])))
     sums, diagonals = (np.tensordot(among, share, 1) for share in shares)
@@ -268,7 +272,7 @@ def _of_bags(among: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blo
 
 
 def _variance(derivatives: Floats, root: Floats) -> Floats:
-    """Return the variances of linear functions of the unit's unknowns, shape (n, k)."""
+    """Return the variances of linear functions, shape (n, k), of the unit's unknowns."""
     rows = derivatives.reshape(-1, len(root))
     turned = dtrmm(1.0, root, rows.T, trans_a=True)
     return np.asarray(np.sum(turned**2, axis=0).reshape(derivatives.shape[:2]))
@@ -281,5 +285,5 @@ def _square(*turned: Floats) -> Floats:
 
 
 def _summed(left: Floats, right: Floats) -> Floats:
-    """Return the sum of the products of all rows of blocks, shape (k, m)."""
+    """Return the sum over blocks of the products of their rows, shape (k, m)."""
     return np.asarray(left.reshape(-1, left.shape[2]).T @ right.reshape(-1, right.shape[2]))

@@ -54,11 +54,12 @@ class ResidualRow:
     """
     ``|f| - g`` of one section, by step of the model.
 
-    section: ``static``, ``dynamic`` or ``all``
-    raw: with the constants at the reference temperature
-    one_set: with one curve for both regimes; no values if each regime has its own curve
-    two_sets: with a curve for each regime
-    fitted: with the calibration, on the data of the fit
+    section: regime of the windows, ``static``, ``dynamic`` or ``all``
+    raw: corrected with the constants at the reference temperature
+    one_set: corrected with one curve for both regimes; no values if each regime has a separate
+        curve
+    two_sets: corrected with a curve for each regime
+    fitted: corrected with the calibration, on the data of the fit
     left_out: on data that were not used in the fit, see `left_out_error`
     """
 
@@ -112,9 +113,10 @@ def left_out_error(score: Score, gravity: float | Floats) -> Floats:
 
 
 def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...]) -> State:
-    """Fit again with some groups only, under a flat prior of their weights."""
+    """Fit again with some groups of columns only, under a flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
-    # Residuals of a model with few groups are mostly model error: all windows get equal weight.
+    # The residuals of a model with few groups are mostly model error, so all windows get equal
+    # weight.
     prior = replace(
         chosen.prior,
         column_sd=only * regression.windows.parts * [[0.05], [0.005]],

@@ -27,11 +27,12 @@ from ..typing import Floats, Ints
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest length of the readings on either side of a gap that give the level [s].
+# Shortest duration of the readings on either side of a gap that give the level [s].
 _MARGIN_S = 10.0
 # Smallest number of samples on either side of a step.
 _FEWEST_SAMPLES = 8
-# Smallest step in units of its sd; the search over its place reaches about 5 by chance.
+# Smallest significant step, in units of its sd; the search over the place of a step reaches about
+# 5 by chance.
 _STEP_SDS = 8.0
 
 
@@ -40,8 +41,8 @@ class Jump:
     """
     A step in the reading of a sensor at rest that is no rotation of the unit.
 
-    time: since the bag's first sample [s]
-    duration_s: interval between the samples before and after it [s]
+    time: time of the step since the bag's first sample [s]
+    duration_s: interval between the samples before and after the step [s]
     step: change of the reading, per axis [input units]
     along: change of the norm, that is, along the specific force [input units]
     temperature_change, temperature_change_sd: step of the board's readings at that time about a
@@ -74,7 +75,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
     near = _near(bag, gaps, [_MARGIN_S] * len(gaps))
-    # If the noise is correlated, the level is a mean over a longer time.
+    # If the noise is correlated, the level beside a gap is a mean over a longer time.
     margins = [_margin(part, quiet_sd) for part in near]
     slow = [place for place, margin in enumerate(margins) if margin > _MARGIN_S]
     wider = _near(bag, [gaps[place] for place in slow], [margins[place] for place in slow])
@@ -100,7 +101,7 @@ def _near(
 
 
 def _margin(near: Floats, quiet_sd: Floats) -> float:
-    """Return the length of the readings beside a gap: 60 time constants of the noise [s]."""
+    """Return the duration of the readings beside a gap [s]: 60 time constants of the noise."""
     time, accel = near[:, 0], near[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
@@ -124,7 +125,8 @@ def _examine(
         return None
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
-    # A shock decays; a step is also a difference between the quiet samples on both sides.
+    # A shock decays, but a step is also a difference between the quiet samples before and after
+    # it.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
     lasting_sd = quiet_sd * relative_sd * _correlation(residual, quiet_sd)
     step, relative_sd, residual = _step(time, accel, time[at], r)
@@ -132,7 +134,8 @@ def _examine(
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = sd * relative_sd * _correlation(residual, sd)
     if r:
-        # At least half of the step must last, and must exceed four standard deviations.
+        # At least half of the step must last, and the lasting part must exceed four standard
+        # deviations.
         is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > 0.5)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -153,7 +156,7 @@ def _examine(
     is_no_turn = _turn(time, gyro, at) < 0.33 * needed_rad or (
         abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd
     )
-    # A hand on the unit causes far more than twice the quiet noise.
+    # If the unit is handled, the samples scatter far more than twice the quiet noise.
     if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
     warmed, warmed_sd = _temperature_step(bag, time[0], time[at], time[-1])
@@ -198,10 +201,11 @@ def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> t
 
 def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[int, float]:
     """
-    Find the first sample after the step and the lag-1 correlation of the noise.
+    Find the first sample after a step, and the lag-1 correlation of the noise.
 
-    Place and correlation are estimated in turn, three times. Noise with a correlation below 0.4
-    counts as white. The correlation is at most 0.999; above, it is that of a random walk.
+    The place of the step and the correlation are estimated in turn, three times. Noise with a
+    correlation below 0.4 counts as white. The correlation is at most 0.999; noise of a larger
+    correlation is a random walk.
     """
     at, r = _place_of_step(time, accel, quiet_sd, 0.0), 0.0
     for _ in range(3):
@@ -216,7 +220,7 @@ def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[in
 
 
 def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> int:
-    """Find the first sample after the most likely step, about a linear drift."""
+    """Find the first sample after the most likely step in samples with a linear drift."""
     n = len(time)
     trend = _trend(time, r)
     residual = whitened(accel, r)
@@ -244,7 +248,7 @@ def whitened(values: Floats, r: float) -> Floats:
 
 
 def _step(time: Floats, values: Floats, at: float, r: float = 0.0) -> tuple[Floats, float, Floats]:
-    """Estimate a step about a drift, its sd in units of the noise, and residuals (n, k)."""
+    """Estimate a step about a drift, the step's sd in units of the noise, and residuals (n, k)."""
     trend = _trend(time, r)
     jump = whitened((time >= at).astype(np.float64)[:, None], r)[:, 0]
     jump -= trend @ (trend.T @ jump)

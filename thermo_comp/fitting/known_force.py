@@ -3,7 +3,7 @@
 """
 Owns the known |f| of a bag that is not at 1 g, from the user or from the bag's metadata.
 
-|f| is given as one value, as a table of sections, or as a rotation rate with a radius.
+|f| is given as a single value, as a table of sections, or as a rotation rate with a radius.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from ..recording.topics import is_called, split_field
 from ..typing import Floats, Ints
 from ..unit.gravity import parse_acceleration
 
-#: Keys of a bag's metadata.
+#: Keys of a bag's metadata about |f|.
 MAGNITUDE, ROTATION = 'specific_force_magnitude_m_s2', 'rotation_topic'
 RADIUS, RADIUS_SD = 'rotation_radius_m', 'rotation_radius_sd_m'
 
 
 class Section(NamedTuple):
-    """A part of a bag, in seconds since its first sample, with |f| and its sd [m/s^2]."""
+    """A part of a bag, in seconds since the bag's first sample, with |f| and its sd [m/s^2]."""
 
     begin_s: float
     end_s: float
@@ -41,11 +41,11 @@ class Section(NamedTuple):
 
 class Magnitude(NamedTuple):
     """
-    |f| of a rest [m/s^2].
+    The known |f| of a rest [m/s^2], in two parts.
 
     still: |f| without rotation; None for gravity
     spin: centripetal acceleration w^2 r at the stated radius
-    sd: sd of |f| without the part of the radius
+    sd: sd of |f| without the part due to the radius
     """
 
     still: float | None
@@ -53,7 +53,7 @@ class Magnitude(NamedTuple):
     sd: float = 0.0
 
     def norm(self, gravity: float) -> float:
-        """Return |f| at the stated radius [m/s^2]."""
+        """Return |f| [m/s^2] with the radius as stated."""
         return math.hypot(gravity if self.still is None else self.still, self.spin)
 
 
@@ -89,7 +89,7 @@ class KnownForce:
                     return Magnitude(section.size, sd=section.sd)
             return Magnitude(None)
         inside = (self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns)
-        n, needed = int(inside.sum()), 3  # fewer readings give no standard error of their mean
+        n, needed = int(inside.sum()), 3  # fewer readings give no standard error of the mean
         if n < needed:
             since_s = (start_ns - first_ns) * 1e-9
             raise FitError(
@@ -122,7 +122,7 @@ class AskedForce:
             raise ValueError('a rotation topic needs a radius, and no other specific force')
 
 
-#: No options: the bags' metadata apply.
+#: Without options the bags' metadata apply.
 USUAL_FORCE = AskedForce()
 
 
@@ -174,7 +174,7 @@ def parse_sections(text: str) -> tuple[Section, ...]:
 def _section(begin_s: float, end_s: float, size: float, sd: float = 0.0) -> Section:
     if not begin_s < end_s:
         raise ValueError(f'a section must end after its begin {begin_s:g} s, got {end_s:g} s')
-    # 1e7 m/s^2 is above the launch of a gun.
+    # The limit 1e7 m/s^2 is above the acceleration of a launch from a gun.
     if not (0.0 < size < 1e7 and 0.0 <= sd < size):
         raise ValueError(
             f'a specific force must be above 0 with a smaller sd, got {size:g} +- {sd:g} m/s^2'

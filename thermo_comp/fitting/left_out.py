@@ -37,7 +37,7 @@ from .regression import Point, Posterior, Regression
 from .start import white_noise_of
 from .unknowns import State
 
-# Smallest number of windows of a position from which its drift is scored.
+# Smallest number of windows of a position for a score of the position's drift.
 _FEWEST_WINDOWS = 8
 # Logarithms of mean squares that differ by less than this count as equal: 5 % of an RMS.
 _EQUAL = 0.1
@@ -93,7 +93,7 @@ class Folds:
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
     def is_noise(self, other: Folds, noise: float) -> bool:
-        """Whether white noise explains the folds that the other model has as well."""
+        """Whether white noise explains the errors in the folds that another model has as well."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
         return bool(square <= (_NOISE * noise) ** 2)
@@ -124,7 +124,7 @@ class Score:
 
     @property
     def kinds(self) -> tuple[Folds, Folds, Folds]:
-        """Folds of each kind."""
+        """The left-out errors of each kind of folds."""
         return self.positions, self.sections, self.norms
 
     @property
@@ -137,14 +137,15 @@ class Score:
 def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
     """
     Whether the second model is better on left-out data by more than the standard error. Halves of
-    the program limit the number of columns; they do not compare models of the same columns.
+    the program limit the number of columns, so `by_halves` is false for models of the same
+    columns.
     """
     return gain(before, after, by_halves=by_halves) > 0.0
 
 
 def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
-    Return the gain of a model if it exceeds its standard errors, else 0.
+    Return the gain by a model if the gain exceeds its standard errors, else 0.
 
     The gain is the sum of the log gains of the drift. If the drifts are equal, the gain is the log
     gain of the norms of left-out positions, which must exceed two standard errors.
@@ -173,13 +174,13 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
 
 def is_undecided(before: Score, after: Score) -> bool:
-    """Whether left-out data do not decide: equal drifts, and no norms scored in both models."""
+    """Whether left-out data do not decide between two models: equal drifts, no norms in common."""
     *drift, norms = _gains(before, after)
     return norms is None and all(abs(gain[0]) < _EQUAL for gain in drift if gain)
 
 
 def is_near(chosen: Score, other: Score) -> bool:
-    """Whether a model is at most one standard error worse than the chosen one."""
+    """Whether a model is at most one standard error worse than the chosen model."""
     gains = [gain for gain in _gains(chosen, other) if gain]
     return bool(gains) and all(gain > -error for gain, error in gains)
 
@@ -256,7 +257,7 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
     in_bias, in_scale = layout.used
     if not in_bias.any():
         return True
-    # Every n-th window: 50 of them are sufficient for the variance.
+    # Every n-th window of the position is used: 50 windows are sufficient for the variance.
     some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
     some = some - some.mean(axis=0)
     p = regression.windows.position[rows.start]
@@ -299,7 +300,8 @@ def _by_sections(
     squares, counts = np.full(len(folds), np.nan), np.zeros(len(folds))
     for k, fold in enumerate(folds):
         point = regression.at(posterior.state, posterior.prior, products.without(fold))
-        # Two Gauss-Newton steps from the fit of all data are sufficient.
+        # Two Gauss-Newton steps from the fit of all data are sufficient for the fit without a
+        # section.
         for _ in range(2):
             point = point.moved(point.solution[0])
         force = regression.force(point.state)

@@ -36,8 +36,8 @@ from .windows import Sets
 COUNTS_FULL_SCALE = 32767.0
 # Families of curves over temperature that are polynomials, of order 1, 2 and 3.
 _POLYNOMIALS = ('linear', 'quadratic', 'cubic')
-#: Groups of columns that the fit selects: the curve, the difference of the two sets, the curves of
-#: the parts, the response.
+#: Groups of columns that the fit selects: the curve, the difference of the two sets, the curves
+#: over the temperatures of parts, the groups of the thermal response.
 GROUPS = tuple(
     dict.fromkeys(
         (
@@ -48,7 +48,7 @@ GROUPS = tuple(
         )
     )
 )
-#: Names of the refusals that a user can allow.
+#: Names of the refusals of data that a user can allow.
 REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compensated')
 
 
@@ -106,7 +106,8 @@ class FitOptions:
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        # The range of gravity on land, with a margin; a value outside it is a mistake in typing.
+        # The range of gravity on land, with a margin; a value outside this range is a typing
+        # error.
         low, high = 9.76, 9.84
         if not low <= self.gravity <= high:
             raise FitError(
@@ -151,12 +152,12 @@ class FitOptions:
 
     @property
     def saturated_at(self) -> float | None:
-        """Magnitude of a saturated sample; None if it depends on the data."""
+        """Magnitude of a saturated sample; None if it has to be chosen from the data."""
         return self.full_scale or (COUNTS_FULL_SCALE if self.input == 'counts' else None)
 
 
 def sets_of(options: FitOptions, bags: Sequence[ReducedBag]) -> Sets:
-    """Choose the curves of the two sets."""
+    """Choose the families of curves of the two sets."""
     readings = [bag.board.value for bag in bags if len(bag.board.value)]
     if not readings:
         line = _family('linear', 0.0, 0.0)
@@ -177,9 +178,9 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name in _POLYNOMIALS:
         return Polynomial((0.0, *[1.0] * (1 + _POLYNOMIALS.index(name))))
     if name == 'exponential':
-        # The leakage of semiconductors doubles in about 10 K: an e-fold of 15 K, and of 30 K.
+        # E-folds of 15 K and 30 K: the leakage of semiconductors doubles in about 10 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
-    # A spline of four pieces; a knot near the reference is replaced by a knot at the reference.
+    # The spline has four pieces; a knot at the reference temperature replaces knots near it.
     knots = np.linspace(lower, upper, 5)
     step = max((upper - lower) / 4, 1.0)
     kept = sorted([0.0, *(float(k) for k in knots if abs(k) > 0.3 * step)])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the curves over the temperatures of parts: sums of columns with one weight each.
+Owns the curves over the temperatures of parts: each is a sum of columns with a common weight.
 
 The temperature of the part of an axis is ``x = t - m``, t being that of the board and m the lag of
 the part. By the binomial theorem x^p is a sum of the columns t^p, t^(p-1) m, ..., m^p, which the
@@ -30,8 +30,8 @@ class PartCurves(NamedTuple):
     """
     The curves over the temperatures of the parts of some axes.
 
-    axis, power: of each curve, shape (p,)
-    sums: factors of the columns of the sets and of the response, shape (p, m)
+    axis, power: axis and power of each curve, shape (p,)
+    sums: factors of the columns (of sets and response) in each curve, shape (p, m)
     """
 
     axis: Ints

@@ -28,7 +28,7 @@ from .hyperparameters import undisturbed
 from .start import ConstantCalibration, position_means, white_noise_of
 from .windows import ThermalWindows
 
-# Ratio of a time constant of the columns to the next smaller one: half an octave.
+# Ratio of a time constant of the columns to the next smaller time constant: half an octave.
 _STEP = 2.0**0.5
 
 
@@ -70,7 +70,7 @@ class Parts:
 
 def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | None:
     """
-    Find the lag of each axis, and reduce the weights of windows that do not fit it.
+    Find the lag of each axis, and reduce the weights of windows that deviate from the model.
 
     Returns None if the model with one lag per axis does not explain the drift of all axes, or if
     the data do not determine a time constant.
@@ -86,7 +86,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
             rows = slice(None, None, max(len(data.time) // n_windows, 1))
             return _PartCurves(windows, start, rows, shape)
 
-        # Every k-th window: 500 of them are sufficient for a search, 3000 for its result.
+        # Every k-th window is used: 500 windows are sufficient for the search, 3000 for its
+        # result.
         searched = curves(500).lags(noise)
         if searched is None:
             continue
@@ -126,10 +127,10 @@ class _PartCurves:
         self._weight = data.weight[rows, None]
         self._t = windows.temperature[rows] - windows.model.reference_temperature
         self._taus = np.array([columns[k].tau_s for k in of_board])
-        #: Time constants tried [s]: those of the columns, and shorter ones.
+        #: Time constants tried [s]: those of the columns, and shorter time constants.
         self._tried = np.array([15.0, 21.0, 30.0, 42.0, *self._taus])
-        # The lag m at a time constant tau between those of the columns is interpolated: m / tau
-        # is a smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
+        # Between the time constants tau of the columns the lag m is interpolated: m / tau is a
+        # smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
         ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
         knots = _even(np.append(0.0, self._taus))
         self._ratio = CubicSpline(knots, ratios, axis=1)
@@ -148,7 +149,7 @@ class _PartCurves:
         self._measured = self._centred(data.mean[rows] / start.scale)
 
     def lags(self, noise: Floats) -> list[Part] | None:
-        """Return the lag of each axis; None if one explains little or is not determined."""
+        """Return the lag of each axis; None if any lag explains little or is not determined."""
         lags = []
         for axis in range(3):
             lag = self._lag(axis, noise[axis])
@@ -158,13 +159,13 @@ class _PartCurves:
         return lags
 
     def _is_of_use(self, lag: Part, axis: int, noise: float) -> bool:
-        """Whether a lag may meet the limits of `find_parts`; the limits here are wider."""
+        """Whether a lag may meet the limits of `find_parts`, tested with wider limits."""
         typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
         return bool(typical <= 3.0 * noise or self.reduction(lag, axis) >= 4.0)
 
     def _lag(self, axis: int, noise: float) -> Part:
         """
-        Return the lag with the smallest RMS residual; 0 s if none reduces it.
+        Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual.
 
         A second stage, or a share of the gradient, must reduce a residual above the white noise
         (`noise`) by 5 %.
@@ -188,7 +189,7 @@ class _PartCurves:
         return best
 
     def near(self, lag: Part, axis: int) -> Part:
-        """Return the lag with the smallest RMS residual near a lag."""
+        """Return the lag with the smallest RMS residual in the neighbourhood of a lag."""
         if not lag.tau_s:
             return lag
         tau_step, second_step, share_step = 0.03, 0.06, 0.02
@@ -196,7 +197,7 @@ class _PartCurves:
         return self._searched(axis, lag, steps)
 
     def _better(self, axis: int, simple: Part, other: Part) -> Part:
-        """Return the second lag if its RMS residual is 5 % below that of the first."""
+        """Return the second lag if its RMS residual is 5 % below that of the first lag."""
         is_better = self._square(other, axis) < self._square(simple, axis) / 1.05**2
         return other if is_better else simple
 
@@ -226,7 +227,7 @@ class _PartCurves:
         return lag_at(minimum.x)
 
     def _time_constant(self, axis: int, sensor_share: float = 0.0) -> Part:
-        """Return the lag of one stage with the smallest RMS residual; 0 s for none."""
+        """Return the lag of one stage with the smallest RMS residual; 0 s if no lag is better."""
 
         def square(tau_s: float) -> float:
             return self._square(Part(tau_s, 0.0, sensor_share if tau_s else 0.0), axis)
@@ -301,20 +302,20 @@ class _PartCurves:
 
 
 def _in_two_stages(lag: Part) -> Part:
-    """Return two stages of a lag of one stage, for the start of a search."""
-    # The residual has a valley along a constant sum of both time constants.
+    """Split a lag of one stage into two stages, as the start of a search."""
+    # The residual has a valley where the sum of both time constants is constant.
     return Part(0.8 * lag.tau_s + 1.0, 0.2 * lag.tau_s + 1.0, lag.sensor_share)
 
 
 def _in_order(tau_s: float, second_tau_s: float, sensor_share: float) -> Part:
-    """Return a lag with the longer time constant first, the shorter at most 0.89 of it."""
-    # Columns accept ratios up to 0.9; both time constants are rounded to 0.1 s before.
+    """Return a lag with the longer time constant first, the shorter at most 0.89 of the longer."""
+    # Columns accept ratios of both time constants up to 0.9, after rounding to 0.1 s.
     longer, shorter = max(tau_s, second_tau_s), min(tau_s, second_tau_s)
     return Part(longer, min(shorter, 0.89 * longer), sensor_share)
 
 
 def _even(tau_s: Floats) -> Floats:
-    """Map time constants [s] to 0 .. 1, for the interpolation; 200 s become 0.5."""
+    """Map time constants [s] to the interval 0 to 1, for the interpolation; 200 s become 0.5."""
     return np.asarray(tau_s / (tau_s + 200.0))
 
 
@@ -323,5 +324,5 @@ def _solved(series: Floats, measured: Floats) -> Floats:
     normal, right = series.T @ series, series.T @ measured
     size = np.sqrt(np.diag(normal)) + 1e-12
     normal = normal / np.outer(size, size)
-    normal[np.diag_indices_from(normal)] += 1e-7  # ridge, for nearly collinear regressors
+    normal[np.diag_indices_from(normal)] += 1e-7  # a ridge, for nearly collinear regressors
     return np.asarray(np.linalg.solve(normal, right / size) / size)

@@ -21,7 +21,7 @@ from .unknowns import Windows
 
 @dataclass(frozen=True)
 class ConstantCalibration:
-    """The triad at one temperature: bias [input units], scale [the same per m/s^2], M."""
+    """The triad at one temperature: bias [input units], scale [input units per m/s^2], M."""
 
     bias: Floats
     scale: Floats
@@ -41,9 +41,9 @@ def constant_calibration(
     means: Floats, gravity: float | Floats, with_misalignment: bool
 ) -> ConstantCalibration:
     """
-    Fit the triad to position means, shape (n, 3); FitError if they are on no ellipsoid.
+    Fit the triad to position means, shape (n, 3); FitError if they do not lie on an ellipsoid.
 
-    `gravity`: |f| of all positions, or of each, shape (n,) [m/s^2]
+    `gravity`: |f| of all positions, or of each position, shape (n,) [m/s^2]
     """
     # Largest RMS distance from the ellipsoid [m/s^2]: 5 % of |f|, more than the drift of a cheap
     # sensor over 60 K, and less than the error of a moving unit.
@@ -64,7 +64,8 @@ def constant_calibration(
         scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
         tried.append(_refine(means, gravity, bias, scale, with_misalignment))
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # The best ellipsoid of scattered points can be very large, with a remote centre: reject it.
+    # The best ellipsoid of scattered points can be very large, with a remote centre: it is
+    # rejected.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
         raise FitError(

@@ -181,7 +181,7 @@ def _blocks(
         if spin is not None:
             force = spin.forces(truth.specific_force, part.cycle_s)
             part = replace(part, specific_force=force)
-        # Eq. Eqs. (2), (8) and (9) of the paper
+        # Eqs. (2), (8) and (9) of the paper
         s = _along_axes(part, to_axes)
         charge = part.bias + K * part.scale * s + noise_sd * noise(len(cycle))
         counts, remainder = unit.converter(charge, remainder)

@@ -81,7 +81,7 @@ def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
     counts = np.empty(charge.shape, dtype=np.int32)
     for first in range(0, len(charge), _ROWS):
         rows = charge[first : first + _ROWS]
-        # Eq. Eq. (1) of the paper: the output is whole counts, and the fraction is added to the
+        # Eq. (1) of the paper: the output is whole counts, and the fraction is added to the
         # next cycle.
         whole = np.floor(rows)
         fraction = np.rint((rows - whole) * _ONE).astype(np.int64)
