@@ -97,8 +97,8 @@ def open_regular(path: str | Path) -> BinaryIO:
 
 def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> bytes:
     """
-    Read a regular file. ValueError if it is larger than `limit` bytes, PermissionError if it lies
-    outside of the folder `within`, OSError as in `open_regular`.
+    Read a regular file. ValueError if the file is larger than `limit` bytes, PermissionError if it
+    lies outside of the folder `within`, OSError as in `open_regular`.
     """
     with open_regular(path) as file:
         # Check the path of the opened file: a link could be exchanged between a check and the
@@ -160,7 +160,9 @@ class Draft:
                 self.partial.mkdir()
 
     def publish(self) -> None:
-        """Give the complete output its name; OutputError if another process took the name."""
+        """
+        Give the complete output its final name; OutputError if another process took this name.
+        """
         with _output_errors(self._path):
             if self.partial.is_dir():
                 _sync(self.partial)
@@ -207,7 +209,9 @@ class Draft:
 
 @contextmanager
 def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
-    """Give a temporary path to write to; without an exception its content becomes the output."""
+    """
+    Give a temporary path to write to, whose content becomes the output if no exception occurs.
+    """
     draft = Draft(path, kind, overwrite=overwrite)
     try:
         with _output_errors(path):

@@ -74,7 +74,7 @@ def _up_to(upper: float, unit: str, why: str) -> Bounds:
 
 
 _PREPARED: dict[str, Bounds] = {
-    # Constants of the unit.
+    # Bounds of the constants of the unit.
     'full scale': _positive(1e-6, 1e16, 'input units', 'a float holds whole counts up to 9e15'),
     'full-scale force': _positive(1e-3, 1e7, 'm/s^2', 'from gravimeters to a gun launch'),
     'scale factor': _positive(1e-9, 1e9, 'input units per m/s^2', 'bounds of the magnitude'),
@@ -88,14 +88,14 @@ _PREPARED: dict[str, Bounds] = {
     'rate span': _positive(1e-6, 2e5, 'K/min', 'no less than 1 K in two years'),
     'time constant': _positive(1e-3, 1e8, 's', 'from a bare wire to three years'),
     'lag': _nil_or(1e-3, 1e8, 's', 'as a time constant; 0 means no lag'),
-    # The thermal response: its columns and their weights.
+    # Bounds of the columns of the thermal response, and of their weights.
     'value of a column': _between(-1e10, 1e10, 'of its kind', 'the cube of 1273 K is 2e9'),
     'span of a column': _positive(1e-9, 2e10, 'of its kind', 'a millionth of a ramp of 0.1 K/min'),
     'share': _between(-10.0, 10.0, '', 'no part amplifies a temperature difference tenfold'),
     'width': _nil_or(1e-4, 1e4, 'K', 'from the resolution of a thermometer up'),
     'gradient': _between(-1273.15, 1273.15, 'K', 'the largest temperature difference'),
     'power': Bounds(at_least=0, at_most=4, why='powers above the third are not observed'),
-    # Noise and standard deviations.
+    # Bounds of noises and standard deviations.
     'noise density': _positive(1e-12, 1e3, 'm/s^2/sqrt(Hz)', 'from far below any sensor to 100 g'),
     'rate noise density': _positive(
         1e-12, 1e3, 'rad/s/sqrt(Hz)', 'from far below any sensor to 57000 deg/s'
@@ -106,19 +106,19 @@ _PREPARED: dict[str, Bounds] = {
     'rate deviation': _up_to(1e3, 'rad/s', 'above 57000 deg/s the rate is unknown'),
     'misalignment deviation': _up_to(1.0, 'rad', 'above 1 rad the angle is unknown'),
     'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'an axis that reads 2 g at 1 g'),
-    # Results of a fit, and numbers of samples.
+    # Bounds of the results of a fit, and of numbers of samples.
     'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
     'number': _up_to(1e15, '', 'a float64 holds such integers exactly'),
     'log evidence': _between(-1e15, 1e15, '', 'a sum over at most 1e15 samples'),
     'deviation of a weight': _up_to(1e16, 'of its column', 'the largest full scale'),
-    # Thermometers and the detector of the regime.
+    # Bounds of the settings of thermometers and of the regime detector.
     'reading noise': _positive(1e-6, 1e2, 'K', 'from a microkelvin to no measurement'),
     'quantum': _up_to(1e2, 'K', 'no sensor has coarser steps'),
     'ramp': _positive(1e-6, 1e5, 'K/min', 'from 1 K in two years to 100 thermal shocks'),
     'false alarms': _positive(1e-12, 1e4, '1/h', 'from one alarm in 1e8 years to three a second'),
     'ripple': _up_to(1e3, 'K', 'the ripple of any chamber is smaller'),
     'dwell': _up_to(1e7, 's', 'no soak lasts four months'),
-    # Lengths of the lists in a calibration file.
+    # Bounds of the lengths of lists in a calibration file.
     'coefficients': Bounds(shortest=1, longest=12, why='powers up to t^11 follow any curve'),
     'knots': Bounds(longest=100, why='one knot per kelvin over 100 K'),
     'columns': Bounds(longest=2000, why='enough for all columns of ten thermometers'),

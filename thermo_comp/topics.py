@@ -55,12 +55,14 @@ def _stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
     """Serialize the regime as a DiagnosticArray with the stamp of the reading that decides it."""
     status = b''
     for text in ('regime', 'dynamic' if is_dynamic else 'static', serial):
-        # The level is one byte; the length of a text is aligned to four bytes.
+        # In CDR the level of a status is one byte, and the length of a text is aligned to four
+        # bytes.
         status += bytes(-(1 + len(status)) % 4) + pack('<I', len(text.encode()) + 1)
         status += text.encode() + b'\0'
     status += bytes(-(1 + len(status)) % 4) + pack('<I', 0)  # the status has no key-value pairs
     sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-    # Fields: stamp, length of the empty frame_id with its NUL, padding, number of status, level.
+    # Fields of the header: stamp, length of the empty frame_id with its NUL, padding, number of
+    # status, level.
     head = pack('<iII4xIb', sec, nanosec, 1, 1, 0)
     return _ENCAPSULATION + head + status
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the ageing model of a unit: a Gaussian model of the errors at its rests, with variances by
-evidence.
+Owns the ageing model of a unit: a Gaussian model of the errors at rest, with variances estimated
+by evidence.
 
 ``|f| - g`` of rest i at time t_i, of start k, is ``H_i delta + B_i b(t_i) + S_i s(t_i) + B_i o_k
 + lack + e_i``: delta is the error of the calibration (its posterior), b and s are random walks of
@@ -68,7 +68,7 @@ class Change:
     log_bayes_factor: float
 
     def columns(self, rows: Rows) -> Floats:
-        """Return the derivatives of the rows by the change, (n, 6) or (n, 3)."""
+        """Return the derivatives of the ageing model's rows by the change, (n, 6) or (n, 3)."""
         if self.time is None:
             return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
         is_after = (rows.time >= self.time)[:, np.newaxis]
@@ -81,9 +81,9 @@ class Rows:
     Equations of the rests, in order of time, at most `_ROWS` of a start: orthogonal sums with all
     information of its rests about the six levels.
 
-    noise, scatter: variance of the noise, and factor of the variance of the rests' scatter
-    rank: number of the row in its start
-    warmth: temperature less the reference [K]
+    noise, scatter: variance of the noise, and factor of the rests' scatter variance in a row
+    rank: number of the row within its start
+    warmth: board temperature less the reference temperature [K]
     """
 
     time: Floats
@@ -112,7 +112,8 @@ def rows_of(series: Series, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # Q is orthogonal, so the sum of n equal rests is sqrt(n) times a single rest.
+        # The factor Q of the singular value decomposition is orthogonal, so the sum of n equal
+        # rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
         summed = (series.miss, series.by_parameter, series.by_level, series.lack)
@@ -134,7 +135,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
 
 
 class Model:
-    """The covariance of the rows as a function of the variances, with given changes."""
+    """The covariance of the model's rows as a function of the variances, with given changes."""
 
     def __init__(
         self, rows: Rows, calibration: Calibration, since: float, changes: Sequence[Change] = ()
@@ -163,7 +164,7 @@ class Model:
             self.base += change.sd**2 * columns @ columns.T
 
     def covariance(self, ageing: Ageing) -> Floats:
-        """Return the covariance of the rows."""
+        """Return the covariance of the model's rows."""
         result: Floats = self.base.copy()
         for sd, part in zip(vars(ageing).values(), self.parts, strict=True):
             result += sd**2 * part
@@ -209,7 +210,7 @@ class Model:
         return ageing, self.inverse(ageing)
 
     def inverse(self, ageing: Ageing) -> Floats:
-        """Return the inverse covariance of the rows."""
+        """Return the inverse covariance of the model's rows."""
         factor = cho_factor(self.covariance(ageing), lower=True)
         return np.asarray(cho_solve(factor, np.eye(len(self.rows.y))))
 
@@ -226,9 +227,9 @@ def learn(series: Series, calibration: Calibration, since: float) -> tuple[Agein
     """
     Estimate variances and changes by evidence, without starts that contradict all other starts.
 
-    At most four changes are added, each with a log Bayes factor of at least 5. A start is left out
-    if one of its rows is more than 5 sd from the prediction by all other rows. Returns the
-    variances, the model of all rows, and the rests used.
+    At most four changes are added, each with a log Bayes factor of at least 5. A start of the node
+    is left out if one of its rows is more than 5 sd from the prediction by all other rows. Returns
+    the variances, the model of all rows, and the rests used.
     """
     centre = usual(calibration)
     is_used = np.ones(len(series), dtype=np.bool_)

@@ -5,7 +5,7 @@ Owns the detection of rests in a stream of samples: windows of 10 s without moti
 
 Samples are summed by whole seconds of their stamps. A second is still if its standard deviation is
 that of the noise and its mean agrees with the mean of the second before (thresholds as in
-`online.checks.GravityCheck`). Ten still seconds in a row are a window. In a long rest all windows
+`online.checks.GravityCheck`). Ten still seconds in a row form a window. In a long rest all windows
 of the first ten minutes are kept, then one window per minute up to an hour, then one window per
 five minutes.
 """
@@ -54,7 +54,8 @@ class RestFinder:
     def __init__(
         self, scale: Floats, noise: Floats, full_scale: float, state_now: StateNow
     ) -> None:
-        # `scale`: input units per m/s^2; `noise`: variance of one sample [m^2/s^4], by axis.
+        # `scale`: scale factors [input units per m/s^2]; `noise`: variance of one sample
+        # [m^2/s^4], by axis.
         self._scale, self._noise, self._full_scale = scale, float(noise.sum()), full_scale
         self._state_now = state_now
         self._second: _Second | None = None
@@ -64,7 +65,9 @@ class RestFinder:
         self._last: list[_Second] = []  # sums of the last second of the previous window
 
     def add(self, stamps: Stamps, samples: Floats) -> list[Rest]:
-        """Take samples with rising stamps, (n, 3), or (n, 6) with the rate; return new rests."""
+        """
+        Take samples with rising stamps, (n, 3), or (n, 6) with angular rates; return new rests.
+        """
         rests: list[Rest] = []
         seconds = stamps // _SECOND_NS
         cuts = np.flatnonzero(np.diff(seconds)) + 1

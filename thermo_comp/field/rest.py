@@ -42,10 +42,10 @@ class Start:
 @dataclass(frozen=True)
 class Rest:
     """
-    One window of samples at rest. `stamp_ns`: its middle; `n`: number of samples; `mean` and `sd`
-    of one sample [input units]; `state`: mean thermal state, laid out as by `thermal.state.Layout`
-    of the start's memory; `shares`: remaining share of the unseen start of each lag; `rate`: mean
-    angular rate [rad/s], empty if unknown.
+    One window of samples at rest. `stamp_ns`: stamp of the window's middle; `n`: number of
+    samples; `mean` and `sd` of one sample [input units]; `state`: mean thermal state, laid out as
+    by `thermal.state.Layout` of the start's memory; `shares`: remaining share of the unseen start
+    of each lag; `rate`: mean angular rate [rad/s], empty if unknown.
     """
 
     stamp_ns: int
@@ -58,7 +58,7 @@ class Rest:
 
 
 def encode(one: Start | Rest) -> bytes:
-    """Write one record as a line."""
+    """Write a start or a rest as a line."""
     if isinstance(one, Start):
         # Earlier releases cannot read angular rates and the newer fields of lags and plays: such
         # fields are written only if they differ from their defaults.
@@ -84,7 +84,7 @@ def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
 
 
 def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
-    """Read the rests of a file, each with its start; count the damaged lines."""
+    """Read the rests of a file, each with its start of the node; count the damaged lines."""
     rests: list[tuple[Start, Rest]] = []
     start: Start | None = None
     n_damaged = 0
@@ -159,7 +159,9 @@ def counted_rests(content: bytes) -> int:
 
 
 def thinned(content: bytes) -> bytes:
-    """Drop every second rest of a file, and damaged lines; each start keeps its first rest."""
+    """
+    Drop every second rest of a file, and damaged lines; the first rest of each start is kept.
+    """
     kept: list[bytes] = []
     n = 0
     for line in content.splitlines(keepends=True):

@@ -5,8 +5,8 @@ Owns rests as measurements of a calibration: ``|f| - g`` and its derivatives by 
 
 A rest at an unknown attitude measures one number. With x the axes' forces before the misalignment
 M, f = M x, u = f / |f| and v = M^T u, an error d_bias [input units] and d_scale [relative] of axis
-i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order the true error of
-the calibration along u is ``|f| - g = H (true - calibrated) + noise``.
+i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order ``|f| - g = H (true
+- calibrated parameters) + noise``.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Series:
 
     @property
     def day(self) -> Ints:
-        """Number of the day of the start of each rest, since 1970."""
+        """Day of each rest's start of the node, in days since 1970."""
         _, first = np.unique(self.start, return_index=True)
         return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
 
@@ -135,7 +135,7 @@ def read_rests(
     if not rests:
         raise RecordingError(f'no rest of unit {unit.serial}', ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
-    # The time in the source's name is rounded down to a second.
+    # The time in the name of an update's source is rounded down to a second.
     first_ns = begin * _DAY_NS + 1e9 * is_update
     later = [(start, rest) for start, rest in rests if rest.stamp_ns > first_ns]
     if is_update and not is_for_update:
@@ -257,9 +257,9 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     """
     Assign windows to groups of consecutive windows that are averaged, at most 60.
 
-    The windows of a group have the same start. Direction and temperature differ by less than 1e-3
-    rad and 1 K from those of the first window; the norm of a mean of vectors is smaller by
-    half the squared angle.
+    All windows of a group belong to the same start of the node. Direction and temperature of a
+    group's windows differ by less than 1e-3 rad and 1 K from those of the first window; the norm
+    of a mean of vectors is smaller by half the squared angle.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)

@@ -112,8 +112,9 @@ def update(
     """
     Update a calibration by rests.
 
-    `source`, `created`: for the new file's provenance; `ahead`: time after the last rest for which
-    the covariance is aged [days]. Raises FitError if there are fewer than three starts.
+    `source`, `created`: source and date for the new file's provenance; `ahead`: time after the
+    last rest for which the covariance is aged [days]. Raises FitError if the rests belong to fewer
+    than three starts of the node.
     """
     n_starts = int(series.start[-1]) + 1
     if n_starts < 3:
@@ -197,7 +198,7 @@ def _slopes(calibration: Calibration) -> Floats:
 def _moved(
     series: Series, calibration: Calibration, solution: Solution
 ) -> tuple[Bools, tuple[Moved, ...]]:
-    """Find the parameters that the rests determine, and list the changes by axis."""
+    """Find the parameters that the rests determine, and list the changes of each axis."""
     layout, correction = parameter_layout(calibration), Correction(calibration)
     coolest, warmest = np.argsort(series.temperature)[[len(series) // 10, -1 - len(series) // 10]]
     states = np.array([series.state.mean(axis=0), series.state[coolest], series.state[warmest]]).T

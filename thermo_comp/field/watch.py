@@ -92,7 +92,9 @@ class Watch:
 
 
 def watch(series: Series, calibration: Calibration, tolerance: float | None = None) -> Watch:
-    """Compare rests with the claim or a tolerance of ``|f| - g`` [m/s^2]; forecast the excess."""
+    """
+    Compare rests with the claimed sd or a tolerance of ``|f| - g`` [m/s^2]; forecast the excess.
+    """
     names = np.array([str(np.datetime64(int(day), 'D')) for day in series.day])
     ordered = np.unique(names)
     days = _rows(series, names, ordered.tolist(), tolerance)
@@ -146,9 +148,9 @@ def passage(error: float, sd: float, rate: float, bound: float) -> tuple[float, 
     """
     Return quantiles of the time [days] after which a random walk first exceeds a bound.
 
-    The walk begins at N(error, sd^2) and its variance grows by `rate` per day. A walk from x stays
-    inside (-c, c) until t with the probability ``sum_k 4 / (k pi) sin(k pi (x + c) / 2 c) exp(-(k
-    pi)^2 rate t / 8 c^2)`` over odd k.
+    The random walk begins at N(error, sd^2), and its variance grows by `rate` per day. A random
+    walk from x stays inside (-c, c) until t with the probability ``sum_k 4 / (k pi) sin(k pi (x +
+    c) / 2 c) exp(-(k pi)^2 rate t / 8 c^2)`` over odd k.
     """
     # 60 terms of the sum suffice for times above a thousandth of the median.
     k = np.arange(1, 120, 2) * np.pi

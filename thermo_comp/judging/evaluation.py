@@ -117,7 +117,8 @@ def evaluate(
     Judge calibrations of a unit, given with their names, on its recordings.
 
     Local gravity and topics default to those of the first calibration; `tolerance` is the largest
-    accepted RMS [m/s^2]; for `serial` see `replay.check_unit`; `force`: |f| where it is not g.
+    accepted RMS of ``|f| - g`` [m/s^2]; for `serial` see `replay.check_unit`; `force`: the user's
+    options about |f| that is not g.
 
     Raises RecordingError if a recording cannot be read, or none has a window at rest;
     CalibrationError if a calibration is for another unit.
@@ -165,7 +166,9 @@ class Epoch:
 
 @dataclass(frozen=True)
 class Drift:
-    """The change of a constant between two calibrations; significant beyond three sd."""
+    """
+    The change of a constant between two calibrations; a change beyond three sd is significant.
+    """
 
     earlier: str
     later: str
@@ -208,7 +211,7 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
 
 
 def drifts_of(history: Sequence[Epoch]) -> list[Drift]:
-    """List the changes from each calibration to the next, with independent errors assumed."""
+    """List the changes from each calibration to the next; their errors are assumed independent."""
     return [
         Drift(
             earlier=before.created,

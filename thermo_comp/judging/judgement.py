@@ -72,7 +72,7 @@ class Judgement:
 
     @property
     def exit_code(self) -> int:
-        """0 for a valid calibration whose gyroscope, if any, is not refuted; else 1."""
+        """Exit code: 0 for a valid calibration whose gyroscope, if any, is not refuted; else 1."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 

@@ -48,7 +48,8 @@ class Verdict(Enum):
 @dataclass(frozen=True)
 class Section:
     """
-    Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or changes of the rate [rad/s].
+    Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or changes of the angular rate
+    [rad/s].
 
     `raw` values use the constants at the reference temperature, other values the whole
     calibration; `claimed_rms` is the RMS of the claimed sd of the same windows, NaN without a
@@ -70,7 +71,9 @@ class Section:
 
 
 class Sections(dict[str, Section]):
-    """``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside`` them."""
+    """
+    The sections ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside``.
+    """
 
     @property
     def regimes(self) -> list[Section]:
@@ -88,7 +91,7 @@ class Sections(dict[str, Section]):
 
 
 def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats) -> Sections:
-    """Summarise values of windows, shape (n,) or (n, axes), by section."""
+    """Summarise the residuals of windows, shape (n,) or (n, axes), by section."""
     inside, dynamic = windows.is_inside, windows.is_dynamic
     sections = Sections()
     rows_of = (inside & ~dynamic, inside & dynamic, inside, ~inside)
@@ -118,7 +121,7 @@ def _section(raw: Floats, residual: Floats, claimed: Floats, rows: Bools | Ints)
 
 @dataclass(frozen=True)
 class RateJudgement:
-    """The judgement of a gyroscope: sections of the changes of all axes [rad/s]."""
+    """The judgement of a gyroscope: sections of the changes of the rate of all axes [rad/s]."""
 
     kind: Verdict
     reason: str

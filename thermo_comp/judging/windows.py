@@ -27,7 +27,7 @@ from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
 from ..unit.metrics import norm_residual
 
-#: Default length of a window [s].
+#: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
 # Distance outside a calibrated range that noise can explain, so that a window counts as inside
 # [half ranges].
@@ -49,10 +49,10 @@ class Windows:
     `is_dynamic`: the dynamic set has more than half the weight; `is_inside`: the window is
     entirely inside the calibrated ranges; `is_swapped`: the board temperature leads that of the
     case. `raw` is the specific force by the constants at the reference temperature, `force` by the
-    calibration, shapes (n, 3). `size`: |f| as known, gravity unless the bag states another.
-    `claimed_sd` of the norm of `force`: error of the calibration, error of `size`, and white noise
-    of the mean; `noise_sd`: the white noise alone. Rows of `gyro`: angular rate raw and corrected,
-    its claimed variances, the thermal state; empty without a gyroscope.
+    calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the bag states
+    another value. `claimed_sd` of the norm of `force`: error of the calibration, error of `size`,
+    and white noise of the mean; `noise_sd`: the white noise alone. Rows of `gyro`: angular rate
+    raw and corrected, its claimed variances, the thermal state; empty without a gyroscope.
     """
 
     window_s: float
@@ -100,12 +100,14 @@ class Windows:
 
 
 def sum_length(window_s: float) -> float:
-    """Choose the longest part of a window in which the thermal state moves little."""
+    """Choose the duration of partial sums [s], in which the thermal state changes little."""
     return window_s / float(np.ceil(window_s / reduction.WINDOW_S))
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Choose the window length [s]: the least multiple of the bags' sums that is 60 s or more."""
+    """
+    Choose the duration of windows [s]: a multiple of the partial sums' duration, 60 s or more.
+    """
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 
@@ -181,7 +183,7 @@ def columns_of(windows: Windows, bags: Sequence[str]) -> dict[str, npt.NDArray[A
     }
 
 
-# A structured array of partial sums or windows.
+# A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
 # Integer fields of a window; all other fields except `excess` are averaged over the partial sums
 # of a window.
@@ -261,7 +263,7 @@ def _joined(sums: _Table) -> _Table:
 
 def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     """Run partial sums through the compensator, with the readings before each partial sum."""
-    # The checks for stuck samples and gravity do not apply to a mean.
+    # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
     # A sum is many samples: a distance of more than 15 s to the sum and the reading before it, as

@@ -3,8 +3,9 @@
 """
 Owns the correction of whole arrays at once, bit-identical to that of single samples.
 
-The compensator takes the temperature readings one by one, as for single samples. The resulting
-segments are collected, evaluated together and applied to all samples with the same arithmetic.
+The compensator takes the temperature readings one by one, as for single samples. The segments
+between the readings are collected, evaluated together and applied to all samples with the same
+arithmetic.
 """
 
 from dataclasses import dataclass, fields
@@ -25,7 +26,7 @@ from .status import DROPPED
 #: Future readings in reverse order; for each reading the number of samples before it, the latest
 #: stamp of its thermometer so far, the thermometer, the stamp [ns] and the temperature [degC].
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
-#: Segments, each with its number of samples.
+#: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
 #: Code of the reason for which a sample is dropped; the code 0 marks a published sample.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
@@ -44,8 +45,8 @@ class CompensatedBlock:
 
     index: Ints  # indices of the published samples in the block, shape (n,)
     stamp_ns: Stamps
-    specific_force: Floats  # [m/s^2], shape (n, 3)
-    covariance: Floats  # row-major 3x3 [m^2/s^4], shape (n, 9)
+    specific_force: Floats  # corrected specific force [m/s^2], shape (n, 3)
+    covariance: Floats  # covariance of the force, row-major 3x3 [m^2/s^4], shape (n, 9)
     #: Corrected angular rate [rad/s] and its variances [rad^2/s^2], shape (n, 3); None without an
     #: angular rate or a gyroscope in the calibration.
     angular_rate: Floats | None = None
@@ -123,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # A full queue applies its oldest readings, as in the node: once a sample has been
-            # received, only the readings before the next sample.
+            # A full queue of readings applies the oldest readings, as in the node; once a sample
+            # has been received, it applies only those before the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

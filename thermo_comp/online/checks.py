@@ -33,7 +33,7 @@ BURST_S: Final = 0.25
 #: Relative excess of the sample rate up to which the calibrated noise holds.
 RATE_TOLERANCE: Final = 0.1
 _WINDOW_S: Final = 1.0  # time over which the rate of samples is measured [s]
-#: Length of a window of the gravity check [ns]: shortest, and longest if samples are few.
+#: Duration of a window of the gravity check [ns]: shortest, and longest if samples are few.
 WINDOW_NS: Final = 1_000_000_000
 LONGEST_WINDOW_NS: Final = 30_000_000_000
 # Shortest time between two samples of a window of the gravity check [ns].
@@ -48,9 +48,9 @@ MEMORY_WINDOWS: Final = 30.0
 #: Number of consecutive still windows that refute a calibration, and that clear it again.
 REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
-#: Time at rest after a step of |f| from rest, after which the step is judged [ns].
+#: Time at rest after a step of |f|, after which the step is judged [ns].
 STEP_NS: Final = 300_000_000
-#: A residual above the tolerance and above this number of its sd refutes the calibration.
+#: A residual of |f| above the tolerance plus this number of its sd refutes the calibration.
 REFUTING_SIGMAS: Final = 5.0
 
 
@@ -61,7 +61,7 @@ class StuckCheck:
         self.is_on = timeout_s > 0.0
         self.limit_ns = round(timeout_s * 1e9) if self.is_on else NEVER_NS
         self.run = (math.nan, math.nan, math.nan, 0)  # first of the equal samples, and its stamp
-        self.n_same = 0  # number of samples equal to the first of the run
+        self.n_same = 0  # number of samples equal to the first sample in `run`
 
     def again(self, stamp_ns: int) -> bool:
         """Count another equal sample; return whether the samples are stuck."""
@@ -102,7 +102,7 @@ class RateCheck:
         self._cycle_s, self._counts_cycles = cycle_s, counts_cycles
         self._allowance = max(BURST_SAMPLES, BURST_S / cycle_s)
         self.is_too_fast = False  # whether more samples come than the converter can make
-        self.ratio = 1.0  # samples per calibrated cycle over the last `_WINDOW_S`
+        self.ratio = 1.0  # samples per calibrated conversion cycle over the last `_WINDOW_S`
         self._level = 0.0
         self._last: tuple[int, int] | None = None
         self._window = (0, 0)
@@ -128,7 +128,8 @@ class RateCheck:
             self._level = 0.0
             self.is_too_fast = False
         else:
-            # Count up to twice the allowance, so that the alarm ends soon after a long excess.
+            # Excess samples are counted up to twice the allowance, so that the alarm ends soon
+            # after a long excess.
             self._level = min(level, 2.0 * self._allowance)
             self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
@@ -151,18 +152,20 @@ class GravityCheck:
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
-        self.is_refuted = False  # the last windows all missed gravity by more than the tolerance
+        # |f| of the last windows differed from gravity by more than the tolerance.
+        self.is_refuted = False
         self._n_alike = 0
         self._is_against = False
         self._forces: list[Sequence[float]] = []
         #: Samples since |f| stepped from one rest to another, and the stamp of the first of them.
         self._off: list[Sequence[float]] = []
         self._off_ns = 0
-        self._is_resting = False  # the last sample agreed with the still window before it
+        self._is_resting = False  # whether the last sample agreed with the last still window
         self._begin_ns = self._last_ns = 0
         self._last_mean: list[float] | None = None
         self._weight = 0.0
-        self.result: GravityResidual | None = None  # None before the first still window
+        # Residual of |f|; None before the first still window.
+        self.result: GravityResidual | None = None
 
     def wants(self, stamp_ns: int) -> bool:
         """Whether enough time has passed since the last sample that was added to a window."""

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns (counts, temperatures) -> (specific force, covariance, regime, status), streaming and batch.
+Owns the correction of a stream of samples: counts and temperatures to specific force, covariance,
+regime and status.
 
 A reading applies from the first later-arriving sample with an equal or later stamp, so stamps and
 order of arrival determine the output, and a node that received everything in order publishes the
 bits of the offline replay. The rate of the samples, and |f| against gravity, are checked at the
-first sample of each segment: the checks cost nothing per sample, and a batch gives the same.
+first sample of each segment, so that the checks cost nothing per sample.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class CompensatorStatus:
     """State of a compensator at the stamp of its last sample."""
 
     stamp_ns: int | None
-    #: Fault of each thermometer, and the size of a rejected step [K].
+    #: Fault of each thermometer, and the size of a rejected step of its readings [K].
     faults: Mapping[str, tuple[Fault, float]]
     #: Time from the last sample to the latest waiting reading [s].
     pending_ahead_s: float
@@ -76,10 +77,11 @@ class CompensatorStatus:
     is_board_lost: bool = True
     is_case_lost: bool = True
     excess: Excess = Excess(0.0, 0.0, 0.0, 0.0)  # noqa: RUF009 - it is immutable
-    #: Whether the board has led the case in a ramp: most likely the two topics are swapped.
+    #: Whether the board temperature has led that of the case in a ramp: most likely the two topics
+    #: are swapped.
     is_lead_reversed: bool = False
     gravity: GravityResidual | None = None  # residual at rest; None before the first rest
-    #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.
+    #: Whether |f| at rest differs from gravity by more than the tolerance: nothing is published.
     is_refuted: bool = False
     #: Bias sd of each axis' angular rate [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
@@ -98,7 +100,7 @@ class Compensator:
         self.thermal = ThermalSide(model, self.config, self.counters)
         self._use(model.calibration)
         self.last_ns = self.event_ns = EVER_NS
-        #: Stamp of a sample that leapt ahead and is not confirmed yet.
+        #: Stamp of a sample that is far ahead of the sample before and is not confirmed yet.
         self.leapt_ns: int | None = None
         self.reading_ns = EVER_NS  # the latest stamp of a reading
         #: Rate correction of the present segment (`Correction.line`); empty without a gyroscope.
@@ -128,7 +130,7 @@ class Compensator:
         Correct one sample in the calibration's input unit.
 
         Returns specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4];
-        None if the sample must not be published; `counters` counts the reason.
+        None if the sample must not be published, with the reason counted in `counters`.
         """
         if not self.last_ns < stamp_ns < self.event_ns:
             return self._process_first(stamp_ns, x, y, z)
@@ -176,7 +178,9 @@ class Compensator:
             self.counters.n_saturated += 1
 
     def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
-        """Correct the first sample after an event, and run the checks of the samples."""
+        """
+        Correct the first sample after a reading or the end of a segment, and check the samples.
+        """
         if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
             self.reading_ns = EVER_NS
@@ -188,8 +192,8 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Until a temperature arrives, every sample is handled as an event, so that it is
-            # counted as dropped.
+            # Until a temperature arrives, every sample is handled here, where it is counted as
+            # dropped.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -206,8 +210,8 @@ class Compensator:
             is_good &= is_sound(rate_line)
             self.rate_line = rate_line.tolist()
         if not is_good:
-            # While the correction is not finite, every sample is handled as an event, so that it
-            # is dropped.
+            # While the correction is not finite, every sample is handled here, where it is
+            # dropped.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None
@@ -233,13 +237,13 @@ class Compensator:
         is_far = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
         if is_far and (leapt_ns is None or stamp_ns <= leapt_ns):
             self.leapt_ns = stamp_ns
-            self.event_ns = EVER_NS  # the next sample is checked again
+            self.event_ns = EVER_NS  # the next sample is also checked for a leap
             return True
         return False
 
     def jump_back(self, stamp_ns: int) -> None:
         """Restart at a sample before which time has jumped back, as in a bag that loops."""
-        # Waiting readings with later stamps belong to the time before the jump.
+        # Waiting readings with later stamps belong to the time before the backward jump.
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self.thermal.reset()
         self.stuck = StuckCheck(self.config.stuck_timeout_s)
@@ -293,11 +297,11 @@ class Compensator:
 
     @property
     def now_ns(self) -> int | None:
-        """Stamp of the last sample; None before the first."""
+        """Stamp of the last sample; None before the first sample."""
         return self.last_ns if self.last_ns != EVER_NS else None
 
     def status(self) -> CompensatorStatus:
-        """Return the state, for diagnostics."""
+        """Return the state of the compensator, for diagnostics."""
         thermal = self.thermal
         tracker, rate = thermal.tracker, thermal.rate_correction
         detector, gravity = tracker.detector, self.gravity

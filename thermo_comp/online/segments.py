@@ -4,9 +4,9 @@
 Owns the segments: time intervals between temperature readings, with a correction linear in time.
 
 A segment ends at a temperature reading, or after one second. The correction is evaluated in full
-at both ends, so a sample costs a few operations, the output has no staircase, and a batch needs
-one evaluation per segment. The slow part of the variance is evaluated at the first segment in each
-ten seconds of the stamps.
+at both ends of a segment, so a sample costs a few operations, the output has no steps, and a batch
+needs one evaluation per segment. The slow part of the variance is evaluated at the first segment
+in each ten seconds.
 """
 
 from collections.abc import Sequence
@@ -41,16 +41,17 @@ class Segment(NamedTuple):
     start_ns: int
     # False for the second part of a segment that the end of a block or a call has cut.
     is_new: bool
-    is_too_fast: bool  # samples come faster than the converter can make them
+    is_too_fast: bool  # whether samples come faster than the converter can make them
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
     start: tuple[float, ...]  # thermal state at the start of the segment
     end: tuple[float, ...]  # thermal state at the end of the segment
-    #: Slow part of the variance of the force (`Correction.n_slow`), then of the angular rate.
+    #: Slow part of the variance of the force, `Correction.n_slow` numbers, then of the angular
+    #: rate.
     slow: list[float]
 
 
 class Model:
-    """A calibration prepared for evaluation; immutable."""
+    """A calibration prepared for evaluation; the object is immutable."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
@@ -203,14 +204,14 @@ class ThermalSide:
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[float]:
-        """Return the slow part of the variance of a segment, evaluated at its end or held."""
+        """Return the slow part of a segment's variance, evaluated at the segment's end or held."""
         key = start_ns // SLOW_NS
         if key != self._slow_key:
             self._slow_key = key
             shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)
             if self.is_unmeasured:
-                # Without a reading, evaluate the variance one sd of the temperature from the
-                # reference.
+                # Without a temperature reading, evaluate the variance one sd of the temperature
+                # from the reference temperature.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             self._slow = [v for part in self.model.uncertainty for v in part.at(end_state, shares)]
         return self._slow

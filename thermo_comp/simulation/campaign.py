@@ -65,15 +65,15 @@ PLAN_NAMES = (
 # Runs at several rates, times in s: ends of the soaks; time from the start of a run to the end of
 # its soak; time at each rate; time between rates.
 _SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
-# Radius and rates [rad/s]. Centrifuge: 1 m, 2 to 10 g horizontally; rate table: 0.25 m, up to 1000
-# deg/s.
+# Radius [m] and rotation rates [rad/s] of the simulated machines. Centrifuge: 1 m, 2 to 10 g
+# horizontally; rate table: 0.25 m, up to 1000 deg/s.
 _CENTRIFUGE = 1.0, tuple(math.sqrt(g * STANDARD_GRAVITY) for g in (2.0, 4.0, 7.0, 10.0))
 _RATE_TABLE = 0.25, tuple(math.radians(rate) for rate in (400.0, 600.0, 800.0, 1000.0))
 
 
 @dataclass(frozen=True)
 class Cyclogram:
-    """Air temperature [degC] over time [s]: linear between points, constant outside."""
+    """Air temperature [degC] over time [s]: linear between the points, constant outside."""
 
     time_s: tuple[float, ...]
     temperature_c: tuple[float, ...]
@@ -90,8 +90,8 @@ def parse_cyclogram(text: str) -> Cyclogram:
 
     Steps are separated by commas, semicolons or lines: ``TARGET[@RATE] [SOAK]`` with the target in
     degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is the
-    starting temperature and takes no rate; a later one without a rate keeps the last rate (1 K/min
-    if none was given). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
+    starting temperature and takes no rate; a later step without a rate keeps the last rate (1
+    K/min if none was given). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
     """
     text = _PROGRAMS.get(text.strip(), text)
     time, temperature, rate = [0.0], list[float](), 1.0
@@ -124,14 +124,15 @@ def positions(n: int, seed: int = 0) -> Floats:
     """
     Return attitudes of a calibration test as unit vectors of the specific force, shape (n, 3).
 
-    Six are the faces of a cube, nine the corners of a three-capped prism, twelve the corners of an
-    icosahedron: for their number the best sets to determine bias, scale and misalignment. Other
-    sets take the faces of a cube, then its edges, then its corners; more than 26 follow a uniform
-    spiral on the sphere. The sets of 6, 9, 12, 18, 24 and 26 are balanced. `seed` tilts each
-    attitude by a small random angle.
+    Six attitudes are the faces of a cube, nine the corners of a three-capped prism, twelve the
+    corners of an icosahedron: for their number the best sets to determine bias, scale and
+    misalignment. Other numbers of attitudes take the faces of a cube, then its edges, then its
+    corners; more than 26 attitudes follow a uniform spiral on the sphere. The sets of 6, 9, 12,
+    18, 24 and 26 attitudes are balanced. `seed` tilts each attitude by a small random angle.
     """
     if n == 9:
-        # Three corners on the equator, six between them at elevations of +-44 degrees.
+        # The prism has three corners on the equator, and six between them at elevations of +-44
+        # degrees.
         third = np.arange(3) * 2.0 * math.pi / 3.0
         ring = np.stack([np.cos(third), np.sin(third)], axis=1)
         height, radius = 0.7, math.sqrt(1.0 - 0.7**2)

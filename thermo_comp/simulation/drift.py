@@ -37,15 +37,15 @@ class PartHistory:
     step: float
 
     def of(self, part: str) -> Floats:
-        """Return the deviation of one part, shape (m,), K."""
+        """Return the temperature deviation of one part, shape (m,), K."""
         return self.deviation[:, self.nodes.index(part)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effect(ABC):
     """
-    A cause of errors. The bias of each axis changes by ``bias * first + bias_curvature * second``,
-    the scale likewise.
+    The base class of the causes of thermal errors. The bias of each axis changes by ``bias * first
+    + bias_curvature * second``, the scale likewise.
 
     Bias changes in ug and scale changes in ppm per unit of the first and the second signal.
     """

@@ -72,7 +72,9 @@ class ThermalNetwork:
         return {AIR: -1, **{name: i for i, name in enumerate(self.nodes)}}
 
     def system(self) -> tuple[Floats, Floats, Floats]:
-        """Return A, b and p, shapes (k, k), (k,) and (k,), as if every exponent were 1."""
+        """
+        Return A, b and p of the network's equation, shapes (k, k), (k,), (k,), for exponents of 1.
+        """
         n, index = len(self.nodes), self._places
         size = n + (self.thermostat is not None)
         both, p = np.zeros((size + 1, size + 1)), np.zeros(size)
@@ -110,7 +112,7 @@ class ThermalNetwork:
         return flow[:-1]
 
     def settled(self, air: float, power: Floats | None = None) -> Floats:
-        """Return the state after an endless soak under constant powers, shape (k,)."""
+        """Return the network's state after an endless soak under constant powers, shape (k,)."""
         A, b, p = self.system()
         drive = p if power is None else power
         state = np.linalg.solve(A, -b * air - drive)
@@ -127,7 +129,9 @@ class ThermalNetwork:
         return self.settled(air)[: len(self.nodes)]
 
     def air_for(self, node: str, temperature: float) -> float:
-        """Return the air temperature that brings a part to a temperature in an endless soak."""
+        """
+        Return the air temperature that brings a part to a given temperature in an endless soak.
+        """
         i = self.nodes.index(node)
 
         def miss(air: Floats) -> float:
@@ -138,7 +142,7 @@ class ThermalNetwork:
 
 class ThermalResponse:
     """
-    Temperatures of a network over a program, at any time.
+    Temperatures of a thermal network over a chamber program, at any time.
 
     `air` are the chamber's temperatures at the knots `time` [s], shape (m,); `power` is the
     dissipation between the knots in addition to the constant powers [W], shape (m - 1, n_parts).

@@ -50,16 +50,16 @@ class Truth:
 
     @property
     def bias(self) -> Floats:
-        """Bias of each cycle, shape (n, 3)."""
+        """Bias in each conversion cycle, shape (n, 3)."""
         return self.on_cycles(self.bias_grid)
 
     @property
     def scale(self) -> Floats:
-        """Relative scale of each cycle, shape (n, 3)."""
+        """Relative scale in each conversion cycle, shape (n, 3)."""
         return self.on_cycles(self.scale_grid)
 
     def on_cycles(self, grid: Floats) -> Floats:
-        """Interpolate linearly from the grid to each cycle."""
+        """Interpolate values linearly from the thermal grid to each conversion cycle."""
         # np.interp is not used, because its rounding depends on the number of points.
         place = self.cycle_s / self.grid_s[1]
         left = np.minimum(place.astype(np.int64), len(self.grid_s) - 2)
@@ -93,7 +93,9 @@ def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: An
 def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
-    """Run a unit through a test in memory; each position has another seed, stamps from 0."""
+    """
+    Run a unit through a test in memory; each position has a separate seed, and stamps from 0.
+    """
     return [
         simulate(
             unit,
@@ -124,9 +126,9 @@ def simulate_blocks(
     """
     Run a unit through a program in bounded memory; the result does not depend on the block size.
 
-    A reading is in the block of the cycles around it, or in the last block. `up` is the direction
-    of the specific force without `spin`; K [counts/cycle] does not depend on `rate_hz`. `seed`
-    determines all random numbers of the run.
+    A temperature reading is in the block of the cycles around the reading, or in the last block.
+    `up` is the direction of the specific force without `spin`; K [counts/cycle] does not depend on
+    `rate_hz`. `seed` determines all random numbers of the run.
     """
     readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz
     positive = {'rate_hz': rate_hz, 'temperature_rate_hz': readings_hz, 'gravity': gravity}

@@ -32,8 +32,8 @@ _ROWS = 1 << 20
 class Stream(IntEnum):
     """
     Sources of random numbers, each with a separate stream: switching a source on or off, or
-    another block size, does not change the others. The values must never change or be reused, as
-    they are part of the meaning of a seed.
+    another block size, does not change the others. The numbers of the sources must never change or
+    be reused, because they determine the random numbers of a seed.
     """
 
     ACCEL_NOISE = 0
@@ -94,7 +94,7 @@ def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
 
 
 def rounded(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
-    """Round every cycle independently, as a sampling converter does."""
+    """Round the counts of every cycle independently, as a sampling converter does."""
     return np.clip(np.rint(charge), *_RANGE).astype(np.int32), remainder
 
 

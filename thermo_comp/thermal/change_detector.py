@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the detection of a change: has the rate of one sensor left the baseline of the soak?
+Owns the detection of a change: whether the rate of a sensor has left the baseline of the soak.
 
 Two linear filters of temperature and rate, of different memory, integrate the second derivative.
 A rate has departed if it differs from the baseline by more than the swing plus a multiple of the
@@ -29,12 +29,13 @@ BEND_SHARES = (1.0, 10.0)  # accelerations of the two filters' tuning / that of 
 TUNING: Final = 1.45  # best memory of a filter in units of (noise / acceleration)^0.4, at 1 Hz
 # Noise variance / filter variance for a sensor whose noise is mostly quantization.
 CELL_NOISE_SHARE: Final = 0.4
-SETTLING: Final = 5.0  # age at which a filter's noise is stationary, in filter memories
+SETTLING: Final = 5.0  # age of a filter at which its noise is stationary, in filter memories
 LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
 LARGEST_BASELINE: Final = 0.25  # largest rate of the soak's baseline / rate of the smallest ramp
-SWING_MARGIN: Final = 1.25  # swing assumed / swing observed about the trend of the rate
+SWING_MARGIN: Final = 1.25  # assumed swing / observed swing of the rate about its trend
 SWING_SIGMAS: Final = 3.0  # noise subtracted from an observed swing of the rate, in sd
-SWING_MEMORY_LAGS: Final = 10.0  # time constant of forgetting a swing, in sensor lags
+# Time constant with which the swing of the rate decays, in sensor lags.
+SWING_MEMORY_LAGS: Final = 10.0
 
 
 class ChangeDetector:
@@ -94,17 +95,17 @@ class ChangeDetector:
         self._reading = nan
 
     def settle(self, sensor: Thermometer, least_doubt: float = 0.0) -> None:
-        """Begin a soak with the rate as its baseline, uncertain by at least `least_doubt`."""
+        """Begin a soak with the rate as its baseline, with an error of at least `least_doubt`."""
         self._baseline = self.rate
         self._doubt = max(self.swing, least_doubt, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # cell edges crossed before the soak measure the ramp
 
     def is_following(self, stamp_ns: int) -> bool:
-        """Whether `rate` includes the reading with this stamp."""
+        """Whether `rate` includes the reading with a given stamp."""
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
-        """Whether the rate is within a swing of the baseline."""
+        """Whether the rate is within the swing and the error of the baseline."""
         return abs(self.rate - self._baseline) < self.swing + self._doubt
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
@@ -129,7 +130,7 @@ class ChangeDetector:
         self._age_s += dt
         if not 0.95 * self._dt < dt < 1.05 * self._dt:
             self._tune(dt)
-        # A rate between the baseline and 0 is no departure.
+        # A rate between the baseline and 0 does not count as a departure from the baseline.
         baseline, swing = self._baseline, self.swing + self._doubt
         high = baseline + swing if baseline > 0.0 else swing
         low = baseline - swing if baseline < 0.0 else -swing
@@ -238,7 +239,7 @@ class ChangeDetector:
         if not -limit <= step <= limit:
             step = limit if step > 0.0 else -limit
         moved = baseline + share * step
-        # A slow onset must not raise the baseline to the rate of a ramp.
+        # The slow onset of a ramp must not raise the baseline to the rate of the ramp.
         farthest = self._largest_baseline
         if not -farthest <= moved <= farthest:
             farthest = max(farthest, abs(baseline))

@@ -12,7 +12,7 @@ series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighte
 two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 
 A part may also exchange heat with both the board and another part, at a sensor s: it lags the
-temperature ``T + v g`` between them, with ``g = T_s - T``. The lag behind this temperature is that
+temperature ``T + v g`` between them, with ``g = T_s - T``. The lag behind ``T + v g`` is the lag
 of the board less v times the lag of the gradient.
 """
 
@@ -67,7 +67,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def singles(self) -> dict[tuple[str, float], float]:
-        """Share of each single lag in this lag, by input and time constant."""
+        """Share of each single lag in a lag of two stages, by input and time constant."""
         stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
         return {
             (name, tau): factor * share
@@ -180,7 +180,7 @@ class LagBank:
     """
     Single lags of one input; `start_ns` is the first stamp since the last `forget`.
 
-    taus: time constants of the lags [s]
+    taus: time constants of the single lags [s]
     """
 
     def __init__(self, taus: tuple[float, ...]) -> None:
@@ -384,7 +384,7 @@ def memory_on_grid(
     spec: MemorySpec, step_s: float, board: Floats, gradients: Sequence[Floats]
 ) -> Floats:
     """
-    Compute the results of `ThermalMemory` for whole series on a uniform grid, except for rounding.
+    Compute the results of `ThermalMemory` for series on a uniform grid, equal except for rounding.
 
     Returns (n, 2 * n_lags + n_plays): (lag [K], 0) per lag, then each play less its input [K].
     """

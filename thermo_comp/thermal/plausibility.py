@@ -24,8 +24,9 @@ LARGEST_RATE: Final = 0.2
 #: readings may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: A sensor counts as standing still after this number of equal readings (more if the declared
-#: noise makes so long a run more probable than `STILL_PROBABILITY`) over at least this time [s].
+#: A sensor's readings count as standing still after this number of equal readings over at least
+#: this time [s]; the number is larger if the declared noise makes the run more probable than
+#: `STILL_PROBABILITY`.
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
@@ -35,7 +36,7 @@ DOUBTFUL_READINGS: Final = 4
 #: as frozen: if its noise exceeds its quantum, and if its quantum hides the noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
-#: Largest assumed error of a frozen sensor [K].
+#: Largest assumed error of a sensor with frozen readings [K].
 LARGEST_DOUBT: Final = 60.0
 
 #: Smallest temperature difference at which a sensor leads the other in a ramp: in K, and as a
@@ -106,7 +107,7 @@ class SensorCheck:
         last_ns, fault = sensor.stamp_ns, self.fault
         self.is_revived = False
         if last_ns is None or stamp_ns <= last_ns or not isfinite(celsius):
-            return True  # the first reading, or one that the estimator rejects
+            return True  # the first reading, or a reading that the estimator rejects
         if celsius == sensor.reading:
             self._n_same += 1
             self.fault = self._judge_still(stamp_ns)
@@ -239,7 +240,7 @@ class LeadCheck:
         self._is_against = False
 
     def update(self, is_static: bool) -> None:
-        """Take both sensors' last estimates; call after a reading of the case."""
+        """Use the last estimates of both sensors; called after each reading of the case."""
         case, board = self._case, self._board
         calm = self._calm_rate
         if is_static or (-calm < case.rate < calm and -calm < board.rate < calm):

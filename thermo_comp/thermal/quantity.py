@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what all quantities of the thermal state have in common."""
+"""Owns the base class of the quantities of the thermal state."""
 
 from typing import ClassVar
 
@@ -11,7 +11,7 @@ class Quantity:
     """A quantity of the thermal state; `input` is the thermometer that it is computed from."""
 
     input: str
-    #: Largest magnitude that a calibration may contain.
+    #: Largest magnitude of the quantity that a calibration may contain.
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0

@@ -8,7 +8,7 @@ The dynamic state *opens* when the rate of the leading sensor has left the basel
 rate of any sensor is clearly that of a ramp. The dynamic state is *held* while any sensor's rate,
 now or predicted half a lag ahead, may exceed the relaxed rate: during the ramp, where the second
 derivative is 0, and after the ramp until the board has relaxed. With `closes` = 'case' (the
-paper's rule) the dynamic state ends with the change of the case temperature, and the board counts
+paper's rule) the dynamic state ends with the change of the case temperature, and the board is used
 only while the case is lost. The derivation is in docs/regime.md.
 
 References
@@ -26,8 +26,8 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state, in lags of the leading sensor
-# Margin for "the rate is below a limit", in sd of the rate. Half a sd is sufficient: in a soak
-# most of the rate's variance allows for an onset that may begin.
+# Margin for "the rate is below a limit", in sd of the rate. A margin of half a sd is sufficient:
+# in a soak most of the rate's variance allows for an onset that may begin.
 SURE_SIGMAS: Final = 0.5
 OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above a limit", in sd of the rate
 FIRST_READINGS: Final = 20  # number of readings that correct a declared noise that is too small
@@ -43,7 +43,7 @@ class Regime(IntEnum):
 
 class RegimeDetector:
     """
-    State machine over the estimates of the case and the board.
+    State machine over the temperature estimates of the case and the board.
 
     `direction` is -1 while cooling and +1 while heating; it is 0 in the dynamic state before the
     direction is known, and in all other states.
@@ -120,7 +120,7 @@ class RegimeDetector:
             >= self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
             and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
         ):
-            # In the first soak the swing of the rate has not been learnt yet.
+            # In the first soak the swing of the rate has not been estimated yet.
             is_first = self.regime == Regime.UNKNOWN
             change.settle(lead, 0.5 * self._relaxed_rate if is_first else 0.0)
             self.regime = Regime.STATIC

@@ -52,10 +52,10 @@ class Layout:
     """
     The numbers of a thermal state: those up to UNKNOWN, pairs of quantity and variance, plays.
 
-    pairs, lags: number of each pair, and of each lag; the pairs of lags are `lag_pairs`
-    variances: places of the variances, in the order of the pairs
-    numbers: name of each number, in order
-    places: place of each quantity
+    pairs, lags: index of each pair, and of each lag; the pairs of lags are `lag_pairs`
+    variances: places of the pairs' variances in the state
+    numbers: name of each number of the state
+    places: place of each quantity in the state
     """
 
     def __init__(self, spec: MemorySpec) -> None:

@@ -27,8 +27,9 @@ from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS: Final = 6.0  # innovation in sd beyond which a reading is down-weighted
 OUTLIER_LIMITS: Final = 5.0  # innovation / OUTLIER_SIGMAS, beyond which a reading is rejected
-RESTART_READINGS: Final = 4  # outliers in a row on one side that count as a real change
-SOAK_S: Final = 900.0  # mean time in the quiet mode [s]; that in the bending mode is the lag
+RESTART_READINGS: Final = 4  # number of outliers in a row on one side that count as a real change
+# Mean time in the quiet mode [s]; the mean time in the bending mode is the lag.
+SOAK_S: Final = 900.0
 QUIET_SHARE: Final = 5e-3  # acceleration in quiet / bending mode, for a sensor without wide cells
 CELL_SHARE: Final = 0.2  # acceleration in quiet / bending mode, for a sensor with wide cells
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
@@ -51,10 +52,11 @@ class Thermometer:
     """
     Causal estimate of one sensor's temperature [degC], its rate [K/s] and acceleration [K/s^2].
 
-    The estimates hold at `stamp_ns`, the stamp of the last used reading; before the first they
-    are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
-    `interval_s`: typical interval; `n_in_row`: readings since the last start; `n_restarts`: starts
-    after a gap or a step; `is_ready`: two readings exist, so a rate does. `measured` and its
+    The estimates hold at `stamp_ns`, the stamp of the last used reading; before the first reading
+    they are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
+    `interval_s`: typical interval between readings; `n_in_row`: number of readings since the last
+    start; `n_restarts`: number of starts after a gap or a step; `is_ready`: two readings exist, so
+    that a rate is known. `measured` and its
     variance: the last reading, or for a sensor with cells the equivalent Gaussian measurement
     (infinite variance: no information). `bending`: probability of the bending mode.
     """
@@ -66,7 +68,7 @@ class Thermometer:
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
         self._noise_scale = 1.0  # actual / declared noise variance
-        self._n_turns = 8.0  # number of innovations in `_noise_scale`; the prior counts as 8
+        self._n_turns = 8.0  # number of innovations in `_noise_scale`; its prior counts as 8
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s
@@ -90,7 +92,7 @@ class Thermometer:
         self.measured = nan
         self.measured_variance = inf
         self.bending = 0.5
-        self._covariance = 0.0  # of temperature and rate
+        self._covariance = 0.0  # covariance of temperature and rate
         self._quiet: State = _NOWHERE
         self._bent: State = _NOWHERE
         self._surprise = 0.0
@@ -114,7 +116,8 @@ class Thermometer:
             self._start(stamp_ns, reading_c)
             return True
 
-        # Interaction step of the IMM filter [1]: each mode starts from a mixture of both modes.
+        # Interaction step of the multiple-model filter [1]: each mode starts from a mixture of
+        # both modes.
         to_bending = dt / (dt + SOAK_S)
         to_quiet = dt / (dt + lag)
         bending = self.bending
@@ -165,7 +168,8 @@ class Thermometer:
                 reading_c, expected, variance, rate * dt, bent[6] * dt * dt
             )
 
-        # Update each mode, and the probability of the bending mode by both innovations.
+        # Update the filter of each mode, and the probability of the bending mode by both
+        # innovations.
         if noise < inf:
             quiet, innovation, s = correct(quiet, measured, noise)
             bent, bent_innovation, bent_s = correct(bent, measured, noise)
@@ -259,8 +263,8 @@ class Thermometer:
         half = 0.5 * self._quantum
         noise = self._noise
         if variance < 4.0 * noise:
-            # The prior is narrower than the noise: match the moments of the prior truncated to the
-            # cell, so that readings that flicker about an edge locate this edge.
+            # If the prior is narrower than the noise, match the moments of the prior truncated to
+            # the cell, so that readings that flicker about an edge of a cell locate the edge.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
@@ -281,7 +285,7 @@ class Thermometer:
         if jump > half:
             edge = 0.5 * (reading + self.reading) + 0.5 * move
             return edge, min(noise + (move * move + 4.0 * var_move) / 12.0, self._flat)
-        # A repeated reading has no new information: the cell only bounds the variance. An estimate
+        # A repeated reading has no new information: its cell only bounds the variance. An estimate
         # outside the cell is measured to be at the edge, once per time in which the temperature
         # changes by one sd.
         if abs(expected - reading) > half:

@@ -21,7 +21,7 @@ from .thermometer import Thermometer
 
 #: Relative sd of the gradient that is estimated from the board's rate while a sensor is lost.
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
-#: Time without a reading / thermal lag, after which the regime is unknown.
+#: Time without a reading after which the regime is unknown, as a share of the thermal lag.
 UNWATCHED_SHARE: Final = 0.25
 
 
@@ -41,14 +41,14 @@ class ThermalTracker:
         self.board = Thermometer(detector.board)
         beside = {name: Thermometer(detector.case) for name in self.spec.sensors}
         self.thermometers = {BOARD_INPUT: self.board, **beside}
-        #: The leading sensor: the first one beside the board.
+        #: The leading sensor is the first sensor beside the board.
         self.case = beside[self.spec.sensors[0]]
         self.checks = {
             BOARD_INPUT: SensorCheck(self.board, self.case, board_lag_s),
             **{name: SensorCheck(sensor, self.board, 0.0) for name, sensor in beside.items()},
         }
         self.memory = ThermalMemory(self.spec)
-        #: Stamp of the newest reading that was used, None before the first.
+        #: Stamp of the newest reading that was used; None before the first reading.
         self.updated_ns: int | None = None
         self._decided_ns: int | None = None
         self._weight = 0.0
@@ -130,7 +130,8 @@ class ThermalTracker:
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
-            # A sensor whose readings stay at the new value for long enough starts again.
+            # After a step, a sensor whose readings stay at the new value for long enough starts
+            # again.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             is_board = sensor is self.board
             patience_s = self.config.temperature_timeout_s if is_board else self._case_timeout_s
@@ -185,8 +186,8 @@ class ThermalTracker:
         """
         Thermal state at a stamp as a flat tuple, in the order of `state.Layout`; the board must
         have at least one reading. The variance of a gradient is that of the sensor, without the
-        variance of the board temperature; the variance of a lag does not include that of its
-        unknown initial state.
+        variance of the board temperature; the variance of a lag does not include the variance of
+        the lag's unknown initial state.
         """
         board, rate, var_board = self.board.at(stamp_ns)
         decided_ns = self._decided_ns
@@ -232,7 +233,9 @@ class ThermalTracker:
         return gradient, variance
 
     def is_settled(self, stamp_ns: int) -> bool:
-        """Whether the unknown temperatures before the start no longer affect the memory."""
+        """
+        Whether the effect of the unknown temperatures before the start on the memory has decayed.
+        """
         layout = Layout(self.spec)
         extra = self.sample(stamp_ns)[layout.variances][layout.lag_pairs]
         start = start_covariance(self.spec.lags).diagonal().tolist()

@@ -3,8 +3,8 @@
 """
 Owns the Calibration value of one unit, validated as a whole.
 
-The dataclasses mirror the calibration file key by key. The object is immutable, so a running node
-replaces it by one assignment.
+The dataclasses mirror the calibration file key by key. A Calibration is immutable, so a running
+node replaces it by a single assignment.
 
 Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
 (0..1), and phi_j the columns of the thermal response (`columns`), common to both sets (Eq. (6) to
@@ -77,7 +77,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class AxisReference:
-    """One axis at the reference temperature."""
+    """The constants of one axis at the reference temperature."""
 
     scale_factor: Annotated[float, 'K: input units per m/s^2 at the reference temperature.']
     bias: Annotated[float, 'dNs(0): zero offset at the reference temperature, in input units.']
@@ -93,7 +93,7 @@ class AxisReference:
 
 @dataclass(frozen=True)
 class Axes:
-    """The three axes at the reference temperature."""
+    """The constants of the three axes at the reference temperature."""
 
     x: AxisReference
     y: AxisReference
@@ -370,7 +370,7 @@ def rate_triad(calibration: Calibration) -> Calibration:
 
 
 def gyroscope_of(triad: Calibration) -> Gyroscope:
-    """Take the gyroscope out of a triad whose scale is 1."""
+    """Make a gyroscope from a triad whose scale is 1."""
     x, y, z = (axis.bias for axis in triad.axes)
     static, dynamic = (
         RateSet(*(RateCurve(axis.bias_function, axis.delta) for axis in regime_set.axes()))

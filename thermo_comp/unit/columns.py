@@ -18,7 +18,7 @@ cube: with the curve they sum up to the curves over the temperatures of parts.
 *gradient_even_about_rest* has the columns of *gradient_even* as functions of the gradient less its
 value at rest.
 
-Tracker, fit, correction, covariance and file use this table.
+Tracker, fit, correction, covariance and calibration file use this table of columns.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,7 +37,7 @@ from .functions import hold
 from .schema import check_ranges
 from .terms import GROUPS, LINE, TERMS, Term
 
-#: A column range that limits no value.
+#: A range of a column that limits no value.
 UNBOUNDED: Final = (-1e9, 1e9)
 #: Time constants of the bank [s], in ratios of sqrt(2), from a few readings to the longest lag
 #: that bags determine. Linear lags use all time constants of the bank, so that sums of lags
@@ -56,7 +56,7 @@ BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
-# The names of groups and kinds, as the schema of the file reads them.
+# The names of groups and kinds, as the schema of the calibration file reads them.
 if TYPE_CHECKING:
     _Group: TypeAlias = str
     _Kind: TypeAlias = str
@@ -70,7 +70,7 @@ class Part(NamedTuple):
     The lag of a part of the unit behind the board, by the keys of a column.
 
     tau_s, second_tau_s: time constants of its two stages [s]; the second is 0 for one stage
-    sensor_share: the part lags the board temperature plus this share of the gradient of the sensor
+    sensor_share: the part lags the board temperature plus this share of the sensor's gradient
     """
 
     tau_s: float
@@ -175,8 +175,8 @@ def bank(
 ) -> tuple[Column, ...]:
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
-    of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K],
-    `parts` the only lags, those of the part of each axis.
+    of each sensor at rest [K], `span_k` the range of temperatures in the data, from the reference
+    [K]; with `parts`, the lags of the part of each axis, there are no other lags.
     """
     fine, coarse, of_plays, of_bends = (
         list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
@@ -228,7 +228,7 @@ def _family(
     lags: Sequence[Part] = (Part(0.0),),
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
-    """Return the columns of a group with all combinations of the properties."""
+    """Return the columns of a group with all combinations of the given keys' values."""
     return [
         Column(
             *(group, kind, sensor, *part, width),
@@ -262,7 +262,9 @@ _DURING: Final = ('always', 'static', 'dynamic')
 
 
 class ColumnTable:
-    """Columns over states (width, n), each state evaluated alone; results have (n_columns, n)."""
+    """
+    Evaluates columns at thermal states (width, n), each state alone; results: (n_columns, n).
+    """
 
     def __init__(
         self,

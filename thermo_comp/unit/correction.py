@@ -3,11 +3,11 @@
 """
 Owns the arithmetic of the correction: bias, scale and error variances from thermal states.
 
-States are columns, shape (width, n), of the numbers that `thermal.state` lays out; one state is
-n = 1. Sums run in a fixed order and each state is evaluated alone, so a stream and a batch get the
-same bits. Results for three axes stand in rows: the bias of x, y, z, then the scale of x, y, z.
-The notation is that of `calibration`; x is the specific force of an axis before the misalignment,
-and the error variance of x is ``v(x) = a + b x + c x^2`` [m^2/s^4].
+Thermal states are columns, shape (width, n), of the numbers that `thermal.state` lays out; for a
+single state n = 1. Sums run in a fixed order and each state is evaluated alone, so a stream and a
+batch get the same bits. Results for three axes stand in rows: the bias of x, y, z, then the scale
+of x, y, z. The notation is that of `calibration`; x is the specific force of an axis before the
+misalignment, and the error variance of x is ``v(x) = a + b x + c x^2`` [m^2/s^4].
 """
 
 from collections.abc import Sequence
@@ -30,13 +30,13 @@ from .nonlinearity import ForceCorrection
 #: the blending is lengthened for this, up to a number of transition times.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
-#: Number of board temperatures at which curves and differences of the sets are evaluated.
+#: Number of board temperatures at which curves and differences of the two sets are evaluated.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
 #: cycle.
 ROUNDING_VARIANCE = 1.0 / 6.0
-#: Smallest noise variance of a message / largest variance of any axis: keeps the covariance
-#: positive definite in spite of rounding; far below the noise of any instrument.
+#: Smallest noise variance of a message / largest variance of any axis: this minimum keeps the
+#: covariance positive definite in spite of rounding, and is far below the noise of any instrument.
 _LEAST_SHARE = 1e-13
 #: Largest number accepted in a result of `Correction.line`: with smaller numbers the corrected
 #: samples do not overflow.
@@ -106,11 +106,13 @@ class Correction:
         if calibration.nonlinearity is not None:
             self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
             self.misalignment += self.of_force.constants
-        #: Number of rows of the slow part of the variance.
+        #: Number of rows of the slow part of the error variance.
         self.n_slow = 9 if self.of_force is None else 24
 
     def _find_felt(self) -> None:
-        """Find the columns that depend on each quantity whose variance is propagated."""
+        """
+        Find the columns that depend on each quantity of the state whose variance is propagated.
+        """
         self.layout = layout = Layout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
@@ -134,7 +136,7 @@ class Correction:
     def _weigh(self, columns: Floats, start: Floats) -> Floats:
         """Add ``W @ columns`` to initial values, shape (6, n), column by column."""
         if columns.shape[1] > _FEW:
-            # The same sums without a table of intermediate values.
+            # With many states the sums are computed without a table of intermediate values.
             total: Floats = start.copy()
             for weights, column in zip(self._W.swapaxes(0, 1), columns, strict=True):
                 total += weights * column
@@ -153,7 +155,7 @@ class Correction:
         return min(max(given_s, largest / GENTLE_RATE), LONGEST_TRANSITION * given_s)
 
     def excess(self, state: Sequence[float], *, is_dynamic: bool) -> Excess:
-        """Return the distance of a state outside the calibrated ranges."""
+        """Return how far a thermal state is outside the calibrated ranges."""
         states = np.array(state)[:, np.newaxis]
         over, too_fast, relative = (row[:, 0].tolist() for row in self.curves.excess(states))
         weight = state[WEIGHT]
@@ -187,12 +189,14 @@ class Correction:
         noise_excess: npt.ArrayLike,
     ) -> Floats:
         """
-        Evaluate the correction of segments as linear in time between states at both ends.
+        Evaluate the correction of segments, linear in time between the thermal states at both
+        ends.
 
-        `slow` is the slow part of a, b, c by axis, shape (9, n). Returns by axis bias and its
-        change over the segment, scale and its change, then by axis a, b, c with the noise of a
-        message: (21,) or (21, n). With a nonlinearity `slow` has 15 more rows and the result 21
-        more, see `ForceCorrection.rows`.
+        `slow` is the slow part of the error variance's coefficients a, b, c by axis, shape (9, n).
+        Returns by axis bias and its change over the segment, scale and its change, then by axis
+        the coefficients a, b, c of the error variance with the noise of a message: (21,) or (21,
+        n). With a nonlinearity `slow` has 15 more rows and the result 21 more, see
+        `ForceCorrection.rows`.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -241,7 +245,7 @@ class Correction:
         slow: Floats,
     ) -> Floats:
         """
-        Evaluate a, b, c of each axis, shape (3, 3, n), without the noise of a message.
+        Evaluate a, b, c of each axis' error variance, (3, 3, n), without the noise of a message.
 
         The difference of the two sets (`gap`) is added as an error while the sets are blended,
         outside the ranges, and while the regime is unknown; while it is unknown the variances of
@@ -279,8 +283,8 @@ class Correction:
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
             v += self._spread(np.concatenate((bent, bent)), bends)
-            # The posterior holds within the calibrated ranges: the variance grows with the
-            # distance from them.
+            # The posterior holds within the calibrated ranges, so the variance grows with the
+            # distance outside.
             v *= (1.0 + (outside + columns_out) ** 2)[:, np.newaxis]
         doubt = unknown + weight * static_weight + outside * outside
         if not (is_beyond or doubt.any()):

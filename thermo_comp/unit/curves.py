@@ -21,10 +21,10 @@ class Curves:
     Bias and scale of both sets as functions of the board temperature; the static set is row 0 of a
     result.
 
-    Where only one set's range ends, the difference of the two sets is held. Beyond both ranges the
-    curves continue along their tangent at the edge for `TANGENT_SPANS` of the span, and are
-    constant from there on; a set whose range ends earlier than that of the other set follows the
-    tangent of the other set.
+    Where the range of only one set ends, the difference of the two sets is held constant. Beyond
+    both ranges the curves continue along their tangent at the edge for `TANGENT_SPANS` of the
+    span, and are constant from there on; a set whose range ends earlier than that of the other set
+    follows the tangent of the other set.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -105,7 +105,7 @@ class Curves:
         ]
 
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return the distances along the lower and the upper tangent of each set [K], (2, n)."""
+        """Return how far each set follows its lower and its upper tangent [K], (2, n)."""
         (lower, upper), (below, above) = self._ends, self._reaches
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
@@ -128,7 +128,9 @@ class Curves:
         return result
 
     def slopes(self, board: Floats) -> Floats:
-        """Differentiate the result of `values` by the board temperature [per K], (2, 6, n)."""
+        """
+        Differentiate the bias and scale of both sets by the board temperature [per K], (2, 6, n).
+        """
         held = hold(board - self._reference, *self._t_range)
         return self._functions.evaluate(held, 'slope')
 

@@ -3,10 +3,10 @@
 """
 Owns a function of temperature: polynomial, cubic spline or exponential, normalised at t = 0.
 
-A single ``t = T_board - T_ref`` [K] gives the bits of a batch: the code uses only ``+ - * /`` in a
-fixed order, and `math.exp` number by number. Each function is linear in its free coefficients, so
-`basis` gives the regressors of the fit and of the parameter covariance (Eq. (9) and (10) of the
-paper).
+A single ``t = T_board - T_ref`` [K] gives the same bits as an array: the code uses only ``+ - *
+/`` in a fixed order, and `math.exp` number by number. Each function is linear in its free
+coefficients, so `basis` gives the regressors of the fit and of the parameter covariance (Eq. (9)
+and (10) of the paper).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class _Family(ABC):
     @property
     @abstractmethod
     def free_coefficients(self) -> tuple[float, ...]:
-        """The free coefficients, in the order of `basis`."""
+        """The free coefficients of the function, in the order of `basis`."""
 
     @property
     def n_free(self) -> int:
@@ -90,7 +90,7 @@ class Polynomial(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """All coefficients except the value at the reference temperature."""
+        """All coefficients of the polynomial except the value at the reference temperature."""
         return self.coefficients[1:]
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Polynomial:
@@ -106,7 +106,7 @@ class Polynomial(_Family):
         return tuple(k * c for k, c in enumerate(self.coefficients))[1:] or (0.0,)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives with respect to the free coefficients: t, t^2, ..."""
+        """Evaluate the derivatives of the polynomial by its free coefficients: t, t^2, ..."""
         return list(np.multiply.accumulate([np.asarray(t)] * self.n_free)) if self.n_free else []
 
 
@@ -138,7 +138,9 @@ class CubicSpline(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """The values at all knots except t = 0 (the reference), less the value at t = 0."""
+        """
+        The values of the spline at all knots except t = 0 (the reference), less that at t = 0.
+        """
         at = self.knots_k.index(0.0)
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
@@ -161,7 +163,7 @@ class CubicSpline(_Family):
         return self._along(self._pieces, t, is_slope=is_slope)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives with respect to the free values: the cardinal splines."""
+        """Evaluate the derivatives of the spline by its free values: the cardinal splines."""
         return [self._along(pieces, np.asarray(t)) for pieces in self._cardinal_pieces]
 
     def _along(self, pieces: Floats, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -202,7 +204,7 @@ class Exponential(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """The amplitudes (the e-folds give the shape)."""
+        """The amplitudes of the exponentials, whose e-folds are fixed."""
         return self.amplitudes
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Exponential:
@@ -217,7 +219,7 @@ class Exponential(_Family):
         return np.asarray(result)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives with respect to the amplitudes at a fixed reference value."""
+        """Evaluate the derivatives by the amplitudes, for a fixed value at the reference."""
         return [by_element(math.exp, t / e_fold) - 1.0 for e_fold in self.e_fold_k]
 
 
@@ -270,13 +272,13 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
 
 
 def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:
-    """Differentiate the result of `basis` by the temperature, at `t` [per K]."""
+    """Differentiate the functions of `basis` by the temperature, at `t` [per K]."""
     units = np.eye(function.n_free).tolist()
     return [float(function.with_free(tuple(unit), 0.0).slope(t)) for unit in units]
 
 
 def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
-    """Return ``a, b, c, d`` of ``a + b h + c h^2 + d h^3``, h from the left knot, (4, n - 1)."""
+    """Return ``a, b, c, d`` of a spline's ``a + b h + c h^2 + d h^3``, h from the left knot."""
     # The tridiagonal system of the spline is solved with numpy: the node must not import scipy.
     y, h = np.asarray(values), np.diff(np.asarray(knots))
     slopes = np.diff(y) / h

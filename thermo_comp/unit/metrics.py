@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns statistics of residuals: corrected - true, and ``|f| - g``, which needs no attitude."""
+"""
+Owns statistics of residuals: corrected less true force, and ``|f| - g``, which needs no attitude.
+"""
 
 from dataclasses import dataclass
 
@@ -20,7 +22,7 @@ class ResidualStatistics:
 
 
 def residual_statistics(residual: Floats) -> ResidualStatistics:
-    """Summarise residuals, shape (n,); those that are not finite are left out."""
+    """Summarise residuals, shape (n,); residuals that are not finite are left out."""
     values = residual[np.isfinite(residual)]
     if not len(values):
         return ResidualStatistics(0, np.nan, np.nan, np.nan)

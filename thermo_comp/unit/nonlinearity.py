@@ -70,7 +70,7 @@ class Nonlinearity:
     The nonlinearity of the three axes.
 
     Beyond the forces of the fit the polynomials continue, and the covariance is increased by an
-    unknown square term from the edge on, with the sd `beyond_sd_g_g2`.
+    unknown square term that begins at the largest force, with the sd `beyond_sd_g_g2`.
     """
 
     force_range_m_s2: Annotated[
@@ -118,8 +118,8 @@ def unit_of(kind: Kind) -> float:
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
     Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
-    error of the result is (k2^2 + k3) times the cube of the correction: at 10 g 1e-14 g with 100
-    ug/g^2, 1e-11 g with 10 ug/g^3.
+    error of the result is (k2^2 + k3) times the cube of the correction: at 10 g it is 1e-14 g with
+    k2 = 100 ug/g^2, and 1e-11 g with k3 = 10 ug/g^3.
     """
     r = k3 * x * x
     s = k2 * x + kq * abs(x) + r
@@ -130,7 +130,7 @@ def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
 def corrected_nonlinear(
     line: Iterable[Real], constants: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
-    """Correct a sample like `online.compensator.corrected`, for an axis with a nonlinearity."""
+    """Correct a sample as `online.compensator.corrected` does, for axes with a nonlinearity."""
     (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
      ax, lx, qx, ay, ly, qy, az, lz, qz,
      k2x, kqx, k3x, dx, ex, fx, gx, k2y, kqy, k3y, dy, ey, fy, gy,
@@ -223,7 +223,8 @@ class ForceCorrection:
 
         `rows`, `rest`: factor of the covariance of the coefficients (2 k, rank), and variances
         added to it; `on_bias`, `on_scale`: factors of bias and relative scale, (rank,). The
-        covariances of |f| f with other parameters are omitted, which overstates the variance.
+        covariances of the coefficient of |f| f with other parameters are omitted, which overstates
+        the variance.
         """
         kinds = [term.kind for term in self._of.terms]
         n = len(kinds)

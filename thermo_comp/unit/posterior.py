@@ -57,7 +57,7 @@ class Posterior:
 
     @cached_property
     def matrix(self) -> Floats:
-        """The factor, shape (n_parameters, rank)."""
+        """The factor of the covariance, shape (n_parameters, rank)."""
         return _decoded('factor', self.factor).reshape(self.n_parameters, self.rank)
 
     @cached_property
@@ -81,8 +81,9 @@ class Posterior:
 
 class Block(NamedTuple):
     """
-    Indices of the parameters of an axis' bias or scale. `static`, `dynamic`: level of the set,
-    followed by its function's coefficients; `response` to `end` (exclusive): weights.
+    Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
+    level of the set, followed by its function's coefficients; `response` to `end` (exclusive):
+    weights.
     """
 
     static: int
@@ -99,7 +100,7 @@ class Block(NamedTuple):
 def lay_out(
     pairs: Iterable[tuple[TemperatureFunction, TemperatureFunction]], n_columns: int
 ) -> list[Block]:
-    """List the consecutive blocks of pairs of a static and a dynamic function."""
+    """List the blocks of parameters for pairs of a static and a dynamic function."""
     blocks = [Block(0, 0, 0, 0)]
     for static, dynamic in pairs:
         begin = blocks[-1].end
@@ -124,7 +125,7 @@ class ParameterLayout(NamedTuple):
 
     @property
     def force(self) -> list[slice]:
-        """The coefficients of the nonlinear terms of each axis."""
+        """Indices of the coefficients of the nonlinear terms of each axis."""
         n = (self.misalignment - self.nonlinear) // 3
         return [slice(first, first + n) for first in (self.nonlinear + n * k for k in range(3))]
 

@@ -49,8 +49,9 @@ class SlowUncertainty:
 
     def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[float]:
         """
-        Evaluate a, b, c of each axis at one state: ``v(x) = a + b x + c x^2`` [m^2/s^4]; with a
-        nonlinearity then its contribution to the coefficients of x^2 to x^6 of each axis.
+        Evaluate a, b, c of each axis' error variance ``v(x) = a + b x + c x^2`` [m^2/s^4] at one
+        thermal state; with a nonlinearity then its contribution to the coefficients of x^2 to x^6
+        of each axis.
         """
         states = np.array(state)[:, np.newaxis]
         table = self._correction.table
@@ -146,14 +147,14 @@ def nonlinear_coefficients(calibration: Calibration) -> list[Coefficients]:
 
 
 def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
-    """Evaluate bias [m/s^2] and scale [input units per m/s^2] at states, shapes (n, 3)."""
+    """Evaluate bias [m/s^2] and scale [input units per m/s^2] at thermal states, shapes (n, 3)."""
     correction = Correction(calibration)
     bias, scale = correction.bias_scale(states.T)
     return (bias / correction.K).T, scale.T
 
 
 def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
-    """Predict the sd of the bias [m/s^2] and of the relative scale at states, shapes (n, 3)."""
+    """Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3)."""
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
     forgotten = [0.0] * len(correction.memory.lags)
@@ -172,7 +173,9 @@ def ramp_states(
     rate: float = 0.0,
     lasted_s: Floats | float = 0.0,
 ) -> Floats:
-    """Build states (n, width) of a ramp that has lasted for `lasted_s` [s] at `rate` [K/s]."""
+    """
+    Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s].
+    """
     layout = Layout(Correction(calibration).memory)
     states = np.zeros((len(temperature), layout.width))
     states[:, BOARD], states[:, WEIGHT] = temperature, float(rate != 0.0)

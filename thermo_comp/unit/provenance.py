@@ -15,7 +15,7 @@ _WeightSd = Annotated[float, QUANTITIES['deviation of a weight']]
 
 @dataclass(frozen=True)
 class GroupEvidence:
-    """Contribution of one group of columns to the fit."""
+    """Contribution of one group of columns to the correction of a fit."""
 
     group: Annotated[str, 'Name of the group, as in the key `response`.']
     part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']

@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale: samples in an offset code have a bias of half their range.
 FULL_SCALES = 2.0
-#: Largest effect of a column or of a parameter's uncertainty / largest bias.
+#: Largest accepted effect of a column or of a parameter's uncertainty / largest bias.
 WORST = 1e6
-#: Number of temperatures at which a function is checked.
+#: Number of temperatures at which a function of temperature is checked.
 _GRID = 513
-#: Distance beyond the range of a function up to which the function is checked.
+#: Part of the error messages: the temperatures over which a function is checked.
 _AROUND = f'and along its tangents, {TANGENT_SPANS:g} of the range on each side'
 
 

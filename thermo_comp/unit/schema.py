@@ -5,8 +5,8 @@ Owns the conversion of plain values to dataclasses and back: type hints are a fi
 
 Hints are float, int, bool, str, Literal, tuple, dataclass, any of them or None, and
 ``Annotated[hint, Bounds(...), 'what it means']``. The only conversions are integer to float and
-list to tuple. Rules between keys belong to the dataclass: it raises a ValueError that starts with
-the key in backticks.
+list to tuple. Rules between keys belong to the dataclass, which raises a ValueError that starts
+with the key in backticks.
 """
 
 import dataclasses
@@ -64,7 +64,7 @@ def plain(value: Any) -> Any:
     """Turn dataclasses and tuples into mappings and lists: the reverse of `build`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         items = {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        # `kind` selects the schema of the other keys, so it stands first.
+        # The key `kind` selects the schema of the other keys, so it is written first.
         return {'kind': items.pop('kind'), **items} if 'kind' in items else items
     return [plain(item) for item in value] if isinstance(value, tuple) else value
 
@@ -117,7 +117,7 @@ def _object(cls: type, data: Any, key: str) -> Any:
     if not isinstance(data, dict):
         _refuse(key, 'must be a mapping of keys', data)
     hints, required = fields_of(cls)
-    # A misspelt key is both unknown and missing; report the unknown name.
+    # A misspelt key is both an unknown and a missing key; the unknown key is reported.
     for name in data:
         if name not in hints:
             raise SchemaError(_joined(key, _shown_name(name)), 'unknown key')

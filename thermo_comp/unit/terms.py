@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function and its derivative; the bits of a result depend on its own x alone."""
+    """A function and its derivative; the bits of a result depend on one x alone."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -43,7 +43,7 @@ _CLASSES: Final[list[type[Term]]] = []
 
 
 class Term(ABC):
-    """A kind of regressor, for tracker, fit, correction, covariance, limits, file, certificate."""
+    """The base class of the kinds of regressors."""
 
     kind: ClassVar[str]  # name of the kind in the calibration file
     formula: ClassVar[str]  # formula of the value, for the description of the file
@@ -110,7 +110,7 @@ class Gradient(Term):
 
 
 class Rate(Term):
-    """Heat flow, estimated from one thermometer."""
+    """Effect of a heat flow, estimated from one thermometer."""
 
     kind, formula = 'rate', 'dT_board/dt [K/s]'
     groups = (('rate', 'rate of the board'),)
@@ -121,7 +121,7 @@ class Rate(Term):
 
 
 class Board(Term):
-    """Parts that lag the board."""
+    """Effect of parts that lag the board."""
 
     kind, formula = 'board', 'T - lagged T'
     positive: ClassVar[_Names] = ('tau_s',)
@@ -138,7 +138,7 @@ class Board(Term):
 
 
 class GradientLag(Term):
-    """Parts between the thermometers."""
+    """Effect of parts between the thermometers."""
 
     kind, formula, positive = 'gradient_lag', 'lagged g_s', ('tau_s',)
     groups = (
@@ -208,7 +208,7 @@ class Play(Term):
 
 
 class Bend(Board):
-    """A slope that changes at one temperature of a part."""
+    """A curve whose slope changes at one temperature of a part."""
 
     kind, formula, positive = 'bend', 'max(t - knee_k, 0), of t lagged', ()
     groups = (('bend', 'change of slope'),)
