@@ -110,7 +110,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     model = model_of(bags, options, parts.lags)
     of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
     fit = regress(of_parts, problem)
-    # The noise estimated by the fit includes the error of the lags; `parts.noise` does not.
+    # The white noise estimated by the fit includes the error of the lags, unlike `parts.noise`.
     if fit.selected.score.rms > 2.0 * parts.noise:
         with_bank = regress(windows, problem)
         if is_better(fit.selected.score, with_bank.selected.score):
@@ -122,8 +122,8 @@ def _may_have_sets(selected: Selected) -> bool:
     """
     Whether the chosen model has two sets, or a model with two sets is similarly good.
 
-    A model is similarly good if its left-out error is within one standard error of that of the
-    chosen model, and its white noise is less than 80 % of that of the chosen model, on every axis.
+    A model is similarly good if its left-out error is within one standard error of the chosen
+    model's error, and its white noise is less than 80 % of the chosen model's noise on every axis.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -135,7 +135,9 @@ def _may_have_sets(selected: Selected) -> bool:
 
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Name the case thermometer, then all others, except the board's, that every bag has."""
+    """
+    Name the case thermometer, then all other thermometers, except the board's, that every bag has.
+    """
     seen = (
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the design of positions: their directions, the covariance that they give, the next direction.
+Owns the design of a test's positions: directions, resulting covariance of the constants, next
+direction.
 
 At rest |f| = g is known, so each position gives one equation for the nine constants of a triad:
 bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. With equations
@@ -66,8 +67,8 @@ def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
     Find the direction in which a position of noise `sd` [g] most lowers the mean variance.
 
     Faces of a cube, which are the easiest to hold, are preferred if their gain is at least half of
-    the largest, then edges, then corners. Directions closer than 20 degrees to one of `seen`,
-    shape (n, 3), are not proposed.
+    the largest, then edges, then corners. Directions closer than 20 degrees to a direction in
+    `seen`, shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -91,7 +92,7 @@ def farthest(up: Floats) -> tuple[Floats, float]:
 
 
 def distinct_directions(up: Floats) -> Floats:
-    """Return the unit vectors, shape (n, 3), without those close to an earlier one."""
+    """Return the unit vectors, shape (n, 3), without vectors close to an earlier vector."""
     kept: list[Floats] = []
     limit = np.cos(np.radians(SAME_DIRECTION_DEG))
     for direction in up:
@@ -154,7 +155,7 @@ def best_rests(candidates: list[Floats]) -> int:
     Return the best of several sets of rests, each given as mean readings of shape (n, 3).
 
     The best set has the smallest sd of the constants, from the residuals of |f| and the directions
-    of its rests. The first set, which has the strictest thresholds, is taken unless another is
+    of its rests. The first set, which has the strictest thresholds, is taken if no other set is
     better by 2 %, or if no set has six attitudes.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
@@ -214,7 +215,7 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
     layout, axes = parameter_layout(calibration), calibration.axes
     levels = [block.static for block in (*layout.bias, *layout.scale)]
     places = [*levels, *range(layout.misalignment, layout.misalignment + 3)]
-    # A bias or scale that is too large makes the corrected force too small.
+    # A calibrated bias or scale that is too large makes the corrected force too small.
     unit = np.array([-1.0 / axis.scale_factor for axis in (axes.x, axes.y, axes.z)])
     unit = np.concatenate((unit, np.repeat((-1.0, 1.0), 3) * calibration.gravity_m_s2))
     covariance = calibration.posterior.covariance()[np.ix_(places, places)] * np.outer(unit, unit)

@@ -4,8 +4,8 @@
 Owns the elimination of the unknowns of positions and bags from the normal equations.
 
 Each position has unknowns (attitude, offsets, tilts) that occur in no other position; they are
-eliminated first, then the initial lag states of each bag. Normal equations for the unknowns of the
-unit remain.
+eliminated first, then the initial lag states of each bag. After the elimination, normal equations
+for the unknowns of the unit remain.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ class Blocks:
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
         """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        # `numpy.linalg.inv` of all factors at once is slower: it does not use their zeros.
+        # `numpy.linalg.inv` of all factors at once is slower, because it does not use that the
+        # factors are triangular.
         root = np.stack([dtrtri(factor.T)[0].T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)
 
@@ -99,7 +100,7 @@ class Blocks:
 
     @property
     def log_determinant(self) -> float:
-        """Sum of the log determinants of the blocks."""
+        """Sum of the log determinants of the eliminated blocks."""
         return -2.0 * float(np.log(np.einsum('nii->ni', self.root)).sum())
 
 
@@ -130,12 +131,12 @@ class Reduced:
 
     @property
     def whole(self) -> Floats:
-        """The matrix with the prior on the sum of the initial lag states."""
+        """The Hessian including the prior on the sum of the initial lag states."""
         return self.matrix if self.common is None else self.matrix + _square(self.common.turned)
 
     @property
     def log_determinant(self) -> float:
-        """Sum of the log determinants of all blocks."""
+        """Sum of the log determinants of all eliminated blocks."""
         blocks = [self.positions, self.bags, *([self.common] if self.common else [])]
         return sum(block.log_determinant for block in blocks)
 
@@ -149,7 +150,9 @@ class Reduced:
         return replace(self, common=Blocks.of(block, cross))
 
     def follow(self, step: Floats) -> tuple[Floats, Floats]:
-        """Return the steps of the unknowns of positions and bags, given the step of the unit's."""
+        """
+        Return the steps of the unknowns of positions and bags, given that of the unit's unknowns.
+        """
         r, solved = len(self.bags.root[0]), self.positions.solved
         starts = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
         if self.common is not None:
@@ -189,7 +192,7 @@ class Reduced:
 
     def beside(self, rows: Floats) -> tuple[Floats, Floats]:
         """
-        Carry out the elimination for further unknowns of the unit, m of each axis.
+        Eliminate positions and bags from the equations of further unknowns, m of each axis.
 
         `rows`: normal equations of the further unknowns with the unknowns of the fit and the
         residual, shape (n_positions, 3, m, k + 1). Returns what the elimination subtracts from the

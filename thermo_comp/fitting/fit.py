@@ -83,7 +83,9 @@ def fit(
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
-    """Reduce a source to its sufficient statistics; FitError if it has no still interval."""
+    """
+    Reduce a source to its sufficient statistics; FitError if the source has no still interval.
+    """
     bag = reduce_source(
         source,
         min_rest_s=options.min_rest_s,
@@ -101,7 +103,7 @@ def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
 def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
-    """Fit a calibration to bags that have been reduced; FitError if they contradict themselves."""
+    """Fit a calibration to reduced bags; FitError if the bags contradict themselves."""
     # The fit multiplies many small matrices, and threads would only slow these products down.
     with threadpool_limits(1, 'blas'):
         return _fit_about_offset(bags, options, progress)
@@ -316,7 +318,8 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     if full_scale == COUNTS_FULL_SCALE and bags[0].is_integer:
         full_scale = widened(full_scale, np.array([[np.rint(largest)]]))
     if full_scale is None:
-        # The smallest usual full scale of sensors in m/s^2 that contains the data.
+        # The full scale is the smallest usual full scale of sensors in m/s^2 that contains the
+        # data.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
     cycle = float(np.median([bag.cycle_s for bag in bags]))

@@ -66,7 +66,7 @@ class Inactive:
 
     def gain(self, column_sd: Floats, wanted: Bools) -> float:
         """
-        Return the gain in log evidence by the `wanted` columns, shape (m,).
+        Return the gain in log evidence by adding the `wanted` columns, shape (m,).
 
         The gain is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, S and q in units of the columns'
         prior sd, shape (2, m), at the best common factor of this sd.
@@ -78,7 +78,7 @@ class Inactive:
 
     def chosen(self, column_sd: Floats, wanted: Bools, least: float, most: int) -> Bools:
         """
-        Choose up to `most` of the wanted columns by forward selection, shape (m,).
+        Choose up to `most` of the `wanted` columns, shape (m,), by forward selection.
 
         The next column is that with the largest gain in log evidence given the columns chosen
         before; the selection ends when this gain is below `least`.

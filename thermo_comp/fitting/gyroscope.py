@@ -4,10 +4,10 @@
 Owns the fit of the gyroscope: the angular rate at rest, with the columns of the accelerometer.
 
 A gyroscope at rest measures the component of the Earth's rate in its attitude, plus a bias that
-changes at each turn-on. Each position has one constant offset as an unknown. Changes of the rate
-within a position determine the effect of temperature; its mean over the positions determines the
-constant bias. The regression is that of the accelerometer with gravity 0, in rad/s in place of
-m/s^2.
+changes at each turn-on. The regression has one constant offset of the rate in each position as an
+unknown. Changes of the rate within a position determine the effect of temperature; its mean over
+the positions determines the constant bias. The regression is that of the accelerometer with
+gravity 0, in rad/s in place of m/s^2.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def add_gyroscope(
     level = position_means(data)
     up = np.tile((0.0, 0.0, 1.0), (data.n_positions, 1))
     state = regression.initial_state(level.mean(axis=0), np.zeros(3), up)
-    # Sd of the Earth's rate on one axis in an unknown attitude [rad/s].
+    # Sd of the component of the Earth's rate along one axis in an unknown attitude [rad/s].
     earth_sd = EARTH_RATE / math.sqrt(3.0)
     prior = Prior(
         bias_mean=np.zeros(3),

@@ -4,15 +4,16 @@
 Owns the detection of jumps: steps in the reading of a sensor at rest.
 
 The reading of a sensor can step within one sample, if a die relaxes or a part slips. The
-temperature does not step, so no function of temperature describes a jump, and a fit across it
-distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit: the noise
-beside the jump is normal; the norm of the reading changes, which is almost constant in a rotation;
-the gyroscope, if there is one, shows no rotation.
+temperature does not step, so no function of temperature describes a jump, and a fit to data across
+a jump distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit: the
+noise beside the jump is normal; the norm of the reading changes, which is almost constant in a
+rotation; the gyroscope, if there is one, shows no rotation.
 
-After a low-pass filter neighbouring samples have a correlation r, and their slow noise hides a
-step. The differences ``a_i - r a_(i-1)`` are white (generalised least squares for first-order
-noise), and a step within one sample is significant in them. A shock that decays is significant,
-too; therefore the mean levels of the quiet samples before and after the step must also differ.
+If a sensor has a low-pass filter, neighbouring samples have a correlation r, and their slow noise
+hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised least squares
+for first-order noise), so a step within one sample is significant in these differences. A shock
+that decays is also significant; therefore the mean levels of the quiet samples before and after
+the step must differ, too.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from .sources import angular_velocity
 
 # Shortest duration of the readings on either side of a gap that give the level [s].
 _MARGIN_S = 10.0
-# Smallest number of samples on either side of a step.
+# Smallest number of samples on either side of a step that is tested.
 _FEWEST_SAMPLES = 8
 # Smallest significant step, in units of its sd; the search over the place of a step reaches about
 # 5 by chance.
@@ -45,8 +46,8 @@ class Jump:
     duration_s: interval between the samples before and after the step [s]
     step: change of the reading, per axis [input units]
     along: change of the norm, that is, along the specific force [input units]
-    temperature_change, temperature_change_sd: step of the board's readings at that time about a
-        linear drift, and its sd [K]; NaN with too few readings
+    temperature_change, temperature_change_sd: step of the board's readings at the time of the jump
+        about a linear drift, and the step's sd [K]; NaN with too few readings
     """
 
     time: float
@@ -88,7 +89,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
 def _near(
     bag: ReducedBag, gaps: Sequence[tuple[float, float]], margins: Sequence[float]
 ) -> list[Floats]:
-    """Collect the samples beside each gap: time, reading, rate (NaN: none), shape (n, 7)."""
+    """Collect the samples beside each gap: time, reading, angular rate or NaN, shape (n, 7)."""
     parts = [[np.zeros((0, 7))] for _ in gaps]
     for block in bag.source.blocks() if gaps else ():
         time, rate = _seconds(block.accel_stamp_ns, bag.start_ns), angular_velocity(block)
@@ -143,7 +144,8 @@ def _examine(
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # The noise is estimated from differences of neighbours, which do not depend on a drift.
+    # The noise is estimated from differences of neighbouring samples, which do not depend on a
+    # drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
@@ -173,7 +175,7 @@ def _examine(
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
     """
-    Return the sd of a mean, relative to that for white noise of `sd`, per axis, at least 1. The
+    Return the sd of a mean over that for white noise of `sd`, for each axis, at least 1. The
     residuals, shape (n, 3), are averaged to 40 pieces, whose variance is multiplied by (1 + r) /
     (1 - r), r being their lag-1 correlation.
     """

@@ -43,7 +43,7 @@ class Magnitude(NamedTuple):
     """
     The known |f| of a rest [m/s^2], in two parts.
 
-    still: |f| without rotation; None for gravity
+    still: |f| without rotation [m/s^2]; None for gravity
     spin: centripetal acceleration w^2 r at the stated radius
     sd: sd of |f| without the part due to the radius
     """
@@ -60,11 +60,11 @@ class Magnitude(NamedTuple):
 @dataclass(frozen=True)
 class KnownForce:
     """
-    |f| of a bag over time; outside the sections |f| is gravity.
+    The known |f| of a bag over time; outside the sections |f| is gravity.
 
     stamp_ns, rate: readings of the rotation rate [rad/s], about a vertical axis
-    radius, radius_sd: distance of the unit from the axis [m]; the fit estimates it if the sd is
-        above 0
+    radius, radius_sd: distance of the unit from the axis, and its sd [m]; the fit estimates the
+        distance if the sd is above 0
     """
 
     name: str
@@ -81,7 +81,9 @@ class KnownForce:
         return size.spin**2 / size.norm(gravity) * self.radius_sd / self.radius
 
     def of(self, start_ns: int, end_ns: int, first_ns: int) -> Magnitude:
-        """Return |f| of a rest, given its stamps and the stamp of the bag's first sample."""
+        """
+        Return |f| of a rest, given the rest's stamps and the stamp of the bag's first sample.
+        """
         if self.stamp_ns is None or self.rate is None:
             middle_s = (0.5 * (start_ns + end_ns) - first_ns) * 1e-9
             for section in self.sections:
@@ -107,7 +109,7 @@ class AskedForce:
     """
     The user's options about |f|.
 
-    magnitude: a value with unit, or the path of a table
+    magnitude: |f| as a value with unit, or the path of a table
     rotation: topic of the rotation rate, as TOPIC or TOPIC:FIELD
     radius, radius_sd: distance of the unit from the axis and its sd [m]
     """
@@ -130,7 +132,8 @@ def known_force(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForc
     """
     Return the known |f| of a bag, from the user or else from its metadata; None for gravity.
 
-    Raises FitError if the text cannot be parsed, or the topic of the rate has no messages.
+    Raises FitError if the text cannot be parsed, or the topic of the rotation rate has no
+    messages.
     """
     metadata = info.metadata
     try:
@@ -154,7 +157,7 @@ def known_force(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForc
 def parse_sections(text: str) -> tuple[Section, ...]:
     """
     Read a magnitude [m/s^2], or lines of ``BEGIN END MAGNITUDE [SD]``, in seconds since the first
-    sample and m/s^2. A semicolon also ends a line; a # begins a comment.
+    sample and m/s^2. A semicolon also ends a line of the text; a # begins a comment.
     """
     lines = [
         line.split('#')[0].replace(',', ' ').split()
@@ -193,7 +196,9 @@ def _numbers(words: list[str]) -> list[float]:
 
 
 def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
-    """Read a value with unit, or a table from a file; a line may begin with a bag's name."""
+    """
+    Read |f| as a value with unit, or as a table from a file; a line may begin with a bag's name.
+    """
     table = Path(text)
     if not table.is_file():
         return (_section(0.0, math.inf, parse_acceleration(text)),)

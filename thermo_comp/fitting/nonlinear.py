@@ -3,8 +3,9 @@
 """
 Owns |f| that is not 1 g in all positions, and the choice of the nonlinear terms over |f|.
 
-A term that the data determine is removed if it lowers the log evidence, or if it does not improve
-the left-out norms. A term that the data do not determine stays near its prior, with the prior sd.
+A nonlinear term that the data determine is removed if it lowers the log evidence, or if it does
+not improve the left-out norms. A term that the data do not determine stays near its prior, with
+the prior sd.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Forces:
     t: board temperature of each window less the reference, shape (n,) [K]
     still: |f| without rotation; gravity if the unit rotates
     spin: centripetal acceleration w^2 r at the stated radius; 0 without rotation
-    sd: standard deviation of |f| without the part of the radius
+    sd: standard deviation of |f| without the part due to the radius
     radius_sd: relative standard deviation of the radius; 0 if the radius is not estimated
     """
 
@@ -145,8 +146,8 @@ def is_beyond(windows: ThermalWindows) -> bool:
 
 def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
     """
-    Return the prior sd of the coefficients of k terms, then that of their changes per kelvin, 2 %
-    of the former, shape (2 k,).
+    Return the prior sd of the coefficients of k terms, then the prior sd of their changes per
+    kelvin, 2 % of those of the coefficients, shape (2 k,).
     """
     sd = np.array([options.nonlinear_sd(kind) for kind in kinds])
     return np.concatenate((sd, 0.02 * sd))

@@ -4,7 +4,7 @@
 Owns the options of a fit: their checks, local gravity, families of curves.
 
 An error of the local gravity changes all three scale factors by the same ratio and is not visible
-in the residuals, so gravity must be given.
+in the residuals, so the user must state gravity.
 
 References
 ----------
@@ -142,7 +142,7 @@ class FitOptions:
 
     def nonlinear_sd(self, kind: Kind) -> float:
         """
-        Return the prior sd of a nonlinear term [g/g^2; of the cube g/g^3].
+        Return the prior sd of a nonlinear term [g/g^2; for the cube g/g^3].
 
         The defaults are above the limits of quartz pendulums: some 20 .. 60 ug/g^2, some ug/g^3.
         """
@@ -202,7 +202,8 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     # Constants of WGS 84: gravity at the equator, Somigliana's k, eccentricity squared.
     root = math.sqrt(1.0 - 0.00669437999014 * sine2)
     at_ellipsoid = 9.7803253359 * (1.0 + 0.00193185265241 * sine2) / root
-    # WGS 84: semi-major axis, flattening, and m, centrifugal acceleration over equatorial gravity.
+    # Constants of WGS 84: semi-major axis, flattening, and m, the ratio of centrifugal
+    # acceleration to gravity at the equator.
     relative, flattening, m = height_m / 6378137.0, 1.0 / 298.257223563, 0.00344978650684
     slope = 2.0 * (1.0 + flattening + m - 2.0 * flattening * sine2)
     return at_ellipsoid * (1.0 - slope * relative + 3.0 * relative**2)

@@ -7,9 +7,9 @@ The bias and the scale factor of an axis are modelled as functions of ``x = t - 
 temperature of one part of the unit: t is the board temperature less the reference temperature, and
 m = T - L(T + v g) the difference between the board temperature T and that of the part. The part
 lags a temperature between board and case: that of the board plus the share v of the gradient g.
-The lag has one stage or, for a part that is heated through another part, two in series. The time
-constants and v minimise the RMS residual of a spline of the bias and a cubic of the scale factor,
-both over x.
+The lag has one stage or, for a part that is heated through another part, two stages in series. The
+time constants and v minimise the RMS residual of a spline of the bias and a cubic of the scale
+factor, both over x.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
 
 class _PartCurves:
     """
-    Bias and scale factor of each axis as functions of x (see the module), for any lags.
+    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
 
     `rows`: the windows that are used
     """
@@ -175,8 +175,9 @@ class _PartCurves:
         if self._square(best, axis) > enough:
             lags = [self._searched(axis, _in_two_stages(best), (0.2, 0.4, 0.0))]
             if self._has_case:
-                # The residual has a valley of several minima along a constant time constant less
-                # the time by which the temperature between board and case leads the board.
+                # The residual has a valley of several minima, along which this difference is
+                # constant: the time constant less the time by which the temperature between board
+                # and case leads the board.
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
                 for near in (best, min(along, key=lambda lag: self._square(lag, axis))):
                     first = near._replace(tau_s=max(near.tau_s, 15.0))
@@ -243,7 +244,9 @@ class _PartCurves:
         return Part(tau, 0.0, sensor_share) if square(tau) < square(0.0) else Part(0.0)
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
-        """Whether time constants larger, or smaller, by `_STEP` add 5 % to the RMS residual."""
+        """
+        Whether time constants larger or smaller by the ratio `_STEP` add 5 % to the RMS residual.
+        """
         tau, second, share = lag
         others = [Part(ratio * tau, ratio * second, share) for ratio in (1.0 / _STEP, _STEP)]
         if not tau:
@@ -294,7 +297,9 @@ class _PartCurves:
         return self._centred(np.hstack((bias, stress, scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
-        """Subtract the weighted mean over each position; multiply by the root of the weight."""
+        """
+        Subtract the weighted mean over each position from values; multiply by the weights' roots.
+        """
         weighted = np.hstack((values, np.ones_like(self._weight))) * self._weight
         sums = np.add.reduceat(weighted, self._first, axis=0)
         level = sums[:, :-1] / sums[:, -1:]

@@ -4,9 +4,10 @@
 Owns informative priors: an earlier calibration of the unit, or the population of its type.
 
 An informative prior is a calibration: mean and covariance of all parameters form the Gaussian
-prior of the regression, which has the calibration's columns. A population's mean and covariance
-are the mean and the scatter over units of the parameters relative to the scale factors. The
-covariance of an earlier calibration of the unit is increased by the ageing of the unit.
+prior of the regression, which has the calibration's columns. The mean and the covariance of a
+population are the mean and the scatter, over the units, of the parameters relative to the scale
+factors. The covariance of an earlier calibration of the unit is increased by the ageing of the
+unit.
 """
 
 from __future__ import annotations
@@ -99,8 +100,8 @@ def informative_priors(
     """
     Return candidate priors from a calibration, which the fit compares by evidence.
 
-    The last candidate is the widest; the fit begins with it. FitError if the calibration has no
-    covariance.
+    The last candidate is the widest; the fit begins with it. Raises FitError if the calibration
+    has no covariance.
     """
     if calibration.posterior is None:
         raise FitError('the prior has no covariance: an imported calibration cannot be a prior')
@@ -146,7 +147,8 @@ def informative_priors(
         sd = np.sqrt(floor)
         scaled, correlation = to_file / sd[:, None], variances / np.outer(sd, sd)
         # A relative jitter of 1e-6 bounds the correlations of the file's float32 covariance. The
-        # QR factor, not a product, keeps the precision of nearly equal parameters.
+        # QR factor of the covariance's factor, instead of a product, keeps the precision of nearly
+        # equal parameters.
         wider = correlation + (1e-6 + share) * np.eye(len(sd))
         whitened = solve_triangular(np.linalg.cholesky(wider), scaled, lower=True)
         root: Floats = np.asarray(np.linalg.qr(whitened, mode='r'))
@@ -262,7 +264,8 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         return [(shortest, share**column.term.order)]
     if at == len(FINE_TAUS):
         return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
-    # Cubic interpolation over the logarithm of the time constant, by Lagrange's polynomials.
+    # The shares are a cubic interpolation over the logarithm of the time constant, by Lagrange's
+    # polynomials.
     first = min(max(at - 2, 0), len(FINE_TAUS) - 4)
     near = FINE_TAUS[first : first + 4]
     return [

@@ -3,10 +3,10 @@
 """
 Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
 
-The blocks are read once, in bounded memory. Samples are averaged to cells of about half a second
-(see `stillness`), and the cells of a still interval to windows of ten seconds; only the last
-window of an interval is shorter. Within a window every thermal regressor is linear in time to far
-below the noise, so the mean of a window is a sufficient statistic. The noise of the means is
+The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
+second (see `stillness`), and the cells of a still interval to windows of ten seconds; only the
+last window of an interval is shorter. Within a window every thermal regressor is linear in time to
+far below the noise, so the mean of a window is a sufficient statistic. The noise of the means is
 estimated by the regression, because that of a charge-balancing converter is smaller than the
 scatter of its samples implies.
 """
@@ -49,14 +49,14 @@ class Readings(NamedTuple):
 @dataclass(frozen=True)
 class StillInterval:
     """
-    One interval without motion: one position.
+    One interval without motion, that is, one position.
 
     start_ns, end_ns: stamps of the middles of the interval's first and last cell
     begin_s: start of the interval's first window, since the bag's first sample [s]
     n_whole: number of windows of full length; a shorter window may follow
     time, count, mean: mean time [s], number and mean of the samples of each window
-    sample_sd: standard deviation of single samples
-    angular_rate: mean of each window [rad/s]; None if a part of the bag has no rate
+    sample_sd: standard deviation of single samples in each window
+    angular_rate: mean angular rate of each window [rad/s]; None if a part of the bag has no rate
     """
 
     start_ns: int
@@ -170,7 +170,7 @@ def reduce_source(
     least: int = stillness.MIN_SAMPLES,
 ) -> ReducedBag:
     """
-    Stream one source and keep its sufficient statistics.
+    Read one source in blocks and keep its sufficient statistics.
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
@@ -251,7 +251,7 @@ def _with_shorter_cells(
     """
     Reduce a source of slow samples in shorter cells; None if cells of the usual length suffice.
 
-    `share`: the part of the bag at rest in cells of the usual length. Slow samples make cells so
+    `share`: the share of cells of the usual length that are at rest. Slow samples make cells so
     long that a bias which changes within minutes looks like a motion, and that short rests are
     lost.
     """

@@ -5,8 +5,8 @@ Owns the regression: the posterior of all unknowns under a given prior, by Gauss
 
 All unknowns have Gaussian priors (attitudes: flat on the sphere). Gauss-Newton finds the mode; the
 inverse of the Hessian is the covariance. The unknowns of each bag are eliminated first, so the
-information of a bag about the unit is one matrix and one vector, which are subtracted to leave the
-bag out.
+information of a bag about the unit is one matrix and one vector; subtracting these leaves the bag
+out.
 
 References
 ----------
@@ -95,7 +95,7 @@ class Point:
 
     @cached_property
     def away(self) -> Floats:
-        """The unknowns less the mean of the prior, shape (n,)."""
+        """The unknowns of the state less the mean of the prior, shape (n,)."""
         return self.regression.away(self.state, self.prior, self.layout)
 
     @cached_property
@@ -227,8 +227,9 @@ class Point:
         """
         Take Gauss-Newton's step.
 
-        If the step increases the energy, fractions of it are tried in the nonlinear unknowns,
-        which enter as products, and the linear unknowns are solved again for each fraction.
+        If the step increases the energy, fractions of the step are tried in the nonlinear
+        unknowns, which enter the equations as products, and the linear unknowns are solved again
+        for each fraction.
         """
         # The energy of this point is computed first, because the regression keeps only the last
         # linearisation.

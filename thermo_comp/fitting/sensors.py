@@ -4,7 +4,7 @@
 Owns the estimation of thermometer and detector settings from bags, and the bags' thermal states.
 
 Rates are central differences over two minutes, which are not causal and need a recording. The
-causal thermometers and the detector get the noise, lag and ramps of the recorded test.
+causal thermometers and the detector are set to the noise, lag and ramps of the recorded test.
 """
 
 from __future__ import annotations
@@ -41,12 +41,14 @@ class Course:
 
     @property
     def least_ramp(self) -> float:
-        """Smallest rate that counts as a ramp: 5 standard deviations of the noise [K/s]."""
+        """
+        Smallest rate that counts as a ramp [K/s]: 5 standard deviations of the noise of the rate.
+        """
         return 5.0 * self.rate_sd
 
     @property
     def fastest(self) -> float:
-        """99 % quantile of the absolute rate [K/s]."""
+        """The 99 % quantile of the absolute rate of the temperature [K/s]."""
         return float(np.quantile(np.abs(self.rate), 0.99))
 
 
@@ -102,7 +104,9 @@ def learn_thermometer(
 
 
 def quantum_of(values: Floats) -> float:
-    """Find the quantum of a sensor's readings, shape (n,) [K]; 0 if they are not rounded."""
+    """
+    Find the quantum of a sensor's readings, shape (n,) [K]; 0 if the readings are not rounded.
+    """
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):
         return 0.0
@@ -114,19 +118,22 @@ def quantum_of(values: Floats) -> float:
 
 
 def _noise_of(values: Sequence[Floats], quantum: float) -> float:
-    # Second differences do not depend on a linear ramp; white noise of sd s gives s sqrt(6).
+    # Second differences of readings do not depend on a linear ramp; white noise of sd s gives them
+    # an sd of s sqrt(6).
     second = np.concatenate([np.diff(value, 2) for value in values])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
-    # Most rounded readings equal their neighbours, so the median is 0: use the mean square without
-    # the largest 1 %, less the variance of rounding.
+    # Most rounded readings equal their neighbours, so the median of the differences is 0: use
+    # their mean square without the largest 1 %, less the variance of rounding.
     square = np.sort(second**2)[: max(1, int(0.99 * len(second)))]
     variance = max(float(square.mean()) / 6.0 - quantum**2 / 12.0, (0.1 * quantum) ** 2)
     return float(np.sqrt(variance))
 
 
 def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list[Course]:
-    """Return the rates of temperature in each bag of 30 readings and 6 spans, or more."""
+    """
+    Return the temperature rates of the bags with at least 30 readings and 6 intervals of the rate.
+    """
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:

@@ -109,9 +109,9 @@ class Whitener:
         """
         Find the Gauss-Markov noise of residuals, shape (n, 3), by their profile likelihood.
 
-        The axes have a common ratio and correlation time; their white variances are profiled out.
-        The result is white noise unless twice the log likelihood gains 9.2, the 1 % point of a
-        chi-square with two degrees of freedom.
+        The axes have a common variance ratio and correlation time; their white variances are
+        profiled out. The result is white noise unless twice the log likelihood gains 9.2, the 1 %
+        point of a chi-square with two degrees of freedom.
         """
         # Candidates of the ratio of the Gauss-Markov variance to the white variance of a window.
         ratios = 10.0 ** np.arange(-2.5, 3.6, 0.5)
@@ -193,7 +193,7 @@ class Base:
 
     @property
     def size(self) -> int:
-        """Number of base series."""
+        """Number of the base series."""
         return int(self.measured[-1]) + 1
 
 
@@ -266,7 +266,7 @@ class Series:
         self.reweigh(windows.weight * shares)
 
     def reweigh(self, weight: Floats) -> None:
-        """Set the weights of the windows, shape (n,)."""
+        """Use weights of the windows, shape (n,), in all products."""
         self.weight = weight
         self.noise: Noise | None = None
         self._products: tuple[Bools, Products] | None = None
@@ -310,7 +310,7 @@ class Series:
         return products[..., :k], products[..., k:]
 
     def _averaged(self, values: Floats) -> Floats:
-        """Return the mean of each position, shape (n_positions, k)."""
+        """Return the mean of series in each position, shape (n_positions, k)."""
         count = np.diff(self.windows.edges)[:, None]
         return np.asarray(np.add.reduceat(values, self._first, axis=0) / count)
 

@@ -4,7 +4,8 @@
 Owns the initial triad: constant bias, scale and misalignment from the means of the positions.
 
 The means of the positions lie on an ellipsoid, which is fitted without temperature by least
-squares on ``|f| - g``. The initial values follow from the extremes of the means on each axis.
+squares on ``|f| - g``. The initial values of that fit follow from the extremes of the means on
+each axis.
 """
 
 from __future__ import annotations
@@ -112,8 +113,8 @@ def position_means(windows: Windows) -> Floats:
 
 def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     """
-    Return the white noise of the windows of each axis [m/s^2], shape (3,), from their second
-    differences, which a drift does not enter; 0 without three windows in a position.
+    Return the white noise of the windows of each axis [m/s^2], shape (3,), from second differences
+    of windows, which do not depend on a drift; 0 if no position has three windows.
     """
     inner = windows.inner
     if not len(inner):

@@ -26,7 +26,7 @@ class Normal(NamedTuple):
     unit: Floats
 
     def scaled(self, factor: Floats) -> Normal:
-        """Multiply the equations of each axis by a factor, shape (3,)."""
+        """Multiply the normal equations of each axis by a factor, shape (3,)."""
         return Normal(self.local * factor[:, None, None], self.unit * factor[:, None, None])
 
     @property
@@ -109,7 +109,7 @@ class Tangent:
         return np.asarray(result)
 
     def at(self, p: int) -> Tangent:
-        """Return the tangent of one position."""
+        """Return the equations of one position."""
         return replace(
             self, combined=self.combined[[p]], factor=self.factor[[p]], scale=self.scale[[p]]
         )

@@ -55,7 +55,7 @@ class Sets:
     is_shared: bool = True
 
     def columns(self, t: Floats, weight: Floats) -> list[Floats]:
-        """Evaluate the columns of the sets."""
+        """Evaluate the columns of the curves of the two sets."""
         static, dynamic = self.static.basis(t), self.dynamic.basis(t)
         if not self.is_shared:
             static = [(1.0 - weight) * value for value in static]
@@ -74,7 +74,7 @@ class Sets:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Group of each column."""
+        """Group of each column of the model."""
         return (CURVE,) * self.static.n_free + (SET,) * (1 + self.dynamic.n_free)
 
     @property
@@ -127,10 +127,10 @@ class Model:
 
 class Track(NamedTuple):
     """
-    The states of the tracker over a bag, without memory.
+    The thermal states of a tracker over a bag, without thermal memory.
 
     start_s, step_s: start and step of the time grid [s]
-    states: shape (n, width); is_known: which of the states are known, shape (n,)
+    states: thermal states, shape (n, width); is_known: which states are known, shape (n,)
     """
 
     start_s: float
@@ -170,7 +170,7 @@ class ThermalWindows:
 
     @property
     def is_dynamic(self) -> Bools:
-        """Windows of the dynamic regime, shape (n,)."""
+        """Whether each window is in the dynamic regime, shape (n,)."""
         return np.asarray(self.weight > 0.5)
 
     @property
@@ -209,10 +209,10 @@ def thermal_windows(
     """
     Combine the windows of all bags with the columns of their thermal states.
 
-    Windows are left out before the board's first reading, while its estimate settles, and while
-    readings of a thermometer are missing. A bag without any temperature is taken to be at the
-    reference, where all columns are 0. `tracks`: thermal states of the bags, if they were computed
-    before with the same detector
+    Windows are left out before the board's first reading, while the estimate of the board
+    temperature settles, and while readings of a thermometer are missing. A bag without any
+    temperature is taken to be at the reference temperature, where all columns are 0. `tracks`:
+    thermal states of the bags, if they were computed before with the same detector
     """
     spec = memory_of(model.columns, model.sensors)
     tracks = tracks or [_track(bag, model, spec) for bag in bags]
@@ -301,7 +301,8 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     groups, columns, acts_on = model.sets.groups, model.columns, model.acts_on
     n_curves, lags = len(groups), Layout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 3]
-    # A support tilts with board and case temperature, linearly and with the square of the latter.
+    # A support tilts linearly with the board and case temperatures, and with the square of the
+    # case temperature.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
@@ -390,7 +391,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
 
 
 def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats]:
-    """Return a time grid [s], and the states on it with their lags."""
+    """Return a time grid [s], and the thermal states on this grid with their lags."""
     states = track.states
     grid = np.asarray(track.start_s + track.step_s * np.arange(len(states)), dtype=np.float64)
     # The lags are evaluated on the whole grid at once, which is much faster than at each reading.
