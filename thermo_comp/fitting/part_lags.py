@@ -47,9 +47,10 @@ class _Shape(NamedTuple):
     has_stress: bool = False
 
 
-# Fewest nodes of the spline of the bias.
+# Smallest number of nodes of the spline of the bias.
 _FEWEST_NODES = 4
-# A curve of few nodes determines a lag best, but has no kinks; so its residual must be noise.
+# Shapes tried in this order: a curve of few nodes determines a lag best but has no kinks, so the
+# residual must be noise.
 _SHAPES = (_Shape(_FEWEST_NODES, 1.1), _Shape(60, 1.5), _Shape(60, 1.5, has_stress=True))
 
 
@@ -100,8 +101,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         parts = Parts((x, y, z), factors, float(noise.mean()))
         if (square <= (shape.most_noise * noise) ** 2).all():
             return parts
-        # A larger residual has another cause, e.g. slow noise: the lags are then accepted only if
-        # they reduce the RMS residual of each axis to an eighth or less of that without a lag.
+        # A larger residual has another cause, for example slow noise: the lags are then accepted
+        # only if they reduce the RMS residual of each axis to an eighth or less of the residual
+        # without a lag.
         is_last = shape.n_nodes > _FEWEST_NODES
         if is_last and accepted is None and min(map(subset.reduction, lags, range(3))) >= 8.0:
             accepted = parts
@@ -112,7 +114,7 @@ class _PartCurves:
     """
     Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
 
-    `rows`: the windows that are used
+    `rows`: the windows that the search uses
     """
 
     def __init__(
