@@ -108,7 +108,7 @@ _PREPARED: dict[str, Bounds] = {
     'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'an axis that reads 2 g at 1 g'),
     # Bounds of the results of a fit, and of numbers of samples.
     'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
-    'number': _up_to(1e15, '', 'a float64 holds such integers exactly'),
+    'number': _up_to(1e15, '', 'a float64 holds integers up to 9e15 exactly'),
     'log evidence': _between(-1e15, 1e15, '', 'a sum over at most 1e15 samples'),
     'deviation of a weight': _up_to(1e16, 'of its column', 'the largest full scale'),
     # Bounds of the settings of thermometers and of the regime detector.

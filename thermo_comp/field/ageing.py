@@ -216,7 +216,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the centre of the priors; the turn-on sd is the residual or the noise in 1 Hz."""
+    """Return the centre of the priors; its turn-on sd is the residual sd, or the noise in 1 Hz."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on

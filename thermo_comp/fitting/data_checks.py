@@ -106,7 +106,8 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         text = 'at rest all samples are equal: does the sensor repeat one reading?'
         yield _advice('stuck', text)
     if dead := '; '.join(_dead_axes(bags)):
-        yield Finding('stuck', 'refusal', f'{dead}: the axis is dead there, leave out such a bag')
+        text = f'{dead}: the axis is dead there, leave out a bag with a dead axis'
+        yield Finding('stuck', 'refusal', text)
     for name in sorted({name for bag in bags for name in bag.temperatures}):
         read = [b.temperatures[name].value for b in bags if name in b.temperatures]
         celsius = np.concatenate(read)
@@ -129,7 +130,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             yield _advice(
                 'compensated',
                 'the samples are no whole numbers: scaled or compensated before they were '
-                'recorded? A calibration made from such samples is valid for that output only',
+                'recorded? A calibration made from scaled samples is valid for that scaling only',
             )
     jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
     if jumps:
@@ -137,7 +138,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         jumped = '; '.join(
             f'{bag.source.name}: {describe(event, per_mg, bag.since_s)}' for bag, event in jumps
         )
-        text = f'{jumped}: leave out such a bag, or end before it with --to'
+        text = f'{jumped}: leave out a bag with a jump, or end before the jump with --to'
         yield Finding('jump', 'refusal', text)
     if not all(bag.angular_rate == bags[0].angular_rate != 'part' for bag in bags):
         names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
@@ -298,14 +299,14 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
         yield _advice(
             'unseen',
             f'{least.away_deg:.0f} deg away from every position the sd of |f| is '
-            f'{spoken(least.sd_m_s2)}, in the positions {spoken(least.seen_sd_m_s2)}: record one '
-            f'with {spoken_direction(np.array(least.up))}',
+            f'{spoken(least.sd_m_s2)}, in the positions {spoken(least.seen_sd_m_s2)}: record a '
+            f'position with {spoken_direction(np.array(least.up))}',
         )
 
 
 def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator[Finding]:
     """
-    Tell which repeatability of mountings and turn-ons is assumed if the norms do not determine it.
+    Report the assumed repeatability of mountings and turn-ons if the norms do not determine it.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. The norms of nine positions
     are explained by nine constants, whatever the offsets.

@@ -293,8 +293,8 @@ def _unusable(error: ValueError) -> FitError:
     if 'misalignment' in str(error):
         return FitError(
             'the angle between two of its axes is less than 60 degrees, which no accelerometer '
-            'has: is it the right topic, did the axes stay the same in all positions, and are '
-            'there at least 9 positions?'
+            'has: is the topic the right one, did the axes stay the same in all positions, and '
+            'are there at least 9 positions?'
         )
     return FitError(f'these data give no calibration that can be used: {error}')
 

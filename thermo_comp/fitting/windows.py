@@ -211,8 +211,9 @@ def thermal_windows(
 
     Windows are left out before the board's first reading, while the estimate of the board
     temperature settles, and while readings of a thermometer are missing. A bag without any
-    temperature is taken to be at the reference temperature, where all columns are 0. `tracks`:
-    thermal states of the bags, if they were computed before with the same detector
+    temperature is taken to be at the reference temperature, where all columns are 0.
+
+    `tracks`: thermal states of the bags, if they were computed before with the same detector
     """
     spec = memory_of(model.columns, model.sensors)
     tracks = tracks or [_track(bag, model, spec) for bag in bags]

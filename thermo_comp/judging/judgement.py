@@ -266,7 +266,7 @@ def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
             ('scale', 1e6 * shift.scale, 1e6 * shift.scale_sd, 'ppm'),
         ):
             if abs(value) > _SURE_SDS * sd:
-                # Two digits of the sd, without an exponent.
+                # The sd is printed with two digits and without an exponent.
                 digits = max(0, 1 - int(np.floor(np.log10(sd)))) if sd > 0.0 else 3
                 collected.append(f'{axis} {name} {value:+.{digits}f} +- {sd:.{digits}f} {unit}')
     return tuple(collected)

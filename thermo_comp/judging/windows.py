@@ -32,7 +32,7 @@ WINDOW_S = 60.0
 # Distance outside a calibrated range that noise can explain, so that a window counts as inside
 # [half ranges].
 _EDGE = 0.02
-# Largest relative difference of a known |f| from gravity for a rest that counts as one at 1 g.
+# Largest relative difference of a known |f| from gravity for a rest that counts as at 1 g.
 _USUAL = 0.01
 # Smallest ratio of the number of samples in a partial sum to the median of this number.
 _LEAST_FILLED = 0.9
@@ -266,8 +266,8 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
-    # A sum is many samples: a distance of more than 15 s to the sum and the reading before it, as
-    # with a slow thermometer, is no sample whose stamp alone is wrong.
+    # A partial sum contains many samples, so its stamp is right even if it is more than 15 s later
+    # than the partial sum and the reading before it, as with a slow thermometer.
     compensator.leap_ns = np.iinfo(np.int64).max
     thermal = compensator.thermal
     readings = iter(readings_in_order(bag, thermal.inputs))

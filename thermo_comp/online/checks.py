@@ -110,7 +110,7 @@ class RateCheck:
     @property
     def noise_excess(self) -> float:
         """
-        Excess noise variance of a sample at the measured rate, relative to the calibrated one.
+        Relative excess of a sample's noise variance over the calibrated one at the measured rate.
         """
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0

@@ -88,7 +88,7 @@ class CompensatorStatus:
 
 
 class Compensator:
-    """Corrects one unit's samples, one by one."""
+    """Corrects the samples of one unit, each when it arrives."""
 
     def __init__(
         self, calibration: Calibration | Model, config: CompensatorConfig | None = None
@@ -192,8 +192,7 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Until a temperature arrives, every sample is handled here, where it is counted as
-            # dropped.
+            # Until a temperature arrives, every sample is checked in full and counted as dropped.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -210,8 +209,7 @@ class Compensator:
             is_good &= is_sound(rate_line)
             self.rate_line = rate_line.tolist()
         if not is_good:
-            # While the correction is not finite, every sample is handled here, where it is
-            # dropped.
+            # While the correction is not finite, every sample is checked in full and dropped.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None

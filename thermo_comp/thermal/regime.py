@@ -87,8 +87,8 @@ class RegimeDetector:
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
-            # The detector detects an onset before the rate is large. Until the rate is large, the
-            # dynamic state ends only if the rate returns to the baseline.
+            # The detector finds the onset of a ramp before the rate is large. Until the rate is
+            # large, the dynamic state ends only if the rate returns to the baseline.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:

@@ -81,12 +81,12 @@ class DetectorSettings:
         float,
         QUANTITIES['ripple'],
         "Amplitude of the surroundings' temperature in a soak (a chamber's control ripple), K. "
-        'A sensor with a lag shows the ripple as a rate up to ``ripple_c / lag_s``: no onset.',
+        'A sensor with a lag shows the ripple as a rate up to ``ripple_c / lag_s``, not an onset.',
     ] = 0.1
     relaxed_rate_k_min: Annotated[
         float,
         QUANTITIES['ramp'],
-        "The unit has relaxed when every sensor's rate is surely below this, K/min.",
+        "The unit has relaxed when every sensor's rate is surely below this limit, K/min.",
     ] = 0.05
     dwell_s: Annotated[
         float,
