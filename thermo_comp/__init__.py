@@ -9,7 +9,7 @@ Thermal-drift compensation of a three-axis accelerometer, after Golovach (2016).
     out = cal.correct(time_s, counts, board=board, case=case)
     out.specific_force, out.covariance, out.dynamic
 
-This page owns the public names and the conventions of all other docstrings.
+This module owns the public names, and states the conventions of all other docstrings.
 
 Units
     SI and degrees Celsius. Temperature differences and rates are in K and K/s. A name carries a
@@ -27,7 +27,8 @@ Temperatures
     ``T_case - T_board``. The case sensor leads, the board sensor lags.
 Regimes
     Static (S = 0) and dynamic (S = 1), decided by a detector with memory; unknown until the
-    detector has enough readings. The static set applies while the regime is unknown.
+    detector has enough readings. The static set of coefficients applies while the regime is
+    unknown.
 Frames
     The output frame is fixed by the sensitivity axes: x along the x sensitivity axis, y in the
     plane of the x and y sensitivity axes (the misalignment matrix is lower triangular with a
@@ -73,7 +74,7 @@ __all__ = [
     'save',
 ]
 
-# Modules of the public names; each is imported at its first use.
+# The module of each public name, which is imported when the name is first used.
 _HOMES = {
     'Calibration': 'unit.calibration',
     'Compensator': 'online.compensator',

@@ -6,7 +6,7 @@ import sys
 
 
 def main() -> None:
-    """Run a command; name the missing library if only the node's dependencies are installed."""
+    """Run a command; report the missing library if only the node's dependencies are installed."""
     try:
         from .cli.app import main as run
     except ModuleNotFoundError as error:

@@ -25,12 +25,12 @@ from .recording.topics import Topics
 from .typing import Bools, Floats, Ints
 from .unit.calibration import Calibration
 
-#: A temperature: one value for each sample, or (time_s, value) with separate times.
+#: A thermometer's readings: one value for each sample, or (time_s, value) with separate times.
 Temperature: TypeAlias = npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]
 
 #: `Columns.start_ns` is a multiple of this time [ns], so that times count from a whole minute.
 _MINUTE_NS = 60_000_000_000
-_LONGEST_S = 4e9  # largest time accepted [s]; a larger time is most likely not in seconds
+_LONGEST_S = 4e9  # largest time accepted [s]; a larger number is most likely not in seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,8 @@ class Columns:
     name : str, optional
         Name of the recording in messages.
     specific_force : str, optional
-        |f| of rests not at 1 g, as in the metadata of a bag; empty: at rest |f| is gravity.
+        |f| of rests that are not at 1 g, written as in a bag's metadata; if empty, |f| at rest is
+        gravity.
 
     """
 
@@ -74,7 +75,7 @@ class Corrected:
     Attributes
     ----------
     specific_force : ndarray, shape (n, 3)
-        Corrected specific force [m/s^2]; NaN where the node would publish nothing.
+        Corrected specific force [m/s^2]; NaN for samples that the node would not publish.
     covariance : ndarray, shape (n, 3, 3)
         Covariance of the specific force [m^2/s^4]; NaN where the force is NaN.
     dynamic : ndarray of bool, shape (n,)
@@ -260,7 +261,7 @@ def fit(
 def _block(
     time_s: npt.ArrayLike, counts: npt.ArrayLike, given: Mapping[str, Temperature], start_ns: int
 ) -> Block:
-    """Check the caller's arrays; a reading is placed just before the sample of its time."""
+    """Check the caller's arrays; a reading is placed just before the sample of the same time."""
     stamps = _stamps('time_s', time_s)
     samples = _numbers('counts', counts)
     if samples.shape != (len(stamps), 3):
@@ -289,7 +290,7 @@ def _numbers(name: str, value: npt.ArrayLike) -> Floats:
 
 
 def _stamps(name: str, value: npt.ArrayLike) -> Ints:
-    """Convert times to nanoseconds; they must rise strictly."""
+    """Convert times to nanoseconds; ValueError if they do not rise strictly."""
     given = np.asarray(value)
     if given.ndim != 1:
         raise ValueError(f'`{name}` must have one dimension, got the shape {given.shape}')

@@ -16,7 +16,8 @@ from .text import one_line
 class ThermoCompError(Exception):
     """An error that a user can correct; its text is one line: file, key, message."""
 
-    # `rule` is the message without any content of the file, for a peer that may not read it.
+    # `rule` is the message without any content of the file, for a client without permission to
+    # read the file.
     def __init__(
         self,
         message: str,
@@ -39,7 +40,7 @@ class RecordingError(ThermoCompError):
 
 
 class OutputError(ThermoCompError):
-    """An output that may not or cannot be written, with its name."""
+    """An output file that may not or cannot be written, with the file's name."""
 
 
 class FitError(ThermoCompError):

@@ -4,9 +4,9 @@
 Owns the reading of files of limited size, and the writing of all output files.
 
 An output never replaces an input of the same command. Without `overwrite` an output replaces no
-existing file, even if another process writes at the same time; with `overwrite`, only a file of
-the same kind. An output gets its final name once it is complete. If the name is a symbolic link,
-the link stays and its target is written.
+existing file, even if another process writes at the same time; with `overwrite` it replaces only a
+file of the same kind. An output gets its final name once it is complete. If the output's name is a
+symbolic link, the link stays and its target is written.
 """
 
 import errno
@@ -33,10 +33,10 @@ class Kind:
     name: str
     mark: bytes
     is_folder: bool = False
-    suffixes: tuple[str, ...] = ()  # accepted suffixes; empty: any
+    suffixes: tuple[str, ...] = ()  # accepted file suffixes; an empty tuple accepts any suffix
 
     def refusal(self, path: Path) -> str:
-        """Return why an existing file or folder is not of this kind; empty if it is."""
+        """Return why an existing file or folder is not of this kind; an empty text if it is."""
         if path.is_dir() != self.is_folder:
             return f'it is a {"folder" if path.is_dir() else "file"}'
         if self.is_folder:
@@ -67,7 +67,7 @@ BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z'
 
 
 def bag_kind(path: str | Path, others: str = '') -> Kind:
-    """Choose the kind of a bag by its suffix; `others` are further suffixes for the message."""
+    """Choose the kind of an output bag by its suffix; the error message also lists `others`."""
     suffix = Path(path).suffix
     if suffix == '.mcap':
         return MCAP
@@ -84,7 +84,7 @@ def shown_name(path: str | Path) -> str:
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """Open a regular file for reading; OSError, before reading can block, for anything else."""
+    """Open a regular file; OSError, before reading can block, for anything else, as for a pipe."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -97,11 +97,12 @@ def open_regular(path: str | Path) -> BinaryIO:
 
 def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> bytes:
     """
-    Read a regular file. ValueError if it is larger than `limit` bytes, PermissionError if it lies
-    outside of the folder `within`, OSError as in `open_regular`.
+    Read a regular file. ValueError if the file is larger than `limit` bytes, PermissionError if it
+    lies outside of the folder `within`, OSError as in `open_regular`.
     """
     with open_regular(path) as file:
-        # Check the opened file: a link could be exchanged between a check and the opening.
+        # Check the path of the opened file: a link could be exchanged between a check and the
+        # opening.
         if within is not None and not _opened(file).is_relative_to(within):
             raise PermissionError(errno.EPERM, 'outside of its folder', str(path))
         size = os.fstat(file.fileno()).st_size
@@ -159,7 +160,9 @@ class Draft:
                 self.partial.mkdir()
 
     def publish(self) -> None:
-        """Give the complete output its name; OutputError if another process took the name."""
+        """
+        Give the complete output its final name; OutputError if another process took this name.
+        """
         with _output_errors(self._path):
             if self.partial.is_dir():
                 _sync(self.partial)
@@ -175,7 +178,8 @@ class Draft:
                 except FileExistsError:
                     raise
                 except OSError:
-                    # A file system without hard links, such as FAT: reserve the name first.
+                    # On a file system without hard links, such as FAT, the name is reserved before
+                    # the file is moved.
                     os.close(os.open(self._target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
                     self.partial.replace(self._target)
             _sync(self._target.parent)
@@ -191,7 +195,7 @@ class Draft:
     def _move_folder(self) -> None:
         old = None
         if self._is_replacing and self._target.exists():
-            # The operating system only replaces an empty folder.
+            # The operating system replaces a folder only if that folder is empty.
             old = self._target.rename(_hidden_sibling(self._target))
         try:
             self.partial.rename(self._target)
@@ -205,7 +209,9 @@ class Draft:
 
 @contextmanager
 def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
-    """Give a temporary path to write to; without an exception its content becomes the output."""
+    """
+    Give a temporary path to write to, whose content becomes the output if no exception occurs.
+    """
     draft = Draft(path, kind, overwrite=overwrite)
     try:
         with _output_errors(path):
@@ -224,7 +230,7 @@ def write_atomically(path: str | Path, data: bytes, kind: Kind, *, overwrite: bo
 
 
 def _sync(path: Path) -> None:
-    """Flush a file, or a directory's entries, to disk."""
+    """Flush the content of a file, or the entries of a directory, to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -234,7 +240,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def _output_errors(path: str | Path) -> Iterator[None]:
-    """Turn OSError into OutputError, with the output's name instead of the hidden one."""
+    """Turn OSError into OutputError, with the output's name instead of its hidden file's name."""
     try:
         yield
     except OSError as error:
@@ -250,7 +256,7 @@ def _hidden_sibling(path: Path) -> Path:
 
 
 def _overlaps(target: Path, other: Path) -> bool:
-    """Whether two paths are the same or one contains the other, also through links."""
+    """Whether two paths are the same, or either contains the other, also through links."""
     is_within = other in (target, *target.parents) or target in other.parents
     return is_within or not _identities(target).isdisjoint(_identities(other))
 

@@ -21,9 +21,11 @@ from .errors import ThermoCompError
 from .files import read_bounded
 
 DEPTH_LIMIT = 12
-#: Largest number of keys, values, lists and mappings: ten times that of the largest calibration.
+#: Largest number of keys, values, lists and mappings of a file: ten times that of the largest
+#: calibration.
 NODE_LIMIT = 20_000
-_FILE_LIMIT = 1 << 16  # largest file written by hand [bytes]; usual files have a few kB
+# Size limit of YAML files written by hand [bytes]; usual files have a few kB.
+_FILE_LIMIT = 1 << 16
 _INTEGER_DIGITS = 20  # digits of the longest integer accepted; a float64 needs no more
 _INTEGER = re.compile(r'[-+]?[0-9]+')
 _FLOAT = re.compile(r'[-+]?(?:(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf)|\.nan')
@@ -36,12 +38,13 @@ class PlainYamlError(ValueError):
 
     def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
         where = '' if line is None else f' (line {line})'
-        self.rule = f'{problem}{where}'  # the message without the detail
+        # The error message without `detail`, which may quote the file.
+        self.rule = f'{problem}{where}'
         super().__init__(f'{problem}: {detail}{where}' if detail else self.rule)
 
 
 def load_plain_yaml(text: str | bytes, node_limit: int = NODE_LIMIT) -> Any:
-    """Read a YAML document of plain values (empty text: None); PlainYamlError for another text."""
+    """Read a YAML document of plain values, None if empty; PlainYamlError for any other text."""
     try:
         return _load(text, node_limit)
     except yaml.YAMLError as error:
@@ -54,14 +57,14 @@ def load_plain_yaml(text: str | bytes, node_limit: int = NODE_LIMIT) -> Any:
 
 
 def read_plain_yaml(path: str | Path) -> Any:
-    """Read a user's YAML file; a ThermoCompError that names the file if it is not plain YAML."""
+    """Read a YAML file; a file that is not plain YAML raises a ThermoCompError with its name."""
     try:
         return load_plain_yaml(read_bounded(path, _FILE_LIMIT).decode())
     except OSError as error:
         raise ThermoCompError(f'{path}: cannot be read: {error.strerror or error}') from error
     except UnicodeDecodeError as error:
         raise ThermoCompError(f'{path}: not UTF-8 text (byte {error.start})') from error
-    except ValueError as error:  # YAML or file size refused
+    except ValueError as error:  # the YAML, or the size of the file, was refused
         raise ThermoCompError(f'{path}: {error}') from error
 
 

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Final
 
 from .text import counted
 
-#: The test of each kind of bound, and the words for it in an error message.
+#: For each kind of bound: the test of a value, and the words of the error message.
 _RULES: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
     'above': (operator.gt, 'be greater than'),
     'at_least': (operator.ge, 'be at least'),
@@ -74,54 +74,54 @@ def _up_to(upper: float, unit: str, why: str) -> Bounds:
 
 
 _PREPARED: dict[str, Bounds] = {
-    # The unit.
+    # Bounds of the constants of the unit.
     'full scale': _positive(1e-6, 1e16, 'input units', 'a float holds whole counts up to 9e15'),
-    'full-scale force': _positive(1e-3, 1e7, 'm/s^2', 'a relative gravimeter; a gun'),
-    'scale factor': _positive(1e-9, 1e9, 'input units per m/s^2', 'by magnitude'),
-    'cycle time': _positive(1e-7, 1e5, 's', 'a converter of 10 MHz; a sample a day'),
+    'full-scale force': _positive(1e-3, 1e7, 'm/s^2', 'from gravimeters to a gun launch'),
+    'scale factor': _positive(1e-9, 1e9, 'input units per m/s^2', 'bounds of the magnitude'),
+    'cycle time': _positive(1e-7, 1e5, 's', 'from 10 MHz to one sample a day'),
     'gravity': Bounds(above=9.0, below=10.5, unit='m/s^2', why='on Earth 9.76 to 9.84'),
-    'angular rate': _between(-1e3, 1e3, 'rad/s', '57000 deg/s'),
+    'angular rate': _between(-1e3, 1e3, 'rad/s', '1000 rad/s are 57000 deg/s'),
     # Temperatures.
-    'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='0 K; solder melts'),
-    'temperature span': _positive(1e-2, 1273.15, 'K', 'resolution of a thermometer'),
+    'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='0 K to molten solder'),
+    'temperature span': _positive(1e-2, 1273.15, 'K', 'a thermometer resolves no less'),
     'temperature rate': _between(-1e5, 1e5, 'K/min', 'a thermal shock is 1000 K/min'),
-    'rate span': _positive(1e-6, 2e5, 'K/min', 'a kelvin in two years'),
-    'time constant': _positive(1e-3, 1e8, 's', 'a bare wire; three years'),
-    'lag': _nil_or(1e-3, 1e8, 's', 'as for a time constant; 0 is no lag'),
-    # The response.
+    'rate span': _positive(1e-6, 2e5, 'K/min', 'no less than 1 K in two years'),
+    'time constant': _positive(1e-3, 1e8, 's', 'from a bare wire to three years'),
+    'lag': _nil_or(1e-3, 1e8, 's', 'as a time constant; 0 means no lag'),
+    # Bounds of the columns of the thermal response, and of their weights.
     'value of a column': _between(-1e10, 1e10, 'of its kind', 'the cube of 1273 K is 2e9'),
-    'span of a column': _positive(1e-9, 2e10, 'of its kind', 'a millionth of a rate of 0.1 K/min'),
+    'span of a column': _positive(1e-9, 2e10, 'of its kind', 'a millionth of a ramp of 0.1 K/min'),
     'share': _between(-10.0, 10.0, '', 'no part amplifies a temperature difference tenfold'),
-    'width': _nil_or(1e-4, 1e4, 'K', 'resolution of a thermometer; more than temperatures differ'),
-    'gradient': _between(-1273.15, 1273.15, 'K', '0 K to where solder melts'),
+    'width': _nil_or(1e-4, 1e4, 'K', 'from the resolution of a thermometer up'),
+    'gradient': _between(-1273.15, 1273.15, 'K', 'the largest temperature difference'),
     'power': Bounds(at_least=0, at_most=4, why='powers above the third are not observed'),
-    # Noise and deviations.
-    'noise density': _positive(1e-12, 1e3, 'm/s^2/sqrt(Hz)', 'far below any sensor; 100 g'),
+    # Bounds of noises and standard deviations.
+    'noise density': _positive(1e-12, 1e3, 'm/s^2/sqrt(Hz)', 'from far below any sensor to 100 g'),
     'rate noise density': _positive(
-        1e-12, 1e3, 'rad/s/sqrt(Hz)', 'far below any sensor; 57000 deg/s'
+        1e-12, 1e3, 'rad/s/sqrt(Hz)', 'from far below any sensor to 57000 deg/s'
     ),
-    'slow noise': _up_to(1e3, 'm/s^2/sqrt(h)', 'a walk of 100 g in an hour'),
-    'rate slow noise': _up_to(1e3, 'rad/s/sqrt(h)', 'a walk of 57000 deg/s in an hour'),
-    'deviation': _up_to(1e4, 'm/s^2', '1000 g: the quantity is unknown'),
-    'rate deviation': _up_to(1e3, 'rad/s', '57000 deg/s: the quantity is unknown'),
-    'misalignment deviation': _up_to(1.0, 'rad', 'the quantity is unknown'),
+    'slow noise': _up_to(1e3, 'm/s^2/sqrt(h)', 'a random walk of 100 g in an hour'),
+    'rate slow noise': _up_to(1e3, 'rad/s/sqrt(h)', 'a random walk of 57000 deg/s in an hour'),
+    'deviation': _up_to(1e4, 'm/s^2', 'above 1000 g the quantity is unknown'),
+    'rate deviation': _up_to(1e3, 'rad/s', 'above 57000 deg/s the rate is unknown'),
+    'misalignment deviation': _up_to(1.0, 'rad', 'above 1 rad the angle is unknown'),
     'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'an axis that reads 2 g at 1 g'),
-    # Results of a fit and numbers of samples.
+    # Bounds of the results of a fit, and of numbers of samples.
     'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
-    'number': _up_to(1e15, '', 'exact as a float'),
-    'log evidence': _between(-1e15, 1e15, '', 'sum over at most 1e15 samples'),
+    'number': _up_to(1e15, '', 'a float64 holds integers up to 9e15 exactly'),
+    'log evidence': _between(-1e15, 1e15, '', 'a sum over at most 1e15 samples'),
     'deviation of a weight': _up_to(1e16, 'of its column', 'the largest full scale'),
-    # Thermometers and detector.
-    'reading noise': _positive(1e-6, 1e2, 'K', 'a microkelvin thermometer; a useless one'),
-    'quantum': _up_to(1e2, 'K', 'coarser than any sensor'),
-    'ramp': _positive(1e-6, 1e5, 'K/min', 'a kelvin in two years; 100 thermal shocks'),
-    'false alarms': _positive(1e-12, 1e4, '1/h', 'an alarm in 1e8 years; three a second'),
-    'ripple': _up_to(1e3, 'K', 'larger than in any chamber'),
-    'dwell': _up_to(1e7, 's', 'four months'),
-    # Lengths of lists in a file.
-    'coefficients': Bounds(shortest=1, longest=12, why='t^11 follows any curve'),
-    'knots': Bounds(longest=100, why='a knot per kelvin over 100 K'),
-    'columns': Bounds(longest=2000, why='all columns of ten thermometers'),
+    # Bounds of the settings of thermometers and of the regime detector.
+    'reading noise': _positive(1e-6, 1e2, 'K', 'from a microkelvin to no measurement'),
+    'quantum': _up_to(1e2, 'K', 'no sensor has coarser steps'),
+    'ramp': _positive(1e-6, 1e5, 'K/min', 'from 1 K in two years to 100 thermal shocks'),
+    'false alarms': _positive(1e-12, 1e4, '1/h', 'from one alarm in 1e8 years to three a second'),
+    'ripple': _up_to(1e3, 'K', 'the ripple of any chamber is smaller'),
+    'dwell': _up_to(1e7, 's', 'no soak lasts four months'),
+    # Bounds of the lengths of lists in a calibration file.
+    'coefficients': Bounds(shortest=1, longest=12, why='powers up to t^11 follow any curve'),
+    'knots': Bounds(longest=100, why='one knot per kelvin over 100 K'),
+    'columns': Bounds(longest=2000, why='enough for all columns of ten thermometers'),
 }
 Positive = Annotated[float, Bounds(above=0.0, below=math.inf)]
 NotNegative = Annotated[float, Bounds(at_least=0.0, below=math.inf)]

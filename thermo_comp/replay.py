@@ -3,9 +3,10 @@
 """
 Owns the offline run of the node: the correction of a whole bag into another bag or a table.
 
-The node's code corrects blocks of samples instead of single samples. A temperature applies from
-the first sample after it in the bag. The result therefore equals, bit for bit, that of a node
-which receives the messages in the order of the bag. Memory is limited to one block.
+The correction is the node's code, applied to blocks of samples instead of single samples. A
+temperature reading applies from the first sample after the reading in the bag. The output
+equals, bit for bit, the output of a node that receives the messages in the order of the bag.
+Only one block of the bag is in memory at a time.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -51,7 +52,8 @@ class ReplayResult:
     n_flags: int
     #: The first regime flag, and each flag that differs from the previous one.
     switches: list[tuple[int, bool]]
-    #: Warnings as in the node: exchanged thermometers, temperatures outside the calibrated range.
+    #: Warnings that the node would give: exchanged thermometers, temperatures outside the
+    #: calibrated range.
     notes: list[str]
 
 
@@ -60,7 +62,7 @@ WriteBlock = Callable[[Block, CompensatedBlock, list[tuple[int, bool]]], None]
 
 
 def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None = None) -> None:
-    """Refuse a calibration of another unit or input; an empty serial accepts any unit."""
+    """Refuse a calibration of another unit or input; an empty `serial` accepts any unit."""
     expected = info.metadata.get('serial', '') if serial is None else serial
     if expected and expected != calibration.unit.serial:
         raise CalibrationError(
@@ -85,7 +87,7 @@ def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
 
 
 def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
-    """Return the roles that a recording must have; constants need no thermometer."""
+    """Return the roles of the topics that a recording must have to be corrected."""
     return ('accel', 'board') if any(one.needs_temperature for one in calibrations) else ('accel',)
 
 
@@ -148,7 +150,7 @@ def replay(
 
 
 def _beyond(calibration: Calibration, block: Block) -> float:
-    """Return how far the board readings lie outside all ranges [K], ignoring single outliers."""
+    """Return how far board readings lie outside all calibrated ranges [K], without outliers."""
     ranges = [regime_set.temperature_range_c for regime_set in calibration.regime_sets()]
     lower, upper = min(bounds[0] for bounds in ranges), max(bounds[1] for bounds in ranges)
     celsius = block.temperatures['board'].celsius
@@ -158,7 +160,7 @@ def _beyond(calibration: Calibration, block: Block) -> float:
 
 
 def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
-    """Keep the first flag (stamp, regime) and each flag that differs from the previous one."""
+    """Keep the first regime flag (stamp, regime) and each flag unlike the flag before it."""
     return [next(run) for _, run in groupby(flags, key=itemgetter(1))]
 
 
@@ -199,7 +201,7 @@ def _messages_of(
                 for topic, pack in FLAGS.items():
                     packed = [pack(*flag, serial) for flag in new]
                     writer.write_raw(topic.name, topic.type, times, packed)
-            # As for the outputs, the log time of a copied input is its stamp.
+            # The log time of a copied input message is its stamp, as for the output messages.
             for role, messages in block.raw.items():
                 name, kind = reader.topics[role], ''
                 if role in reader.fields:
@@ -241,7 +243,7 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 
 def _imu_of(block: Block, corrected: CompensatedBlock) -> ImuColumns | None:
-    """Return the Imu fields other than the force; a rate with covariance -1 stays unchanged."""
+    """Return the Imu fields but the force; an angular rate with covariance -1 is not corrected."""
     if block.imu is None:
         return None
     imu = block.imu.take(corrected.index)

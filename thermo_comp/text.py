@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the safe printing of texts from outside, and nouns with their number."""
+"""Owns the safe printing of texts from files and networks, and nouns with their number."""
 
 import os
 import sys
 
-LONGEST_SERIAL = 64  # characters; serials are used in file names, parameter files and tables
+# Longest serial of a unit [characters]: serials appear in file names, parameter files and tables.
+LONGEST_SERIAL = 64
 
 
 def counted(n: int, noun: str) -> str:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the table of the node's ROS topics: name, message type, QoS and the flags' packers.
+Owns the table of the node's ROS topics: name, type, QoS, serialization of the regime flags.
 
 Node, replay, recorders, player, bag writer and docs/ros_interface.md read this table. A message is
 packed in little-endian CDR: 4 bytes of encapsulation, then the fields.
@@ -22,7 +22,8 @@ N_NUMBERS = {VECTOR3_STAMPED: 3, IMU: 37, TEMPERATURE: 2}
 
 _ENCAPSULATION = b'\0\1\0\0'
 
-#: Packs a flag: stamp of the reading that decides [ns], whether dynamic, serial of the unit.
+#: Serializes a regime flag, given the stamp of the reading that decides the regime [ns], whether
+#: the regime is dynamic, and the serial of the unit.
 PackFlag = Callable[[int, bool, str], bytes]
 
 
@@ -32,7 +33,7 @@ class NodeTopic:
 
     name: str
     type: str
-    meaning: str  # for the reference page
+    meaning: str  # description of the topic in the reference page
     depth: int
     is_reliable: bool = True
     is_latched: bool = False  # a late subscriber gets the last message (transient local)
@@ -51,15 +52,17 @@ def _bool_flag(_stamp_ns: int, is_dynamic: bool, _serial: str) -> bytes:
 
 
 def _stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
-    """Serialize a DiagnosticArray of one status, with the stamp of the reading that decides."""
+    """Serialize the regime as a DiagnosticArray with the stamp of the reading that decides it."""
     status = b''
     for text in ('regime', 'dynamic' if is_dynamic else 'static', serial):
-        # The level is one byte; the length of a text is aligned to four bytes.
+        # In CDR the level of a status is one byte, and the length of a text is aligned to four
+        # bytes.
         status += bytes(-(1 + len(status)) % 4) + pack('<I', len(text.encode()) + 1)
         status += text.encode() + b'\0'
-    status += bytes(-(1 + len(status)) % 4) + pack('<I', 0)  # no key and value
+    status += bytes(-(1 + len(status)) % 4) + pack('<I', 0)  # the status has no key-value pairs
     sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-    # Fields: stamp, length of the empty frame_id with its NUL, padding, number of status, level.
+    # Fields of the header: stamp, length of the empty frame_id with its NUL, padding, number of
+    # status, level.
     head = pack('<iII4xIb', sec, nanosec, 1, 1, 0)
     return _ENCAPSULATION + head + status
 
@@ -69,7 +72,7 @@ def thermometer(name: str) -> str:
     return f'temperature/{name}'
 
 
-# Queue of 2000 samples, in and out: 0.2 s at 10 kHz.
+# The topics of the samples, input and output, have a queue of 2000 samples: 0.2 s at 10 kHz.
 COUNTS = NodeTopic('accel/counts', VECTOR3_STAMPED, 'counts per cycle', 2000, is_reliable=False)
 IMU_IN = NodeTopic(
     'imu/uncompensated',
@@ -105,10 +108,11 @@ STAMPED = NodeTopic(
 )
 STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz, hardware_id = serial', 10)
 
-#: Topics of the samples, by the value of the parameter `input`; below, the topics of all inputs,
-#: by their names in `Topics`.
+#: `SAMPLES`: topics of the samples, by the value of the parameter `input`; `INPUTS`: topics of all
+#: inputs, by their names in `Topics`.
 SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}
 INPUTS = {**SAMPLES, 'board': BOARD, 'case': CASE}
-#: The regime flags with their packers; all topics of the bag that `replay` writes.
+#: `FLAGS`: topics of the regime flags with their serializers; `OUTPUTS`: all topics that `replay`
+#: writes.
 FLAGS: dict[NodeTopic, PackFlag] = {REGIME: _bool_flag, STAMPED: _stamped_flag}
 OUTPUTS = (IMU_OUT, *FLAGS)

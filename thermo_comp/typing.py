@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the array types that all rooms share."""
+"""Owns the array types that all subpackages share."""
 
 from typing import TypeAlias
 

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the ageing model of a unit: a Gaussian model of its rests, with variances by evidence.
+Owns the ageing model of a unit: a Gaussian model of the errors at rest, with variances estimated
+by evidence.
 
 ``|f| - g`` of rest i at time t_i, of start k, is ``H_i delta + B_i b(t_i) + S_i s(t_i) + B_i o_k
 + lack + e_i``: delta is the error of the calibration (its posterior), b and s are random walks of
@@ -24,9 +25,8 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import Series
 
-#: Centres of the priors relative to the turn-on offset: random walk of the bias, and of the scale
-#: times g, per root day; scatter of a rest. Sd of the logarithms of all priors: a factor of 5
-#: either way.
+#: Centres of the priors, relative to the turn-on offset: random walk per root day of bias, and of
+#: scale times g; scatter of a rest. Sd of the logarithm of all priors: a factor of 5 either way.
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
@@ -36,8 +36,8 @@ _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
 #: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
-#: Largest number of rows of a start in the solution, and in the search of the variances; largest
-#: number of all rows in the search, whose time grows with the cube of this number.
+#: Largest number of rows (equations) per start of the node in the solution, and in the search for
+#: the variances; largest number of all rows in the search, whose time grows with its cube.
 _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
 
 
@@ -59,14 +59,16 @@ class Ageing:
 
 @dataclass(frozen=True)
 class Change:
-    """A jump of the levels at `time` [days since 1970], or, with None, a change of the curve."""
+    """
+    A jump of the levels at `time` [days since 1970] or, if `time` is None, a change of the curve.
+    """
 
     time: float | None
     sd: float
     log_bayes_factor: float
 
     def columns(self, rows: Rows) -> Floats:
-        """Return the derivatives of the rows by the change, (n, 6) or (n, 3)."""
+        """Return the derivatives of the ageing model's rows by the change, (n, 6) or (n, 3)."""
         if self.time is None:
             return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
         is_after = (rows.time >= self.time)[:, np.newaxis]
@@ -79,9 +81,9 @@ class Rows:
     Equations of the rests, in order of time, at most `_ROWS` of a start: orthogonal sums with all
     information of its rests about the six levels.
 
-    noise, scatter: variance of the noise, and factor of the variance of the rests' scatter
-    rank: number of the row in its start
-    warmth: temperature less the reference [K]
+    noise, scatter: variance of the noise, and factor of the rests' scatter variance in a row
+    rank: number of the row within its start
+    warmth: board temperature less the reference temperature [K]
     """
 
     time: Floats
@@ -96,7 +98,7 @@ class Rows:
     rank: Ints
 
     def at(self, chosen: Bools) -> Rows:
-        """Return the chosen rows."""
+        """Return the rows that a mask selects."""
         return Rows(**{name: value[chosen] for name, value in vars(self).items()})
 
 
@@ -110,7 +112,8 @@ def rows_of(series: Series, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # Q is orthogonal, so the sum of n equal rests is sqrt(n) times a single rest.
+        # The factor Q of the singular value decomposition is orthogonal, so the sum of n equal
+        # rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
         summed = (series.miss, series.by_parameter, series.by_level, series.lack)
@@ -127,12 +130,12 @@ def rows_of(series: Series, scatter: float) -> Rows:
     searched = rows.start[rows.rank < _SEARCH_ROWS]
     if len(searched) <= _MOST_ROWS:
         return rows
-    # Older starts have little information about the present state.
+    # Older starts of the node have little information about the present state.
     return rows.at(rows.start > searched[-_MOST_ROWS])
 
 
 class Model:
-    """The covariance of the rows as a function of the variances, with given changes."""
+    """The covariance of the model's rows as a function of the variances, with given changes."""
 
     def __init__(
         self, rows: Rows, calibration: Calibration, since: float, changes: Sequence[Change] = ()
@@ -152,7 +155,7 @@ class Model:
             np.where(is_same, along, 0.0),
             np.diag(rows.scatter),
         ]
-        # The lack of fit is correlated between temperatures less than some 10 K apart.
+        # The lack of fit is correlated between temperatures that differ by less than about 10 K.
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
@@ -161,7 +164,7 @@ class Model:
             self.base += change.sd**2 * columns @ columns.T
 
     def covariance(self, ageing: Ageing) -> Floats:
-        """Return the covariance of the rows."""
+        """Return the covariance of the model's rows."""
         result: Floats = self.base.copy()
         for sd, part in zip(vars(ageing).values(), self.parts, strict=True):
             result += sd**2 * part
@@ -184,8 +187,8 @@ class Model:
             ]
             return float(value), np.array(slope) + away / _LOG_SD
 
-        # Small variances have almost no gradient, so the search has two initial points: all
-        # scatter is due to the starts, or all of it to the random walks.
+        # The evidence has almost no gradient where variances are small, so the search has two
+        # initial points: all scatter is due to the starts, or all scatter to the random walks.
         steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
         step = max(float(np.median(steps)), centre.rest)
         bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD
@@ -207,13 +210,13 @@ class Model:
         return ageing, self.inverse(ageing)
 
     def inverse(self, ageing: Ageing) -> Floats:
-        """Return the inverse covariance of the rows."""
+        """Return the inverse covariance of the model's rows."""
         factor = cho_factor(self.covariance(ageing), lower=True)
         return np.asarray(cho_solve(factor, np.eye(len(self.rows.y))))
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the centre of the priors; its turn-on sd is the residual or the noise in 1 Hz."""
+    """Return the centre of the priors; its turn-on sd is the residual sd, or the noise in 1 Hz."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -222,11 +225,11 @@ def usual(calibration: Calibration) -> Ageing:
 
 def learn(series: Series, calibration: Calibration, since: float) -> tuple[Ageing, Model, Series]:
     """
-    Estimate variances and changes by evidence, without starts that contradict all others.
+    Estimate variances and changes by evidence, without starts that contradict all other starts.
 
-    At most four changes are added, each with a log Bayes factor of at least 5. A start is left out
-    if one of its rows is more than 5 sd from the prediction by all other rows. Returns the
-    variances, the model of all rows, and the rests used.
+    At most four changes are added, each with a log Bayes factor of at least 5. A start of the node
+    is left out if one of its rows is more than 5 sd from the prediction by all other rows. Returns
+    the variances, the model of all rows, and the rests used.
     """
     centre = usual(calibration)
     is_used = np.ones(len(series), dtype=np.bool_)
@@ -250,7 +253,7 @@ def learn(series: Series, calibration: Calibration, since: float) -> tuple[Agein
         bad = rows.start[np.abs(left_out) > 5.0]
         at = np.flatnonzero(is_used)
         is_bad = np.isin(used.start, bad)
-        # If more than 10 % of the rests are affected they are a model error, not outliers.
+        # If more than 10 % of the rests are outliers, the model is wrong, so all rests are kept.
         if not len(bad) or is_bad.sum() > 0.1 * len(used):
             break
         is_used[at[is_bad]] = False
@@ -258,7 +261,9 @@ def learn(series: Series, calibration: Calibration, since: float) -> tuple[Agein
 
 
 def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
-    """Yield the jumps before each start, and a change of the curve, with log Bayes factors."""
+    """
+    Yield possible jumps before each start, and a change of the curve, with log Bayes factors.
+    """
     rows = model.rows
     alpha, by_level = inverse @ rows.y, rows.by_level * _JUMP_SHARES
     _, first = np.unique(rows.start, return_index=True)
@@ -287,7 +292,9 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
 
 
 def _log_bayes_factor(precision: Floats, pull: Floats, sd: float) -> float:
-    """Return the gain in log evidence by a change of prior sd `sd`, marginal over all else."""
+    """
+    Return the gain in log evidence by a change of prior sd `sd`, marginal over all other unknowns.
+    """
     inner = np.eye(len(pull)) + sd**2 * precision
     gain = 0.5 * sd**2 * pull @ np.linalg.solve(inner, pull)
     return float(gain - 0.5 * np.linalg.slogdet(inner)[1])
@@ -312,13 +319,13 @@ class Solution:
     innovations: Floats
 
     def before(self, row: int) -> Floats:
-        """Return the shift by the first rows only."""
+        """Return the shift that follows from the first rows only."""
         return np.asarray(self.gains[:row].T @ self.innovations[:row])
 
 
 def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: float) -> Solution:
     """
-    Condition the parameters on the rests.
+    Condition the parameters of the calibration on the rests.
 
     `to_file`: derivatives of the file's parameters by the six levels, (n_parameters, 6); `bend`:
     by a slope of each axis, (n_parameters, 3); `ahead`: time of use after the last rest [days].

@@ -4,9 +4,10 @@
 Owns the detection of rests in a stream of samples: windows of 10 s without motion.
 
 Samples are summed by whole seconds of their stamps. A second is still if its standard deviation is
-that of the noise and its mean agrees with that of the second before (the thresholds of
-`online.checks.GravityCheck`). Ten still seconds in a row are a window. In a long rest all windows
-of the first ten minutes are kept, one per minute up to an hour, then one in five minutes.
+that of the noise and its mean agrees with the mean of the second before (thresholds as in
+`online.checks.GravityCheck`). Ten still seconds in a row form a window. In a long rest all windows
+of the first ten minutes are kept, then one window per minute up to an hour, then one window per
+five minutes.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,15 +19,18 @@ from ..online.checks import LARGEST_CHANGE, SCATTER_FACTOR, SMALLEST_WINDOW
 from ..typing import Floats, Stamps
 from .rest import Rest
 
-SECONDS = 10  # length of a window [s]
+SECONDS = 10  # length of a window of a rest [s]
 _SECOND_NS = 1_000_000_000
-#: Number of a window in its rest, and n: from this window on every n-th window is kept.
+#: Number of a window in its rest, and n: from the window with this number on, every n-th window is
+#: kept.
 _SPACING = ((360, 30), (60, 6), (0, 1))
 
 
 @dataclass
 class _Second:
-    """Sums over one second of the stamps; `origin`, its first sample, keeps the sums small."""
+    """
+    Sums over one second of the stamps; subtracting the first sample, `origin`, keeps them small.
+    """
 
     number: int
     origin: Floats
@@ -50,17 +54,20 @@ class RestFinder:
     def __init__(
         self, scale: Floats, noise: Floats, full_scale: float, state_now: StateNow
     ) -> None:
-        # `scale`: input units per m/s^2; `noise`: variance of one sample [m^2/s^4], by axis.
+        # `scale`: scale factors [input units per m/s^2]; `noise`: variance of one sample
+        # [m^2/s^4], by axis.
         self._scale, self._noise, self._full_scale = scale, float(noise.sum()), full_scale
         self._state_now = state_now
         self._second: _Second | None = None
         self._run: list[_Second] = []
         self._states: list[tuple[Sequence[float], Sequence[float]]] = []
         self._n_windows = 0
-        self._last: list[_Second] = []  # the last second of the previous window
+        self._last: list[_Second] = []  # sums of the last second of the previous window
 
     def add(self, stamps: Stamps, samples: Floats) -> list[Rest]:
-        """Take samples with rising stamps, (n, 3), or (n, 6) with the rate; return new rests."""
+        """
+        Take samples with rising stamps, (n, 3), or (n, 6) with angular rates; return new rests.
+        """
         rests: list[Rest] = []
         seconds = stamps // _SECOND_NS
         cuts = np.flatnonzero(np.diff(seconds)) + 1
@@ -89,7 +96,7 @@ class RestFinder:
             if self._n_windows % spacing == 0:
                 rests.append(self._window())
             self._n_windows += 1
-            # The first second of the next window is compared with the last second of this one.
+            # The first second of the next window is compared with the last second of this window.
             self._run, self._states = [], []
             self._last = [second]
         if following != second.number + 1:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the record of a rest, one line of text with a checksum, and the thinning of such lines.
+Owns the record of a rest, one line of text with a checksum, and the thinning of rest logs.
 
 A rest log is a folder of files, one per day (UTC). Each line is a CRC-32 in hexadecimal, a blank,
 and JSON: an object describes a start of the node, a list is a window at rest since that start.
@@ -18,16 +18,18 @@ from typing import Any
 from ..thermal.memory import Lag, MemorySpec, Play
 from ..thermal.state import Layout
 
-#: Ending of the files of a log; their names are the days, 2026-11-25.rests.
+#: Suffix of the files of a rest log; the name of a file is the day, as in 2026-11-25.rests.
 SUFFIX = '.rests'
 
-#: First bytes after the checksum of a start and of a rest.
+#: First bytes after the checksum, for the record of a start and for that of a rest.
 _OF_START, _OF_REST = b' {', b' ['
 
 
 @dataclass(frozen=True)
 class Start:
-    """A start of the node, or a change of its calibration since (then `start_ns` stays)."""
+    """
+    A start of the node, or a later change of its calibration, with the `start_ns` of the start.
+    """
 
     start_ns: int
     serial: str
@@ -40,10 +42,10 @@ class Start:
 @dataclass(frozen=True)
 class Rest:
     """
-    A window at rest. `stamp_ns`: its middle; `n`: number of samples; `mean` and `sd` of one sample
-    [input units]; `state`: mean thermal state, laid out as by `thermal.state.Layout` of the
-    start's memory; `shares`: remaining share of the unseen start of each lag; `rate`: mean angular
-    rate [rad/s], empty if unknown.
+    One window of samples at rest. `stamp_ns`: stamp of the window's middle; `n`: number of
+    samples; `mean` and `sd` of one sample [input units]; `state`: mean thermal state, laid out as
+    by `thermal.state.Layout` of the start's memory; `shares`: remaining share of the unseen start
+    of each lag; `rate`: mean angular rate [rad/s], empty if unknown.
     """
 
     stamp_ns: int
@@ -56,10 +58,10 @@ class Rest:
 
 
 def encode(one: Start | Rest) -> bytes:
-    """Write one record as a line."""
+    """Write a start or a rest as a line."""
     if isinstance(one, Start):
-        # Earlier releases know neither rates nor the later fields of lags and plays: these are
-        # written only if they differ from their defaults.
+        # Earlier releases cannot read angular rates and the newer fields of lags and plays: such
+        # fields are written only if they differ from their defaults.
         sensors, lags, plays, rates = vars(one.memory).values()
         memory = [sensors, *([_shortened(each) for each in all_] for all_ in (lags, plays))]
         data: Any = {**vars(one), 'memory': [*memory, rates] if rates else memory}
@@ -82,7 +84,7 @@ def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
 
 
 def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
-    """Read the rests of a file, each with its start; count the damaged lines."""
+    """Read the rests of a file, each with its start of the node; count the damaged lines."""
     rests: list[tuple[Start, Rest]] = []
     start: Start | None = None
     n_damaged = 0
@@ -98,7 +100,7 @@ def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
             elif start is not None:
                 rests.append((start, _rest(data, start.memory)))
         except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
-            # A valid checksum does not imply valid content.
+            # A line with a valid checksum can have invalid content.
             n_damaged += 1
     return rests, n_damaged
 
@@ -128,7 +130,7 @@ def _rest(data: list[Any], memory: MemorySpec) -> Rest:
 
 
 def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
-    """Make a lag or play from the values of its first fields."""
+    """Make a lag or a play from the values of its first fields."""
     names = cls._fields[: len(values)]
     return cls(
         *(
@@ -139,7 +141,7 @@ def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
 
 
 def _number(value: float) -> float:
-    # 1e12 is far above any sample.
+    # The limit 1e12 is far above any sample.
     if not abs(value) < 1e12:
         raise ValueError(value)
     return float(value)
@@ -157,7 +159,9 @@ def counted_rests(content: bytes) -> int:
 
 
 def thinned(content: bytes) -> bytes:
-    """Drop every second rest of a file, and damaged lines; each start keeps its first rest."""
+    """
+    Drop every second rest of a file, and damaged lines; the first rest of each start is kept.
+    """
     kept: list[bytes] = []
     n = 0
     for line in content.splitlines(keepends=True):

@@ -5,8 +5,8 @@ Owns rests as measurements of a calibration: ``|f| - g`` and its derivatives by 
 
 A rest at an unknown attitude measures one number. With x the axes' forces before the misalignment
 M, f = M x, u = f / |f| and v = M^T u, an error d_bias [input units] and d_scale [relative] of axis
-i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order the true error of
-the calibration along u is ``|f| - g = H (true - calibrated) + noise``.
+i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order ``|f| - g = H (true
+- calibrated parameters) + noise``.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
 
 _DAY_NS = 86_400e9
-#: Parts of the name of an update's source, before the time of its last rest, and before the days
-#: by which its covariance was aged.
+#: Parts of the name of an update's source: before the time of the last rest, and before the number
+#: of days by which the covariance was aged.
 _UNTIL, _AGED = 'rests until ', ', claim aged '
 
 
@@ -70,12 +70,12 @@ class Series:
 
     @property
     def day(self) -> Ints:
-        """Number of the day of the start of each rest, since 1970."""
+        """Day of each rest's start of the node, in days since 1970."""
         _, first = np.unique(self.start, return_index=True)
         return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
 
     def at(self, chosen: Bools | slice) -> Series:
-        """Return the chosen rests; their starts are numbered anew."""
+        """Return the selected rests; the starts of these rests are numbered from 0."""
         parts: dict[str, Any] = {
             name: value[chosen]
             for name, value in vars(self).items()
@@ -102,7 +102,7 @@ def read_rests(
 
     Returns the rests, the provenance of an update aged `ahead` days, and notes for the user.
 
-    Rests before the calibration are left out, unless all rests are before it; for an update, rests
+    Rests before the calibration are left out, unless all rests are before the calibration; rests
     that an earlier update used are always left out. Raises RecordingError if no rest is left.
     """
     files: list[Path] = []
@@ -135,7 +135,7 @@ def read_rests(
     if not rests:
         raise RecordingError(f'no rest of unit {unit.serial}', ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
-    # The time in the source's name is rounded down to a second.
+    # The time in the name of an update's source is rounded down to a second.
     first_ns = begin * _DAY_NS + 1e9 * is_update
     later = [(start, rest) for start, rest in rests if rest.stamp_ns > first_ns]
     if is_update and not is_for_update:
@@ -174,7 +174,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
         ahead = float(aged.removesuffix(' d') or 0.0)
     except ValueError:
         return -np.inf, -np.inf, False
-    # A covariance aged by a century or more makes the file invalid.
+    # With a covariance aged by a century or more the calibration file would be invalid.
     if np.isnat(moment) or not 0.0 <= ahead < 36525.0:
         return -np.inf, -np.inf, False
     begin = int(moment.astype(np.int64)) / _DAY_NS
@@ -184,7 +184,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
 def series_of(
     rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
 ) -> Series:
-    """Evaluate rests at the logged or given gravity; RecordingError if their log lacks a lag."""
+    """Evaluate rests at the logged or given gravity; RecordingError if the log lacks a lag."""
     correction = Correction(calibration)
     layout, K = Layout(correction.memory), correction.K[:, 0]
     places = {spec: _places(spec, correction.memory) for spec in {s.memory for s, _ in rests}}
@@ -239,7 +239,9 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the places of a state's elements, and of its lags' shares, in the log's state."""
+    """
+    Return the places in a log's state of the elements, and of the lag shares, of another state.
+    """
     try:
         logged, target = Layout(memory).numbers, Layout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)
@@ -255,9 +257,9 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     """
     Assign windows to groups of consecutive windows that are averaged, at most 60.
 
-    The windows of a group have the same start. Direction and temperature differ by less than 1e-3
-    rad and 1 K from those of the first window; the norm of a mean of vectors is smaller by
-    half the squared angle.
+    All windows of a group belong to the same start of the node. Direction and temperature of a
+    group's windows differ by less than 1e-3 rad and 1 K from those of the first window; the norm
+    of a mean of vectors is smaller by half the squared angle.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)
@@ -282,7 +284,7 @@ def _along(
     v: Floats,
     x: Floats,
 ) -> Floats:
-    """Project the error variance, less a sample's noise, on the direction of the force."""
+    """Return the error variance along the force, without the noise of a sample."""
     parts = np.array(
         [slow.at(s, p) for s, p in zip(states.tolist(), shares.tolist(), strict=True)]
     )

@@ -33,12 +33,13 @@ AHEAD_DAYS = 1.0
 @dataclass(frozen=True)
 class Moved:
     """
-    Changes of one axis, each with its posterior sd; 0 if the rests do not determine the axis.
+    Changes of an axis' constants, each with posterior sd; 0 if the rests do not determine the
+    axis.
 
-    bias: at the temperature of the rests [m/s^2]
-    scale: relative
-    curve: of the bias over the temperatures of the rests [m/s^2]
-    reading: of bias plus scale at the mean force of the rests [m/s^2]
+    bias: change of the bias at the temperature of the rests [m/s^2]
+    scale: relative change of the scale
+    curve: change of the bias curve over the temperatures of the rests [m/s^2]
+    reading: change by bias plus scale at the mean force of the rests [m/s^2]
     """
 
     axis: str
@@ -75,7 +76,7 @@ class Judged:
 
     @property
     def is_better(self) -> bool:
-        """Whether the gain exceeds its standard error."""
+        """Whether the mean gain on left-out rests exceeds its standard error."""
         return self.gain > self.gain_sd
 
     def __str__(self) -> str:
@@ -111,8 +112,9 @@ def update(
     """
     Update a calibration by rests.
 
-    `source`, `created`: for the new file's provenance; `ahead`: time after the last rest for which
-    the covariance is aged [days]. Raises FitError if there are fewer than three starts.
+    `source`, `created`: source and date for the new file's provenance; `ahead`: time after the
+    last rest for which the covariance is aged [days]. Raises FitError if the rests belong to fewer
+    than three starts of the node.
     """
     n_starts = int(series.start[-1]) + 1
     if n_starts < 3:
@@ -130,7 +132,7 @@ def update(
     determined, moved = _moved(used, calibration, solution)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
-    # For parameters that are not updated, the omitted shift is an additional error.
+    # For parameters that are not updated, the shift that is not applied is an additional error.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
     axis_determined = [change.is_determined for change in moved]
@@ -196,7 +198,7 @@ def _slopes(calibration: Calibration) -> Floats:
 def _moved(
     series: Series, calibration: Calibration, solution: Solution
 ) -> tuple[Bools, tuple[Moved, ...]]:
-    """Find the parameters that the rests determine, and list the changes by axis."""
+    """Find the parameters that the rests determine, and list the changes of each axis."""
     layout, correction = parameter_layout(calibration), Correction(calibration)
     coolest, warmest = np.argsort(series.temperature)[[len(series) // 10, -1 - len(series) // 10]]
     states = np.array([series.state.mean(axis=0), series.state[coolest], series.state[warmest]]).T
@@ -227,7 +229,7 @@ def _moved(
 
 
 def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score updates by earlier rests on each day; below five days, on each start."""
+    """Score updates by earlier rests on each day or, with fewer than five days, on each start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -254,7 +256,7 @@ def _judged(series: Series, model: Model, solution: Solution, determined: Bools)
 
 
 def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Calibration:
-    """Add a shift to the parameters; the levels of the scale multiply K."""
+    """Add a shift to a calibration's parameters; a shift of a scale's level multiplies K."""
     layout = parameter_layout(calibration)
     of_scale = np.array([shift[block.static] for block in layout.scale])
     K = np.array([axis.scale_factor for axis in calibration.axes])
@@ -266,7 +268,7 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
 
 
 def _with_residual(part: RegimeSet, turn_on: float, determined: Sequence[bool]) -> RegimeSet:
-    """Raise the slow error of each axis to that of the starts, if the latter is larger."""
+    """Raise the slow error of each axis to the scatter of the starts, if this is larger."""
     axes: dict[str, Any] = {
         name: replace(
             axis,

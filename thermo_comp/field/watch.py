@@ -3,9 +3,9 @@
 """
 Owns the drift watch: ``|f| - g`` of a rest log against the claimed sd, and a forecast.
 
-A unit is within its claim while the error along gravity is within `LIMIT` claimed sd. The forecast
-assumes a random walk of the error from its present estimate, with the variance estimated from the
-log: it is the distribution of the first passage of either bound.
+A unit is within its claim while its error along gravity is at most `LIMIT` claimed sd. The
+forecast is the distribution of the time at which the error first exceeds either bound, for a
+random walk from the present estimate with the variance estimated from the log.
 """
 
 from collections.abc import Sequence
@@ -23,13 +23,13 @@ from .update import update
 LIMIT = 2.0
 #: Probabilities of the forecast, and its horizon [days].
 _QUANTILES, _HORIZON = (0.1, 0.5, 0.9), 3650.0
-#: Width of a class of temperature [K], and largest number of periods.
+#: Width of a class of temperature [K], and largest number of periods in the table.
 _CLASS_K, _PERIODS = 10.0, 30
 
 
 @dataclass(frozen=True)
 class Row:
-    """``|f| - g`` over the rests of a day or of a class of temperature [m/s^2]."""
+    """``|f| - g`` over the rests of a day, a period or a class of temperature [m/s^2]."""
 
     name: str
     n_rests: int
@@ -41,7 +41,7 @@ class Row:
 
     @property
     def is_within(self) -> bool:
-        """Whether the RMS is within the limit: the tolerance, or a multiple of the claim."""
+        """Whether the RMS is at most the limit: the tolerance, or a multiple of the claimed sd."""
         return self.rms <= self.limit
 
 
@@ -52,9 +52,9 @@ class Watch:
 
     days, periods, temperatures: by day, by period (at most 30), by class of temperature
     left: first day of the last period outside the claim; None for a unit within its claim
-    forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit leaves its
-        claim [days]; infinite: later than ten years
-    interval: the same quantiles for a unit that has just been updated
+    forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
+        exceeds its claim [days]; infinite if later than ten years
+    interval: the quantiles of `forecast` for a unit that has just been updated
     """
 
     days: tuple[Row, ...]
@@ -68,7 +68,7 @@ class Watch:
 
     @property
     def exit_code(self) -> int:
-        """1 if the error of the unit exceeds the claim, else 0."""
+        """Exit code of the command: 1 if the error of the unit exceeds its claim, else 0."""
         return 1 if self.left else 0
 
     def __str__(self) -> str:
@@ -92,7 +92,9 @@ class Watch:
 
 
 def watch(series: Series, calibration: Calibration, tolerance: float | None = None) -> Watch:
-    """Compare rests with the claim or a tolerance of ``|f| - g`` [m/s^2]; forecast the excess."""
+    """
+    Compare rests with the claimed sd or a tolerance of ``|f| - g`` [m/s^2]; forecast the excess.
+    """
     names = np.array([str(np.datetime64(int(day), 'D')) for day in series.day])
     ordered = np.unique(names)
     days = _rows(series, names, ordered.tolist(), tolerance)
@@ -102,7 +104,7 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
     classes = [f'{edge:g} .. {edge + _CLASS_K:g} degC' for edge in lower]
     warmer = [f'{edge:g} .. {edge + _CLASS_K:g} degC' for edge in np.unique(lower)]
     is_out = [not row.is_within for row in days]
-    # Two days in a row are required: on a single day the unit may have been disturbed.
+    # The claim must be exceeded on two days in a row: on one day the unit may have been disturbed.
     n_out = ([*is_out[::-1], False]).index(False)
     left = days[-n_out].name if n_out >= min(2, len(days)) and n_out else None
     last, ageing = days[-1].name, None
@@ -146,9 +148,9 @@ def passage(error: float, sd: float, rate: float, bound: float) -> tuple[float, 
     """
     Return quantiles of the time [days] after which a random walk first exceeds a bound.
 
-    The walk begins at N(error, sd^2) and its variance grows by `rate` per day. A walk from x stays
-    inside (-c, c) until t with the probability ``sum_k 4 / (k pi) sin(k pi (x + c) / 2 c) exp(-(k
-    pi)^2 rate t / 8 c^2)`` over odd k.
+    The random walk begins at N(error, sd^2), and its variance grows by `rate` per day. A random
+    walk from x stays inside (-c, c) until t with the probability ``sum_k 4 / (k pi) sin(k pi (x +
+    c) / 2 c) exp(-(k pi)^2 rate t / 8 c^2)`` over odd k.
     """
     # 60 terms of the sum suffice for times above a thousandth of the median.
     k = np.arange(1, 120, 2) * np.pi

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the fit: bags of a thermal test -> still positions -> regression -> calibration, with proof.
+Owns the fit of a calibration: bags of a thermal test, positions at rest, regression, left-out
+errors.
 """
 
 from .evidence import ResidualRow

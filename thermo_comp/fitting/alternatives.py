@@ -28,7 +28,8 @@ def model_of(
     bags: Sequence[ReducedBag], options: FitOptions, parts: tuple[Part, Part, Part] | None = None
 ) -> Model:
     """
-    Return the model of the prior, or else a model with all columns that the bags can determine.
+    Return the model of the prior or, without a prior, a model with all columns that the bags can
+    determine.
 
     `parts`: the lag of each axis, see `Model`; None for the bank of time constants
     """
@@ -72,7 +73,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves of the program limit the number of columns, which is equal in both models.
+    # Left-out halves of the program are not compared: they limit the number of columns, which is
+    # equal in both models.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -84,7 +86,7 @@ def windows_of(
     undisturbed: Floats | None = None,
 ) -> ThermalWindows:
     """
-    Return the windows of bags, with |f| of each position.
+    Return the windows of bags, with the known |f| of each position.
 
     `tracks`: thermal states of the bags, if they were computed before
     `undisturbed`: factors of the weights of the windows, see `Parts`
@@ -97,8 +99,8 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows with one lag per axis, or with a bank of time constants.
 
-    The bank is fitted if no lag per axis is found, or if the lags leave more left-out drift than
-    noise explains. The bank replaces the lags per axis if it is better on left-out data.
+    The bank is fitted if no lag per axis is found, or if the left-out drift with the lags exceeds
+    noise. The bank replaces the lags per axis if it is better on left-out data.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -108,7 +110,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     model = model_of(bags, options, parts.lags)
     of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
     fit = regress(of_parts, problem)
-    # The noise estimated by the fit includes the error of the lags; `parts.noise` does not.
+    # The white noise estimated by the fit includes the error of the lags, unlike `parts.noise`.
     if fit.selected.score.rms > 2.0 * parts.noise:
         with_bank = regress(windows, problem)
         if is_better(fit.selected.score, with_bank.selected.score):
@@ -120,8 +122,8 @@ def _may_have_sets(selected: Selected) -> bool:
     """
     Whether the chosen model has two sets, or a model with two sets is similarly good.
 
-    A model is similarly good if its left-out error is within one standard error of that of the
-    chosen model, and its white noise is less than 80 % of that of the chosen model, on every axis.
+    A model is similarly good if its left-out error is within one standard error of the chosen
+    model's error, and its white noise is less than 80 % of the chosen model's noise on every axis.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -133,7 +135,9 @@ def _may_have_sets(selected: Selected) -> bool:
 
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Name the case thermometer, then all others, except the board's, that every bag has."""
+    """
+    Name the case thermometer, then all other thermometers, except the board's, that every bag has.
+    """
     seen = (
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags

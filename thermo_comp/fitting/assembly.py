@@ -60,7 +60,7 @@ def build_calibration(
     """
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
-    # Response columns with a weight, or with an entry in the covariance alone.
+    # Response columns that have a weight, or only an entry in the covariance.
     used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_parameters(regression, layout, state, model, used, kinds)
@@ -97,9 +97,9 @@ def build_calibration(
 
 def _temperature_range(windows: ThermalWindows) -> Range:
     """
-    Return the valid range of temperatures. A test at one temperature is valid within 0.5 K of this
-    temperature. Without a thermometer the margin is 50 K, and the covariance of the slope covers
-    the unknown curve.
+    Return the valid range of board temperatures. The calibration of a test at one temperature is
+    valid within 0.5 K of this temperature. Without a thermometer the range has a margin of 50 K,
+    and the covariance of the slope covers the unknown curve.
     """
     return _range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
@@ -145,11 +145,11 @@ def _valid_columns(
             order = column.term.order
             valid = _range(windows.raw[:, k], 0.01, order)
             if k not in weighed:
-                # A column with zero weight contributes only to the covariance, which is valid at
-                # any value.
+                # A column with zero weight contributes only to the covariance, and is valid at any
+                # value.
                 most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
-        # A column that is used only in the curves of parts gets the group of these curves.
+        # A column used only in the curves over parts' temperatures gets the group of these curves.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if known is None else union((valid, column.range))
         result.append(replace(column, group=group, range=valid))
@@ -288,13 +288,13 @@ def file_parameters(
     kinds: Sequence[Kind] = (),
 ) -> Floats:
     """
-    Return the derivatives of the file's parameters by the regression's, both in their own order.
+    Return the derivatives of the file's parameters by the regression's parameters.
 
     `used`: response columns in the file; `kinds`: nonlinear terms in the file
     """
     sets, sums = model.sets, model.part_curves.sums
     n, m = sets.static.n_free, sets.dynamic.n_free
-    # The last row is zero: place -1 marks a parameter that is not estimated.
+    # The last row is zero, because the place -1 marks a parameter that is not estimated.
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)
     rows: list[Floats] = []
     for axis, K in enumerate(regression.nominal_scale):
@@ -306,7 +306,7 @@ def file_parameters(
             (of_scale, 1.0, unknown[layout.kappa[axis]] / state.kappa[axis]),
         ):
             each = unknown[places] * (unit / regression.rms)[:, None]
-            # Curves of parts are sums of the other columns.
+            # Curves over the temperatures of parts are sums of the other columns.
             each, of_parts = np.split(each, [sums.shape[1]])
             each = each + sums.T @ of_parts
             static, (delta,), dynamic, response = np.split(each, [n, n + 1, n + 1 + m])
@@ -345,7 +345,7 @@ def _triple(values: Floats) -> tuple[float, float, float]:
 
 
 def union(ranges: Iterable[Range]) -> Range:
-    """Return the smallest range that contains all ranges."""
+    """Return the smallest range that contains all given ranges."""
     lower, upper = zip(*ranges, strict=True)
     return min(lower), max(upper)
 
@@ -354,11 +354,12 @@ def _range(values: Floats, smallest_margin: float, order: int = 0) -> Range:
     """
     Return the valid range of a quantity that is a power (`order`) of a heat flow: the range of its
     values with a margin, extended to ramps twice as fast, since the response to a heat flow is
-    linear. Order 0: a temperature, valid only within the data.
+    linear. A quantity of order 0 is a temperature and valid only within the data.
     """
     ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))
-    # 2 % of the span: thermometer noise shall not put the fitted data outside their own range.
+    # The margin is 2 % of the span, so that thermometer noise does not put the fitted data outside
+    # the valid range.
     margin = max(0.02 * (upper - lower), smallest_margin)
     lower, upper = lower - margin, upper + margin
     return min(lower, ratio * lower), max(upper, ratio * upper)

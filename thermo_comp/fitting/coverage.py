@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the design of positions: their directions, the covariance that they give, the next direction.
+Owns the design of a test's positions: directions, resulting covariance of the constants, next
+direction.
 
 At rest |f| = g is known, so each position gives one equation for the nine constants of a triad:
 bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. With equations
@@ -23,14 +24,14 @@ from ..unit.gravity import STANDARD_GRAVITY
 from .start import constant_calibration
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD
 
-#: Prior sd of the nine constants: bias [g], relative scale, misalignment [rad].
+#: Prior sd of a triad's nine constants: bias [g], relative scale, misalignment [rad].
 PRIOR_SD = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, MISALIGNMENT_SD], 3)
 #: Largest angle between two rests of the same position [deg].
 SAME_DIRECTION_DEG = 5.0
 
 
 def force_columns(up: Floats) -> Floats:
-    """Differentiate the force by the nine constants, at unit vectors (n, 3): shape (n, 3, 9)."""
+    """Differentiate the force at unit vectors (n, 3) by a triad's constants: shape (n, 3, 9)."""
     columns = np.zeros((len(up), 3, 9))
     for axis in range(3):
         columns[:, axis, axis] = 1.0
@@ -40,32 +41,34 @@ def force_columns(up: Floats) -> Floats:
 
 
 def norm_columns(up: Floats) -> Floats:
-    """Differentiate the magnitude by the nine constants, at unit vectors (n, 3): shape (n, 9)."""
+    """Differentiate |f| at unit vectors (n, 3) by the nine constants of a triad: shape (n, 9)."""
     return np.asarray(np.einsum('ni,nij->nj', up, force_columns(up)))
 
 
 def constants_covariance(
     up: Floats, sd: Floats, misalignment_sd: float = MISALIGNMENT_SD
 ) -> Floats:
-    """Return the covariance of the constants for positions `up` (n, 3) of noise `sd` (n,) [g]."""
+    """Return the covariance of a triad's constants by positions `up` (n, 3) of noise `sd` [g]."""
     seen = norm_columns(up) / sd[:, None]
     prior_sd = np.append(PRIOR_SD[:6], [misalignment_sd] * 3)
     return np.asarray(np.linalg.inv(np.diag(prior_sd**-2) + seen.T @ seen))
 
 
 def worst_sd(covariance: Floats) -> float:
-    """Largest standard deviation of the force, over all attitudes and directions of error [g]."""
+    """
+    Largest standard deviation of the force over all attitudes and directions of its error [g].
+    """
     columns = force_columns(_SPHERE)
     return math.sqrt(np.max(np.linalg.eigvalsh(columns @ covariance @ columns.transpose(0, 2, 1))))
 
 
 def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
     """
-    Find the direction where a position of noise `sd` [g] lowers the mean variance the most.
+    Find the direction in which a position of noise `sd` [g] most lowers the mean variance.
 
     Faces of a cube, which are the easiest to hold, are preferred if their gain is at least half of
-    the largest, then edges, then corners. Directions closer than 20 degrees to one of `seen`,
-    shape (n, 3), are not proposed.
+    the largest, then edges, then corners. Directions closer than 20 degrees to a direction in
+    `seen`, shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -75,7 +78,7 @@ def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
     gain /= np.einsum('ij,ij->i', moved, columns_of_norm) + sd * sd
     gain[np.max(_SPHERE @ seen.T, axis=1, initial=-1.0) > math.cos(math.radians(20.0))] = 0.0
     good = gain >= max(0.5 * gain.max(), 1e-300)
-    # Slices of `_SPHERE`: faces, edges and corners of a cube, then all other directions.
+    # Slices of `_SPHERE`: faces, edges and corners of a cube, and all other directions.
     tiers = slice(0, 6), slice(6, 18), slice(18, 26), slice(26, None)
     tier = next(tier for tier in tiers if good[tier].any())
     return np.asarray(_SPHERE[tier][np.argmax(gain[tier] >= 0.99 * gain[tier].max())])
@@ -89,7 +92,7 @@ def farthest(up: Floats) -> tuple[Floats, float]:
 
 
 def distinct_directions(up: Floats) -> Floats:
-    """Return the unit vectors, shape (n, 3), without those close to an earlier one."""
+    """Return the unit vectors, shape (n, 3), without vectors close to an earlier vector."""
     kept: list[Floats] = []
     limit = np.cos(np.radians(SAME_DIRECTION_DEG))
     for direction in up:
@@ -99,17 +102,19 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """Return unit vectors of mean readings (n, 3) about a centre; NaN at the centre."""
+    """
+    Return the directions of mean readings (n, 3) from a centre; NaN for a reading at the centre.
+    """
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
 
 def rough_centre(means: Floats) -> Floats:
     """
-    Return the reading at zero force: 0 if the norms of the readings agree, else a sphere's centre.
+    Return the reading at zero force: 0 if the norms of readings agree, else a sphere's centre.
 
-    With offset binary codes the angles between raw vectors are meaningless. `means` has shape
-    (n, 3); if they are fewer than four, or in a plane, the result is 0.
+    With offset binary codes the angles between raw vectors are meaningless. `means`: mean
+    readings, shape (n, 3); with fewer than four, or all in a plane, the result is 0.
     """
     zero = np.zeros(3)
     if len(means) < 4:
@@ -121,20 +126,23 @@ def rough_centre(means: Floats) -> Floats:
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
-    # Points with less than 2 % of their variance across a plane do not determine a centre.
+    # Points with less than 2 % of their variance across a plane do not determine a sphere's
+    # centre.
     if values[0] < 0.02 * values[2]:
         return zero
     # A sphere about c satisfies |m|^2 = 2 c m + const; subtracting the mean keeps numbers small.
     columns = np.column_stack((2.0 * arms, np.ones(len(arms))))
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
-    # The sphere is accepted if its radii vary by less than 10 %.
+    # The sphere is accepted if the distances from its centre vary by less than 10 %.
     is_sphere = np.std(radii) < 0.1 * np.mean(radii)
     return np.asarray(means.mean(axis=0) + centre) if is_sphere else zero
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the largest sd of a constant per unit of norm noise, for directions (n, 3)."""
+    """
+    Return the largest sd of a triad's constant per unit of noise of |f|, for directions (n, 3).
+    """
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -147,7 +155,7 @@ def best_rests(candidates: list[Floats]) -> int:
     Return the best of several sets of rests, each given as mean readings of shape (n, 3).
 
     The best set has the smallest sd of the constants, from the residuals of |f| and the directions
-    of its rests. The first set, which has the strictest thresholds, is taken unless another is
+    of its rests. The first set, which has the strictest thresholds, is taken if no other set is
     better by 2 %, or if no set has six attitudes.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
@@ -163,7 +171,9 @@ def best_rests(candidates: list[Floats]) -> int:
 
 
 def _cost(means: Floats, with_misalignment: bool) -> float:
-    """Return the largest sd of a constant at the scatter of the rests, in units of g."""
+    """
+    Return the largest sd of a constant of a triad, given the scatter of the rests' norms [g].
+    """
     n_free = len(means) - (9 if with_misalignment else 6)
     if n_free < 0:
         return np.inf
@@ -197,13 +207,15 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """Find the least known attitude for positions (n, 3); None without a covariance."""
+    """
+    Find the attitude with the largest sd of |f|, given positions (n, 3); None without covariance.
+    """
     if calibration.posterior is None:
         return None
     layout, axes = parameter_layout(calibration), calibration.axes
     levels = [block.static for block in (*layout.bias, *layout.scale)]
     places = [*levels, *range(layout.misalignment, layout.misalignment + 3)]
-    # A bias or scale that is too large makes the corrected force too small.
+    # A calibrated bias or scale that is too large makes the corrected force too small.
     unit = np.array([-1.0 / axis.scale_factor for axis in (axes.x, axes.y, axes.z)])
     unit = np.concatenate((unit, np.repeat((-1.0, 1.0), 3) * calibration.gravity_m_s2))
     covariance = calibration.posterior.covariance()[np.ix_(places, places)] * np.outer(unit, unit)
@@ -223,7 +235,9 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
 
 
 def spoken_direction(up: Floats) -> str:
-    """Describe an attitude for a user: the axes that point up, and the readings in g."""
+    """
+    Describe an attitude to a user: the axes that point up, and the readings of the axes in g.
+    """
     signs = [f'{"-" if value < 0.0 else "+"}{name}' for name, value in zip('xyz', up, strict=True)]
     size = np.abs(up)
     axes = [sign for sign, share in zip(signs, size, strict=True) if share > 0.1]
@@ -249,5 +263,6 @@ def _spiral(n: int) -> Floats:
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
 
-# Unit vectors: the 26 of a cube, then 500 that cover the sphere evenly (8 degrees apart).
+# Unit vectors: 26 to faces, edges and corners of a cube, then 500 evenly over the sphere, 8
+# degrees apart.
 _SPHERE = np.concatenate([_cube(), _spiral(500)])

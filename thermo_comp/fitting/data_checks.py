@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest number of distinct attitudes that determine bias and scale factor, which are six
-#: constants, and the misalignment in addition, which has three more.
+#: Smallest numbers of distinct attitudes: that determine bias and scale factor (six constants),
+#: and that determine the misalignment (three constants) in addition.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT = 6, 9
 #: Smallest number of positions whose norms determine the sd of mounting offsets beside the nine
 #: constants.
@@ -43,7 +43,7 @@ POSITIONS_FOR_MOUNTINGS = 12
 
 @dataclass(frozen=True)
 class Finding:
-    """A finding of the checks: its name, with which a user allows a refusal, and its message."""
+    """A finding of the checks: the name by which a user can allow a refusal, and the message."""
 
     name: str
     level: Literal['refusal', 'advice', 'good']
@@ -71,7 +71,9 @@ def enforce(findings: Iterable[Finding], options: FitOptions) -> list[Finding]:
 
 
 def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
-    """Refuse the prior of another unit: its small uncertainties do not apply to this unit."""
+    """
+    Refuse a prior of another unit: the small uncertainties of a unit do not apply to another.
+    """
     if prior is None or prior.provenance.model == POPULATION:
         return
     if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:
@@ -84,7 +86,7 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
-    """Judge the raw data: saturation, motion, numbers that are no counts, jumps, angular rates."""
+    """Check the raw data: saturation, motion, numbers that are no counts, jumps, angular rates."""
     part = sum(bag.n_saturated for bag in bags) / max(sum(bag.n_samples for bag in bags), 1)
     if part > 0.001:
         yield Finding(
@@ -104,7 +106,8 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         text = 'at rest all samples are equal: does the sensor repeat one reading?'
         yield _advice('stuck', text)
     if dead := '; '.join(_dead_axes(bags)):
-        yield Finding('stuck', 'refusal', f'{dead}: the axis is dead there, leave out such a bag')
+        text = f'{dead}: the axis is dead there, leave out a bag with a dead axis'
+        yield Finding('stuck', 'refusal', text)
     for name in sorted({name for bag in bags for name in bag.temperatures}):
         read = [b.temperatures[name].value for b in bags if name in b.temperatures]
         celsius = np.concatenate(read)
@@ -127,7 +130,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             yield _advice(
                 'compensated',
                 'the samples are no whole numbers: scaled or compensated before they were '
-                'recorded? A calibration made from such samples is valid for that output only',
+                'recorded? A calibration made from scaled samples is valid for that scaling only',
             )
     jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
     if jumps:
@@ -135,7 +138,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         jumped = '; '.join(
             f'{bag.source.name}: {describe(event, per_mg, bag.since_s)}' for bag, event in jumps
         )
-        text = f'{jumped}: leave out such a bag, or end before it with --to'
+        text = f'{jumped}: leave out a bag with a jump, or end before the jump with --to'
         yield Finding('jump', 'refusal', text)
     if not all(bag.angular_rate == bags[0].angular_rate != 'part' for bag in bags):
         names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
@@ -150,7 +153,7 @@ def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[str]:
     usual = 2 * alive.sum(axis=0) >= len(rests)
     for (name, rest), is_alive in zip(rests, alive, strict=True):
         is_dead = ~is_alive & usual & (np.ptp(rest.mean, axis=0) == 0.0)
-        # A working axis shows noise or drift within a thousand samples.
+        # The samples of a working axis show noise or drift within a thousand samples.
         for axis in np.flatnonzero(is_dead & (rest.count.sum() >= 1000)):
             hours = (rest.end_ns - rest.start_ns) / 3600e9
             letter, value = 'xyz'[axis], rest.mean[0, axis]
@@ -182,7 +185,7 @@ def judge_copies(names: Sequence[str]) -> list[Finding]:
 
 
 def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterator[Finding]:
-    """Judge temperatures, ramps and directions `up`, shape (n, 3), of the still windows."""
+    """Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest."""
     yield _judge_positions(up)
     if not windows.has_temperature:
         text = 'no temperature was recorded: the calibration holds at the temperature of the test'
@@ -229,8 +232,9 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
     """
-    Return the rate of the board temperature [K/min], shape (n,), 0 where the mean temperature does
-    not change by at least half of this rate from one window to the next: there the rate is noise.
+    Return the rate of the board temperature [K/min], shape (n,); 0 where the mean temperature
+    changes by less than half of this rate from one window to the next, because such a rate is
+    noise.
     """
     rate, edges = windows.rate * 60.0, windows.data.edges
     for begin, end in pairwise(edges.tolist()):
@@ -295,14 +299,14 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
         yield _advice(
             'unseen',
             f'{least.away_deg:.0f} deg away from every position the sd of |f| is '
-            f'{spoken(least.sd_m_s2)}, in the positions {spoken(least.seen_sd_m_s2)}: record one '
-            f'with {spoken_direction(np.array(least.up))}',
+            f'{spoken(least.sd_m_s2)}, in the positions {spoken(least.seen_sd_m_s2)}: record a '
+            f'position with {spoken_direction(np.array(least.up))}',
         )
 
 
 def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator[Finding]:
     """
-    Tell which repeatability of mountings and turn-ons is assumed if the norms do not determine it.
+    Report the assumed repeatability of mountings and turn-ons if the norms do not determine it.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. The norms of nine positions
     are explained by nine constants, whatever the offsets.
@@ -362,7 +366,7 @@ def judge_result(
     options: FitOptions,
     has_temperature: bool = True,
 ) -> Iterator[Finding]:
-    """Judge the residuals; `slow`: sd of the bias that no temperature explains [m/s^2]."""
+    """Check the residuals; `slow`: sd of the bias that no temperature explains [m/s^2]."""
     overall = rows[-1]
     raw, fitted = overall.raw.rms / MICRO_G, overall.fitted.rms / MICRO_G
     others = ''

@@ -4,8 +4,8 @@
 Owns the elimination of the unknowns of positions and bags from the normal equations.
 
 Each position has unknowns (attitude, offsets, tilts) that occur in no other position; they are
-eliminated first, then the initial lag states of each bag. Normal equations for the unknowns of the
-unit remain.
+eliminated first, then the initial lag states of each bag. After the elimination, normal equations
+for the unknowns of the unit remain.
 """
 
 from __future__ import annotations
@@ -35,14 +35,16 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     scaled = matrix / root[..., None, :]
     scaled /= root[..., :, None]
     index = np.arange(matrix.shape[-1])
-    jitters = 1e-13, 1e-11, 1e-9, 1e-7  # added one after another until a factor exists
+    # Relative jitters, added one after another until a factor exists.
+    jitters = 1e-13, 1e-11, 1e-9, 1e-7
     for jitter in jitters:
         scaled[..., index, index] += jitter
         try:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
             if matrix.ndim > 2:
-                # Factor the matrices one by one: only some of them need more jitter.
+                # The matrices are factored one by one, because only some matrices need more
+                # jitter.
                 return np.stack([factored(*pair) for pair in zip(matrix, square, strict=True)])
             if jitter == jitters[-1]:
                 raise
@@ -68,11 +70,11 @@ def inverse_root(factor: Floats) -> Floats:
 @dataclass(frozen=True)
 class Blocks:
     """
-    Eliminated blocks of equal size, those of all positions or of all bags.
+    Eliminated blocks of the normal equations, of equal size: of all positions or of all bags.
 
-    root: inverse of the Cholesky factor of each block, shape (n, k, k)
-    turned: this inverse times the cross block with the remaining unknowns and, in the last column,
-        times the gradient, shape (n, k, m + 1)
+    root: inverse of each block's Cholesky factor, shape (n, k, k)
+    turned: `root` times the cross block with the remaining unknowns and, in the last column, times
+        the gradient, shape (n, k, m + 1)
     """
 
     root: Floats
@@ -81,7 +83,8 @@ class Blocks:
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
         """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        # `numpy.linalg.inv` of all factors at once is slower: it does not use their zeros.
+        # `numpy.linalg.inv` of all factors at once is slower, because it does not use that the
+        # factors are triangular.
         root = np.stack([dtrtri(factor.T)[0].T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)
 
@@ -97,14 +100,14 @@ class Blocks:
 
     @property
     def log_determinant(self) -> float:
-        """Sum of the log determinants of the blocks."""
+        """Sum of the log determinants of the eliminated blocks."""
         return -2.0 * float(np.log(np.einsum('nii->ni', self.root)).sum())
 
 
 @dataclass(frozen=True)
 class Reduced:
     """
-    The normal equations of the unit's n unknowns, with all others eliminated.
+    The normal equations of the unit's n unknowns, with all other unknowns eliminated.
 
     layout: places of the unknowns
     starts_prior: precision of the initial lag states, and precision times state, (2, n_bags, r)
@@ -128,24 +131,28 @@ class Reduced:
 
     @property
     def whole(self) -> Floats:
-        """The matrix with the prior on the sum of the initial lag states."""
+        """The Hessian including the prior on the sum of the initial lag states."""
         return self.matrix if self.common is None else self.matrix + _square(self.common.turned)
 
     @property
     def log_determinant(self) -> float:
-        """Sum of the log determinants of all blocks."""
+        """Sum of the log determinants of all eliminated blocks."""
         blocks = [self.positions, self.bags, *([self.common] if self.common else [])]
         return sum(block.log_determinant for block in blocks)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add the prior on the sum of the initial lag states, now `total`, about 0."""
+        """
+        Add the prior, with mean 0, of the sum of the initial lag states, which is now `total`.
+        """
         cross = self.bags.solved.sum(axis=0, keepdims=True)
         cross[..., -1] += total
         block = self.bags.inverse.sum(axis=0, keepdims=True) + variance * np.eye(len(total))
         return replace(self, common=Blocks.of(block, cross))
 
     def follow(self, step: Floats) -> tuple[Floats, Floats]:
-        """Return the steps of the unknowns of positions and bags, given the step of the unit's."""
+        """
+        Return the steps of the unknowns of positions and bags, given that of the unit's unknowns.
+        """
         r, solved = len(self.bags.root[0]), self.positions.solved
         starts = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
         if self.common is not None:
@@ -171,13 +178,13 @@ class Reduced:
 
     @cached_property
     def _rest(self) -> Blocks:
-        """The block of each position's bag without this position."""
+        """The block of the bag of each position, without the position's contribution."""
         bag = self.layout.bag
         others = (bag[:, None] == bag) - np.eye(len(bag))
         return _of_bags(others, self.shares, self.starts_prior[:, bag])
 
     def without(self, p: int, normal: Normal) -> Floats:
-        """Return `whole` without a position, given its normal equations."""
+        """Return `whole` without a position, given the position's normal equations."""
         turned = self.positions.turned[p, :, len(self.bags.root[0]) :]
         before, after = self.bags.turned[self.layout.bag[p]], self._rest.turned[p]
         gone = _of_unit(normal.unit, self.layout) - turned.T @ turned
@@ -185,7 +192,7 @@ class Reduced:
 
     def beside(self, rows: Floats) -> tuple[Floats, Floats]:
         """
-        Carry out the elimination for further unknowns of the unit, m of each axis.
+        Eliminate positions and bags from the equations of further unknowns, m of each axis.
 
         `rows`: normal equations of the further unknowns with the unknowns of the fit and the
         residual, shape (n_positions, 3, m, k + 1). Returns what the elimination subtracts from the
@@ -230,7 +237,7 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -
     index = np.arange(n_own)
     block[:, index, index] += precision[layout.own]
     cross[..., -1] -= (precision * away)[layout.own]
-    # Attitudes without any information keep their value.
+    # Attitudes about which the data have no information keep their value.
     block[:, index, index] += np.einsum('pii->pi', block) <= 0.0
     positions = Blocks.of(block, cross)
     diagonal = np.einsum('pii->pi', starts[..., :r])
@@ -256,7 +263,7 @@ def _of_unit(normal: Floats, layout: Layout) -> Floats:
 
 
 def _of_bags(among: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blocks:
-    """Eliminate the initial lag states of bags, each with the positions `among` them, (m, n)."""
+    """Eliminate the initial lag states of bags; `among`: positions of each bag, shape (m, n)."""
     if not shares[0].size:
         return Blocks(np.zeros((len(among), 0, 0)), np.zeros((len(among), *shares[0].shape[1:])))
     sums, diagonals = (np.tensordot(among, share, 1) for share in shares)
@@ -268,7 +275,7 @@ def _of_bags(among: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blo
 
 
 def _variance(derivatives: Floats, root: Floats) -> Floats:
-    """Return the variances of linear functions of the unit's unknowns, shape (n, k)."""
+    """Return the variances of linear functions, shape (n, k), of the unit's unknowns."""
     rows = derivatives.reshape(-1, len(root))
     turned = dtrmm(1.0, root, rows.T, trans_a=True)
     return np.asarray(np.sum(turned**2, axis=0).reshape(derivatives.shape[:2]))
@@ -281,5 +288,5 @@ def _square(*turned: Floats) -> Floats:
 
 
 def _summed(left: Floats, right: Floats) -> Floats:
-    """Return the sum of the products of all rows of blocks, shape (k, m)."""
+    """Return the sum over blocks of the products of their rows, shape (k, m)."""
     return np.asarray(left.reshape(-1, left.shape[2]).T @ right.reshape(-1, right.shape[2]))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the exclusion of bags from another environment, and their part in the published error.
+Owns the exclusion of bags of another environment, and the error that is published for them.
 
 In a chamber with a fan the board temperature follows the case temperature by one law, in still air
 by another. The bias of a part without a thermometer depends on the environment, and no set of
@@ -36,7 +36,7 @@ from .windows import ThermalWindows, thermal_windows
 
 def _is_far_above(square: Floats | float, usual: float) -> Bools:
     """
-    Whether the RMS of a drift exceeds five times the usual RMS; both are given as mean squares.
+    Whether the RMS of a drift exceeds five times the usual RMS, both given as mean squares.
     """
     return np.asarray(square > 5.0**2 * usual)
 
@@ -52,7 +52,7 @@ def contradicting_bag(fit: Fit) -> int | None:
     square = _square_of_bags(fit)
     known = np.isfinite(square)
     if known.sum() < 4:
-        # A majority that one bag can contradict needs four bags.
+        # At least four bags are needed to decide that one bag contradicts the majority.
         return None
     usual, noise = float(np.median(square[known])), float(np.mean(fit.posterior.prior.sigma**2))
     if (~known).sum() == 1 and _is_far_above(usual, noise):
@@ -62,7 +62,7 @@ def contradicting_bag(fit: Fit) -> int | None:
 
 
 def is_better_without(whole: Fit, rest: Fit, bag: int) -> bool:
-    """Whether the mean square of the other bags' left-out drift is halved without a bag."""
+    """Whether leaving out a bag halves the mean square of the left-out drift of the other bags."""
     before, after = np.delete(_square_of_bags(whole), bag), _square_of_bags(rest)
     known = np.isfinite(before) & np.isfinite(after)
     return bool(known.any() and before[known].mean() > 2.0 * after[known].mean())
@@ -96,10 +96,11 @@ def bags_contradicting_prior(
         scale_sd=SCALE_SD,
         misalignment_sd=MISALIGNMENT_SD,
         column_sd=data.parts.astype(np.float64),
-        # Only the drift is judged: a turn-on or ageing may have changed the level, by up to 1 mg.
+        # Only the drift is compared, because a turn-on or ageing may have changed the level by up
+        # to 1 mg.
         offset_sd=1e-2,
         sigma=np.maximum(sigma, 1e-9),
-        # The factor 1e4 fixes the parameters at the mean of the prior.
+        # The factor 1e4 on the prior's root fixes the parameters at the mean of the prior.
         informative=replace(first, root=1e4 * first.root),
     )
     fitted = regression.solve(state, prior, n_steps=4)

@@ -3,15 +3,15 @@
 """
 Owns the measurement equation of the windows, and its linearisation.
 
-Window w of position p, axis i, in m/s^2 of the nominal scale factor K0::
+Equation of window w of position p and axis i, in m/s^2 of the nominal scale factor K0::
 
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + kappa (A l_p)_i g + noise,
     a = (A u_p)_i g,  A = M^-1,  l_p across u_p: tilt of the support
 
-B and S are columns of one table (`unit.columns`), each divided by its RMS. With g = 0 the equation
-is that of an angular rate: b, B beta and o_p remain. If |f| differs between positions it replaces
-g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added (`forces`). All terms
-are linear combinations of the base series of the windows (`series`).
+B and S are columns of the table in `unit.columns`, each divided by its RMS. With g = 0 the
+equation is that of an angular rate: the terms b, B beta and o_p remain. If |f| differs between
+positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added
+(`forces`). All terms are linear combinations of the base series of the windows (`series`).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _Result = TypeVar('_Result')
 def last_result_kept(
     method: Callable[Concatenate[_Self, _Given], _Result],
 ) -> Callable[Concatenate[_Self, _Given], _Result]:
-    """Keep the last result of a method; it is returned again for the same objects as arguments."""
+    """Keep the last result of a method, and return it again for the same objects as arguments."""
     name = f'_last_{method.__name__}'
 
     @wraps(method)
@@ -52,14 +52,14 @@ def last_result_kept(
 
 class Effects(NamedTuple):
     """
-    The effect of a state at the reference temperature.
+    The effect of a state of the unknowns at the reference temperature.
 
     force: specific force along each axis in each position, shape (n_positions, 3)
     across: derivative of the reading by a rotation of the attitude, shape (n_positions, 3, 2)
     read: reading without the bias, shape (n_positions, 3)
     nonlinear: sums of the nonlinear terms at the reference temperature and per kelvin, shape (2,
         n_positions, 3)
-    slopes: their derivatives by the force, of the same shape
+    slopes: derivatives of `nonlinear` by the force, of the same shape
     """
 
     force: Floats
@@ -73,7 +73,7 @@ class Equations(Series):
     """
     The measurement equations of a fit.
 
-    windows: the data
+    windows: the data of the fit
     gravity: local gravity; 0 for an angular rate
     nominal_scale: K0 [input units per m/s^2], shape (3,)
     """
@@ -118,7 +118,7 @@ class Equations(Series):
 
     def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
         """
-        Assign a place to every unknown; the same object for the same unknowns.
+        Assign a place to every unknown; return the same object for the same unknowns.
 
         `used`: active columns of bias and scale, shape (2, m); `nonlinear`: active nonlinear
         coefficients, shape (2 k,); None for all
@@ -150,7 +150,7 @@ class Equations(Series):
         return Effects(force, across, state.kappa * (force + nonlinear[0, 0]), *nonlinear)
 
     def tangent(self, state: State, layout: Layout, base: Base) -> Tangent:
-        """Linearise the equations about a state."""
+        """Linearise the measurement equations about a state."""
         force, across, read, _, _ = self.effects(state)
         along = (state.kappa * force)[..., None]
         n_starts, n_stretches = layout.start.shape[1], layout.stretch.shape[1]
@@ -210,7 +210,7 @@ class Equations(Series):
         Return series and factor of the active nonlinear coefficients.
 
         The relative change of the scale factor multiplies the terms at the reference temperature,
-        but not their change per kelvin: that product is negligible.
+        but not the terms' change per kelvin: the product of both changes is negligible.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):
@@ -230,7 +230,9 @@ class Equations(Series):
         return result
 
     def misfit(self, state: State, base: Base) -> Floats:
-        """Measured minus predicted as combinations of the base, (n_positions, 3, n_base)."""
+        """
+        Measured minus predicted readings as combinations of the base, (n_positions, 3, n_base).
+        """
         force, across, read, (_, bend_by_t), _ = self.effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size))
@@ -242,7 +244,7 @@ class Equations(Series):
         return result
 
     def residual(self, state: State, layout: Layout) -> Floats:
-        """Measured minus predicted, shape (n, 3) [m/s^2]."""
+        """Measured minus predicted readings of all windows, shape (n, 3) [m/s^2]."""
         base, position = self.products(layout.used).base, self.windows.position
         series = self.of(base)
         series[:, 1 + base.moved] += self.starts(state, base)[position] * series[:, base.at_start]
@@ -283,8 +285,8 @@ class Equations(Series):
         result[layout.offset] = prior.offset_sd**-2
         result[layout.tilt] = prior.tilt_sd**-2
         result[layout.start] = 1.0 / prior.start_share
-        # The prior of attitudes is flat. An angular rate does not depend on the attitude: the
-        # precision 1 keeps the equations regular.
+        # The prior of attitudes is flat, so its precision is 0. An angular rate does not depend on
+        # the attitude, and a precision of 1 keeps its equations regular.
         result[layout.up] = 0.0 if self.gravity else 1.0
         return result
 
@@ -317,7 +319,7 @@ def as_vector(state: State, layout: Layout) -> Floats:
 
 
 def without_inactive(state: State, layout: Layout) -> State:
-    """Set inactive weights and coefficients to 0; `state` itself if all of them are 0."""
+    """Set inactive weights and coefficients to 0; return `state` itself if they are 0 already."""
     kept = {name: getattr(layout, name) >= 0 for name in ('weights', 'nonlinear')}
     if not any(getattr(state, name)[~active].any() for name, active in kept.items()):
         return state

@@ -33,12 +33,12 @@ class PositionReport:
     """
     The result of a fit for one still interval.
 
-    source: the bag's name
-    start_ns: stamp of its start
-    duration_s: length [s]
+    source: name of the bag
+    start_ns: stamp of the start of the interval
+    duration_s: duration of the interval [s]
     up: estimated direction of the specific force, in the output frame
-    residual_rms: RMS of ``|f| - g`` over its windows [m/s^2]
-    left_out_rms: RMS of its left-out error, see `left_out_error` [m/s^2]
+    residual_rms: RMS of ``|f| - g`` over the windows of the interval [m/s^2]
+    left_out_rms: RMS of the interval's left-out error, see `left_out_error` [m/s^2]
     """
 
     source: str
@@ -52,14 +52,15 @@ class PositionReport:
 @dataclass(frozen=True)
 class ResidualRow:
     """
-    ``|f| - g`` of one section, by step of the model.
+    ``|f| - g`` of the windows of one section, by step of the model.
 
-    section: ``static``, ``dynamic`` or ``all``
-    raw: with the constants at the reference temperature
-    one_set: with one curve for both regimes; no values if each regime has its own curve
-    two_sets: with a curve for each regime
-    fitted: with the calibration, on the data of the fit
-    left_out: on data that were not used in the fit, see `left_out_error`
+    section: regime of the windows, ``static``, ``dynamic`` or ``all``
+    raw: corrected with the constants at the reference temperature
+    one_set: corrected with one curve for both regimes; no values if each regime has a separate
+        curve
+    two_sets: corrected with a curve for each regime
+    fitted: corrected with the calibration, on the data of the fit
+    left_out: corrected without using the corrected data in the fit, see `left_out_error`
     """
 
     section: str
@@ -94,7 +95,7 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats]:
 def tables_of(
     residuals: Iterable[Floats], is_dynamic: Bools
 ) -> list[dict[str, ResidualStatistics]]:
-    """Return the statistics by regime of some residuals, shape (n,), where they are known."""
+    """Return the statistics of the known ones of some residuals, shape (n,), by regime."""
     return [
         statistics_by_regime(values[np.isfinite(values)], is_dynamic[np.isfinite(values)])
         for values in residuals
@@ -112,9 +113,10 @@ def left_out_error(score: Score, gravity: float | Floats) -> Floats:
 
 
 def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...]) -> State:
-    """Fit again with some groups only, under a flat prior of their weights."""
+    """Fit again with some groups of columns only, under a flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
-    # Residuals of a model with few groups are mostly model error: all windows get equal weight.
+    # The residuals of a model with few groups are mostly model error, so all windows get equal
+    # weight.
     prior = replace(
         chosen.prior,
         column_sd=only * regression.windows.parts * [[0.05], [0.005]],

@@ -83,7 +83,9 @@ def fit(
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
-    """Reduce a source to its sufficient statistics; FitError if it has no still interval."""
+    """
+    Reduce a source to its sufficient statistics; FitError if the source has no still interval.
+    """
     bag = reduce_source(
         source,
         min_rest_s=options.min_rest_s,
@@ -101,8 +103,8 @@ def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
 def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
-    """Fit a calibration to bags that have been reduced; FitError if they contradict themselves."""
-    # The fit consists of many products of small matrices, which threads would only slow down.
+    """Fit a calibration to reduced bags; FitError if the bags contradict themselves."""
+    # The fit multiplies many small matrices, and threads would only slow these products down.
     with threadpool_limits(1, 'blas'):
         return _fit_about_offset(bags, options, progress)
 
@@ -159,11 +161,13 @@ def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
 
 
 def about(calibration: Calibration, offset: Floats) -> Calibration:
-    """Convert a calibration of centred codes into one of the codes themselves."""
+    """
+    Convert a calibration for codes less their offset into a calibration for the codes themselves.
+    """
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
-        # Unsigned codes of the default length, 16 bits.
+        # The full scale of unsigned codes of the default length, 16 bits.
         full_scale = 2.0 * COUNTS_FULL_SCALE + 1.0
     moved = (
         AxisReference(axis.scale_factor, axis.bias + by)
@@ -182,7 +186,7 @@ def with_notes(calibration: Calibration, findings: Iterable[Finding]) -> Calibra
 def _fit_one_environment(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
-    """Fit the bags, without those of another environment, see `environments`."""
+    """Fit the bags, without bags of another environment, see `environments`."""
     first = _fit(bags, options, progress)
     known = options.prior
     excluded: list[int] = []
@@ -200,7 +204,7 @@ def _fit_one_environment(
         if known is None and not is_better_without(first.fit, refit.fit, excluded[0]):
             return first
     elif known is not None:
-        # All bags contradict the prior, so no bag can update the prior.
+        # If all bags contradict the prior, no bag can update the prior.
         provenance = first.calibration.provenance
         refit = replace(first, calibration=replace(known, provenance=provenance))
     others = 'the other bags' if known is None else 'the prior'
@@ -270,7 +274,9 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
 def _judged(
     bags: Sequence[ReducedBag], options: FitOptions
 ) -> tuple[list[ReducedBag], list[Finding]]:
-    """Return the bags without copied thermometers, and the findings about the raw data."""
+    """
+    Return the bags without thermometers that copy the board's, and findings about the raw data.
+    """
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name
@@ -283,12 +289,12 @@ def _judged(
 
 
 def _unusable(error: ValueError) -> FitError:
-    """Return the error of a calibration with values outside their ranges."""
+    """Return the FitError for a calibration with values outside their ranges."""
     if 'misalignment' in str(error):
         return FitError(
             'the angle between two of its axes is less than 60 degrees, which no accelerometer '
-            'has: is it the right topic, did the axes stay the same in all positions, and are '
-            'there at least 9 positions?'
+            'has: is the topic the right one, did the axes stay the same in all positions, and '
+            'are there at least 9 positions?'
         )
     return FitError(f'these data give no calibration that can be used: {error}')
 
@@ -312,7 +318,8 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     if full_scale == COUNTS_FULL_SCALE and bags[0].is_integer:
         full_scale = widened(full_scale, np.array([[np.rint(largest)]]))
     if full_scale is None:
-        # The smallest usual full scale of sensors in m/s^2 that contains the data.
+        # The full scale is the smallest usual full scale of sensors in m/s^2 that contains the
+        # data.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
     cycle = float(np.median([bag.cycle_s for bag in bags]))

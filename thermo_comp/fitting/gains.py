@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the change of the log evidence if columns leave a fit or join it.
+Owns the change of the log evidence if columns are removed from a fit or added to it.
 
 References
 ----------
@@ -20,7 +20,8 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# Squares of the candidates of a common factor of the columns' prior sd; the best one is taken.
+# Squares of the candidate values of a common factor of the columns' prior sd; the best value is
+# used.
 _SQUARES = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 
@@ -46,9 +47,9 @@ class Inactive:
     """
     Sparsity and quality factors of inactive columns, given the active ones [2]_.
 
-    part, column: part (0: bias, 1: scale) and column of each of k cases, shape (k,)
-    S: sparsity factor, information about their weights, shape (3 k, 3 k), in the order case, axis
-    Q: quality factor, gradient by their weights, shape (3 k,)
+    part, column: part (0: bias, 1: scale) and column of each of k inactive columns, shape (k,) S:
+    sparsity factor, the information about the weights, shape (3 k, 3 k), by column, then axis Q:
+    quality factor, the gradient by the weights, shape (3 k,)
     """
 
     part: Ints
@@ -57,7 +58,7 @@ class Inactive:
     Q: Floats
 
     def _in_prior_sd(self, column_sd: Floats, wanted: Bools) -> tuple[Floats, Floats, Ints]:
-        """Return S and Q of the wanted weights in units of their prior sd, and their columns."""
+        """Return S and Q of the wanted weights, in units of prior sd, and the weights' columns."""
         sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
         at = np.flatnonzero(sd > 0.0)
         S = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at])
@@ -65,7 +66,7 @@ class Inactive:
 
     def gain(self, column_sd: Floats, wanted: Bools) -> float:
         """
-        Return the gain in log evidence by the `wanted` columns, shape (m,).
+        Return the gain in log evidence by adding the `wanted` columns, shape (m,).
 
         The gain is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, S and q in units of the columns'
         prior sd, shape (2, m), at the best common factor of this sd.
@@ -77,10 +78,10 @@ class Inactive:
 
     def chosen(self, column_sd: Floats, wanted: Bools, least: float, most: int) -> Bools:
         """
-        Choose up to `most` of the wanted columns by forward selection, shape (m,).
+        Choose up to `most` of the `wanted` columns, shape (m,), by forward selection.
 
-        The next column is that with the largest gain in log evidence given those chosen before;
-        the selection ends when this gain is below `least`.
+        The next column is that with the largest gain in log evidence given the columns chosen
+        before; the selection ends when this gain is below `least`.
         """
         S, Q, column = self._in_prior_sd(column_sd, wanted)
         result = np.zeros_like(wanted)

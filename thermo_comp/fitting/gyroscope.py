@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the fit of the gyroscope: the angular rate of the still windows, over the same columns.
+Owns the fit of the gyroscope: the angular rate at rest, with the columns of the accelerometer.
 
 A gyroscope at rest measures the component of the Earth's rate in its attitude, plus a bias that
-changes at each turn-on. Each position has one constant offset as an unknown. Changes within a
-position determine the effect of temperature; the mean over the positions determines the constant
-bias. The regression is that of the accelerometer with gravity 0, in rad/s in place of m/s^2.
+changes at each turn-on. The regression has one constant offset of the rate in each position as an
+unknown. Changes of the rate within a position determine the effect of temperature; its mean over
+the positions determines the constant bias. The regression is that of the accelerometer with
+gravity 0, in rad/s in place of m/s^2.
 """
 
 from __future__ import annotations
@@ -71,11 +72,11 @@ def add_gyroscope(
     level = position_means(data)
     up = np.tile((0.0, 0.0, 1.0), (data.n_positions, 1))
     state = regression.initial_state(level.mean(axis=0), np.zeros(3), up)
-    # Sd of the Earth's rate on one axis in an unknown attitude [rad/s].
+    # Sd of the component of the Earth's rate along one axis in an unknown attitude [rad/s].
     earth_sd = EARTH_RATE / math.sqrt(3.0)
     prior = Prior(
         bias_mean=np.zeros(3),
-        bias_sd=np.full(3, 1.0),  # [rad/s], flat for any gyroscope
+        bias_sd=np.full(3, 1.0),  # prior sd of the bias [rad/s], flat for any gyroscope
         scale_sd=1.0,
         misalignment_sd=1.0,
         column_sd=np.zeros((2, len(data.groups))),
@@ -84,10 +85,11 @@ def add_gyroscope(
         offset_scale=earth_sd,
     )
     fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
-    # The positions show the offsets, so their sd is not marginalised.
+    # The positions determine the offsets, so the sd of the offsets is not marginalised.
     fixed_sd = replace(fit.posterior.prior, offset_scale=0.0)
     claim = claim_of(regression, replace(fit.posterior, prior=fixed_sd))
-    # The Earth's rate in the offsets is a true rate, not an error of the gyroscope.
+    # The Earth's rate, which the offsets contain, is a true rate and not an error of the
+    # gyroscope.
     turn_on = math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0))
     claim = replace(claim, offset_sd=turn_on)
     triad = build_calibration(fit, claim, bags, calibration.unit)
@@ -98,12 +100,13 @@ def add_gyroscope(
 
 
 def _candidates(data: Windows, options: FitOptions) -> Candidates:
-    """Return the columns that the bias of the rate may have."""
+    """Return the columns that the bias of the angular rate may have."""
     allowed = {*data.groups} if options.groups is None else {*options.groups}
     is_candidate = np.isin(data.groups, list(allowed)) & (data.kelvins > 0.0)
     kelvins = np.outer((1.0, 0.0), is_candidate * data.kelvins)
     none = np.zeros(kelvins.shape, dtype=bool)
-    # Typical and largest sd of a slope [rad/s per K]; the largest is that of consumer MEMS.
+    # Typical and largest sd of a slope of the bias [rad/s per K]; the largest is that of consumer
+    # MEMS.
     return Candidates(1e-5 * kelvins, 5e-3 * kelvins, none[0], none)
 
 

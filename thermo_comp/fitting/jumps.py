@@ -4,15 +4,16 @@
 Owns the detection of jumps: steps in the reading of a sensor at rest.
 
 The reading of a sensor can step within one sample, if a die relaxes or a part slips. The
-temperature does not step, so no function of temperature describes a jump, and a fit across it
-distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit: the noise
-beside the jump is normal; the norm of the reading changes, which is almost constant in a rotation;
-the gyroscope, if there is one, shows no rotation.
+temperature does not step, so no function of temperature describes a jump, and a fit to data across
+a jump distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit: the
+noise beside the jump is normal; the norm of the reading changes, which is almost constant in a
+rotation; the gyroscope, if there is one, shows no rotation.
 
-After a low-pass filter neighbouring samples have a correlation r, and their slow noise hides a
-step. The differences ``a_i - r a_(i-1)`` are white (generalised least squares for first-order
-noise), and a step within one sample is significant in them. A shock that decays is significant,
-too; therefore the mean levels of the quiet samples before and after the step must also differ.
+If a sensor has a low-pass filter, neighbouring samples have a correlation r, and their slow noise
+hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised least squares
+for first-order noise), so a step within one sample is significant in these differences. A shock
+that decays is also significant; therefore the mean levels of the quiet samples before and after
+the step must differ, too.
 """
 
 from __future__ import annotations
@@ -27,11 +28,12 @@ from ..typing import Floats, Ints
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest length of the readings on either side of a gap that give the level [s].
+# Shortest duration of the readings on either side of a gap that give the level [s].
 _MARGIN_S = 10.0
-# Smallest number of samples on either side of a step.
+# Smallest number of samples on either side of a step that is tested.
 _FEWEST_SAMPLES = 8
-# Smallest step in units of its sd; the search over its place reaches about 5 by chance.
+# Smallest significant step, in units of its sd; the search over the place of a step reaches about
+# 5 by chance.
 _STEP_SDS = 8.0
 
 
@@ -40,12 +42,12 @@ class Jump:
     """
     A step in the reading of a sensor at rest that is no rotation of the unit.
 
-    time: since the bag's first sample [s]
-    duration_s: interval between the samples before and after it [s]
+    time: time of the step since the bag's first sample [s]
+    duration_s: interval between the samples before and after the step [s]
     step: change of the reading, per axis [input units]
     along: change of the norm, that is, along the specific force [input units]
-    temperature_change, temperature_change_sd: step of the board's readings at that time about a
-        linear drift, and its sd [K]; NaN with too few readings
+    temperature_change, temperature_change_sd: step of the board's readings at the time of the jump
+        about a linear drift, and the step's sd [K]; NaN with too few readings
     """
 
     time: float
@@ -74,7 +76,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
     near = _near(bag, gaps, [_MARGIN_S] * len(gaps))
-    # If the noise is correlated, the level is a mean over a longer time.
+    # If the noise is correlated, the level beside a gap is a mean over a longer time.
     margins = [_margin(part, quiet_sd) for part in near]
     slow = [place for place, margin in enumerate(margins) if margin > _MARGIN_S]
     wider = _near(bag, [gaps[place] for place in slow], [margins[place] for place in slow])
@@ -87,7 +89,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
 def _near(
     bag: ReducedBag, gaps: Sequence[tuple[float, float]], margins: Sequence[float]
 ) -> list[Floats]:
-    """Collect the samples beside each gap: time, reading, rate (NaN: none), shape (n, 7)."""
+    """Collect the samples beside each gap: time, reading, angular rate or NaN, shape (n, 7)."""
     parts = [[np.zeros((0, 7))] for _ in gaps]
     for block in bag.source.blocks() if gaps else ():
         time, rate = _seconds(block.accel_stamp_ns, bag.start_ns), angular_velocity(block)
@@ -100,7 +102,7 @@ def _near(
 
 
 def _margin(near: Floats, quiet_sd: Floats) -> float:
-    """Return the length of the readings beside a gap: 60 time constants of the noise [s]."""
+    """Return the duration of the readings beside a gap [s]: 60 time constants of the noise."""
     time, accel = near[:, 0], near[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
@@ -124,7 +126,8 @@ def _examine(
         return None
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
-    # A shock decays; a step is also a difference between the quiet samples on both sides.
+    # A shock decays, but a step is also a difference between the quiet samples before and after
+    # it.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
     lasting_sd = quiet_sd * relative_sd * _correlation(residual, quiet_sd)
     step, relative_sd, residual = _step(time, accel, time[at], r)
@@ -132,7 +135,8 @@ def _examine(
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = sd * relative_sd * _correlation(residual, sd)
     if r:
-        # At least half of the step must last, and must exceed four standard deviations.
+        # At least half of the step must last, and the lasting part must exceed four standard
+        # deviations.
         is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > 0.5)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -140,7 +144,8 @@ def _examine(
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # The noise is estimated from differences of neighbours, which do not depend on a drift.
+    # The noise is estimated from differences of neighbouring samples, which do not depend on a
+    # drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
@@ -153,7 +158,7 @@ def _examine(
     is_no_turn = _turn(time, gyro, at) < 0.33 * needed_rad or (
         abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd
     )
-    # A hand on the unit causes far more than twice the quiet noise.
+    # If the unit is handled, the samples scatter far more than twice the quiet noise.
     if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
     warmed, warmed_sd = _temperature_step(bag, time[0], time[at], time[-1])
@@ -170,7 +175,7 @@ def _examine(
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
     """
-    Return the sd of a mean, relative to that for white noise of `sd`, per axis, at least 1. The
+    Return the sd of a mean over that for white noise of `sd`, for each axis, at least 1. The
     residuals, shape (n, 3), are averaged to 40 pieces, whose variance is multiplied by (1 + r) /
     (1 - r), r being their lag-1 correlation.
     """
@@ -198,10 +203,11 @@ def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> t
 
 def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[int, float]:
     """
-    Find the first sample after the step and the lag-1 correlation of the noise.
+    Find the first sample after a step, and the lag-1 correlation of the noise.
 
-    Place and correlation are estimated in turn, three times. Noise with a correlation below 0.4
-    counts as white. The correlation is at most 0.999; above, it is that of a random walk.
+    The place of the step and the correlation are estimated in turn, three times. Noise with a
+    correlation below 0.4 counts as white. The correlation is at most 0.999; noise of a larger
+    correlation is a random walk.
     """
     at, r = _place_of_step(time, accel, quiet_sd, 0.0), 0.0
     for _ in range(3):
@@ -216,7 +222,7 @@ def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[in
 
 
 def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> int:
-    """Find the first sample after the most likely step, about a linear drift."""
+    """Find the first sample after the most likely step in samples with a linear drift."""
     n = len(time)
     trend = _trend(time, r)
     residual = whitened(accel, r)
@@ -244,7 +250,7 @@ def whitened(values: Floats, r: float) -> Floats:
 
 
 def _step(time: Floats, values: Floats, at: float, r: float = 0.0) -> tuple[Floats, float, Floats]:
-    """Estimate a step about a drift, its sd in units of the noise, and residuals (n, k)."""
+    """Estimate a step about a drift, the step's sd in units of the noise, and residuals (n, k)."""
     trend = _trend(time, r)
     jump = whitened((time >= at).astype(np.float64)[:, None], r)[:, 0]
     jump -= trend @ (trend.T @ jump)

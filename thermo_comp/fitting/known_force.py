@@ -3,7 +3,7 @@
 """
 Owns the known |f| of a bag that is not at 1 g, from the user or from the bag's metadata.
 
-|f| is given as one value, as a table of sections, or as a rotation rate with a radius.
+|f| is given as a single value, as a table of sections, or as a rotation rate with a radius.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from ..recording.topics import is_called, split_field
 from ..typing import Floats, Ints
 from ..unit.gravity import parse_acceleration
 
-#: Keys of a bag's metadata.
+#: Keys of a bag's metadata about |f|.
 MAGNITUDE, ROTATION = 'specific_force_magnitude_m_s2', 'rotation_topic'
 RADIUS, RADIUS_SD = 'rotation_radius_m', 'rotation_radius_sd_m'
 
 
 class Section(NamedTuple):
-    """A part of a bag, in seconds since its first sample, with |f| and its sd [m/s^2]."""
+    """A part of a bag, in seconds since the bag's first sample, with |f| and its sd [m/s^2]."""
 
     begin_s: float
     end_s: float
@@ -41,11 +41,11 @@ class Section(NamedTuple):
 
 class Magnitude(NamedTuple):
     """
-    |f| of a rest [m/s^2].
+    The known |f| of a rest [m/s^2], in two parts.
 
-    still: |f| without rotation; None for gravity
+    still: |f| without rotation [m/s^2]; None for gravity
     spin: centripetal acceleration w^2 r at the stated radius
-    sd: sd of |f| without the part of the radius
+    sd: sd of |f| without the part due to the radius
     """
 
     still: float | None
@@ -53,18 +53,18 @@ class Magnitude(NamedTuple):
     sd: float = 0.0
 
     def norm(self, gravity: float) -> float:
-        """Return |f| at the stated radius [m/s^2]."""
+        """Return |f| [m/s^2] with the radius as stated."""
         return math.hypot(gravity if self.still is None else self.still, self.spin)
 
 
 @dataclass(frozen=True)
 class KnownForce:
     """
-    |f| of a bag over time; outside the sections |f| is gravity.
+    The known |f| of a bag over time; outside the sections |f| is gravity.
 
     stamp_ns, rate: readings of the rotation rate [rad/s], about a vertical axis
-    radius, radius_sd: distance of the unit from the axis [m]; the fit estimates it if the sd is
-        above 0
+    radius, radius_sd: distance of the unit from the axis, and its sd [m]; the fit estimates the
+        distance if the sd is above 0
     """
 
     name: str
@@ -81,7 +81,9 @@ class KnownForce:
         return size.spin**2 / size.norm(gravity) * self.radius_sd / self.radius
 
     def of(self, start_ns: int, end_ns: int, first_ns: int) -> Magnitude:
-        """Return |f| of a rest, given its stamps and the stamp of the bag's first sample."""
+        """
+        Return |f| of a rest, given the rest's stamps and the stamp of the bag's first sample.
+        """
         if self.stamp_ns is None or self.rate is None:
             middle_s = (0.5 * (start_ns + end_ns) - first_ns) * 1e-9
             for section in self.sections:
@@ -89,7 +91,7 @@ class KnownForce:
                     return Magnitude(section.size, sd=section.sd)
             return Magnitude(None)
         inside = (self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns)
-        n, needed = int(inside.sum()), 3  # fewer readings give no standard error of their mean
+        n, needed = int(inside.sum()), 3  # fewer readings give no standard error of the mean
         if n < needed:
             since_s = (start_ns - first_ns) * 1e-9
             raise FitError(
@@ -107,7 +109,7 @@ class AskedForce:
     """
     The user's options about |f|.
 
-    magnitude: a value with unit, or the path of a table
+    magnitude: |f| as a value with unit, or the path of a table
     rotation: topic of the rotation rate, as TOPIC or TOPIC:FIELD
     radius, radius_sd: distance of the unit from the axis and its sd [m]
     """
@@ -122,7 +124,7 @@ class AskedForce:
             raise ValueError('a rotation topic needs a radius, and no other specific force')
 
 
-#: No options: the bags' metadata apply.
+#: Without options the bags' metadata apply.
 USUAL_FORCE = AskedForce()
 
 
@@ -130,7 +132,8 @@ def known_force(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForc
     """
     Return the known |f| of a bag, from the user or else from its metadata; None for gravity.
 
-    Raises FitError if the text cannot be parsed, or the topic of the rate has no messages.
+    Raises FitError if the text cannot be parsed, or the topic of the rotation rate has no
+    messages.
     """
     metadata = info.metadata
     try:
@@ -154,7 +157,7 @@ def known_force(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForc
 def parse_sections(text: str) -> tuple[Section, ...]:
     """
     Read a magnitude [m/s^2], or lines of ``BEGIN END MAGNITUDE [SD]``, in seconds since the first
-    sample and m/s^2. A semicolon also ends a line; a # begins a comment.
+    sample and m/s^2. A semicolon also ends a line of the text; a # begins a comment.
     """
     lines = [
         line.split('#')[0].replace(',', ' ').split()
@@ -174,7 +177,7 @@ def parse_sections(text: str) -> tuple[Section, ...]:
 def _section(begin_s: float, end_s: float, size: float, sd: float = 0.0) -> Section:
     if not begin_s < end_s:
         raise ValueError(f'a section must end after its begin {begin_s:g} s, got {end_s:g} s')
-    # 1e7 m/s^2 is above the launch of a gun.
+    # The limit 1e7 m/s^2 is above the acceleration of a launch from a gun.
     if not (0.0 < size < 1e7 and 0.0 <= sd < size):
         raise ValueError(
             f'a specific force must be above 0 with a smaller sd, got {size:g} +- {sd:g} m/s^2'
@@ -193,7 +196,9 @@ def _numbers(words: list[str]) -> list[float]:
 
 
 def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
-    """Read a value with unit, or a table from a file; a line may begin with a bag's name."""
+    """
+    Read |f| as a value with unit, or as a table from a file; a line may begin with a bag's name.
+    """
     table = Path(text)
     if not table.is_file():
         return (_section(0.0, math.inf, parse_acceleration(text)),)

@@ -37,9 +37,9 @@ from .regression import Point, Posterior, Regression
 from .start import white_noise_of
 from .unknowns import State
 
-# Smallest number of windows of a position from which its drift is scored.
+# Smallest number of windows of a position for a score of the position's drift.
 _FEWEST_WINDOWS = 8
-# Logarithms of mean squares that differ by less than this count as equal: 5 % of an RMS.
+# Logarithms of mean square errors that differ by less than this count as equal: 5 % of an RMS.
 _EQUAL = 0.1
 # Ratio of an RMS drift to white noise up to which noise explains the drift. In a soak, changes of
 # the temperature by hundredths of a kelvin, whose lag is not known, add to the white noise.
@@ -71,9 +71,9 @@ class Folds:
         Return the log ratio of the mean square error to that of another model, and its standard
         error, over the folds that both have; None without such folds.
 
-        Of two estimates with equal signs the more significant is returned, else 0: the mean over
-        folds of their log ratios, which is robust to a few large folds, and the log ratio of the
-        sums with its jackknife error, which is robust to small folds.
+        The more significant of two estimates is returned if their signs are equal, else 0: the
+        mean over folds of their log ratios, which is robust to a few large folds, and the log
+        ratio of the sums with its jackknife error, which is robust to small folds.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
@@ -82,7 +82,8 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # The scatter of one fold is unknown: its error is the smallest difference that counts.
+            # The scatter of a single fold is unknown: the smallest difference that counts is taken
+            # as its error.
             return of_sums, _EQUAL
         each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))
@@ -93,7 +94,7 @@ class Folds:
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
     def is_noise(self, other: Folds, noise: float) -> bool:
-        """Whether white noise explains the folds that the other model has as well."""
+        """Whether white noise explains the errors in the folds that another model has as well."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
         return bool(square <= (_NOISE * noise) ** 2)
@@ -105,7 +106,7 @@ class Score:
     Left-out errors of a model.
 
     positions, sections: drift of left-out positions, and of left-out sections of the program
-    norms: ``|f| - g`` of left-out positions whose norm the others determine
+    norms: ``|f| - g`` of left-out positions whose norm the other positions determine
     force: each window corrected by a fit without its position, NaN if the norm of this position is
         not scored, shape (n, 3)
     drift: drift of each window by a fit without its position or, if that fit does not determine
@@ -124,12 +125,14 @@ class Score:
 
     @property
     def kinds(self) -> tuple[Folds, Folds, Folds]:
-        """Folds of each kind."""
+        """The left-out errors of each kind of folds."""
         return self.positions, self.sections, self.norms
 
     @property
     def rms(self) -> float:
-        """RMS of the left-out drift: the larger of that of positions and of sections."""
+        """
+        RMS of the left-out drift: the larger of the RMS of positions and the RMS of sections.
+        """
         known = [folds.rms for folds in (self.positions, self.sections) if np.isfinite(folds.rms)]
         return max(known, default=float('nan'))
 
@@ -137,28 +140,30 @@ class Score:
 def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
     """
     Whether the second model is better on left-out data by more than the standard error. Halves of
-    the program limit the number of columns; they do not compare models of the same columns.
+    the program limit the number of columns, so `by_halves` is false for models of the same
+    columns.
     """
     return gain(before, after, by_halves=by_halves) > 0.0
 
 
 def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
-    Return the gain of a model if it exceeds its standard errors, else 0.
+    Return the gain by a model if the gain exceeds its standard errors, else 0.
 
-    The gain is the sum of the log gains of the drift. If the drifts are equal, the gain is the log
-    gain of the norms of left-out positions, which must exceed two standard errors.
+    The gain is the sum of the log gains of the drift of positions and of sections. If the drifts
+    are equal, the gain is the log gain of the norms of left-out positions, which must exceed two
+    standard errors.
     """
     *drifts, norms = _gains(before, after)
     drift = [gain for gain in drifts if gain]
-    # A drift that white noise explains need not decrease if the other does: bags of soaks do not
-    # show what a bag of ramps shows.
+    # The drift of one kind of folds need not decrease if white noise explains it and the drift of
+    # the other kind decreases: bags of soaks do not show the effects of ramps.
     must_gain = [
         gain
         for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
         if gain and (gain[0] > gain[1] or not second.is_noise(first, after.noise))
     ]
-    # The RMS error of the two halves may rise by a quarter, which is about its scatter.
+    # The RMS error of the left-out halves may rise by a quarter, which is about its scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
         return 0.0
@@ -173,13 +178,13 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
 
 def is_undecided(before: Score, after: Score) -> bool:
-    """Whether left-out data do not decide: equal drifts, and no norms scored in both models."""
+    """Whether left-out data do not decide between two models: equal drifts, no norms in common."""
     *drift, norms = _gains(before, after)
     return norms is None and all(abs(gain[0]) < _EQUAL for gain in drift if gain)
 
 
 def is_near(chosen: Score, other: Score) -> bool:
-    """Whether a model is at most one standard error worse than the chosen one."""
+    """Whether a model is at most one standard error worse than the chosen model."""
     gains = [gain for gain in _gains(chosen, other) if gain]
     return bool(gains) and all(gain > -error for gain, error in gains)
 
@@ -206,7 +211,7 @@ def score_of(regression: Regression, posterior: Posterior) -> Score:
 def _by_positions(
     regression: Regression, posterior: Posterior
 ) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out each position; return folds of drift and norm, corrected windows and drift."""
+    """Leave out each position; return folds of drift and norm, corrected windows, their drift."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point = regression.at(posterior.state, posterior.prior)
     n_positions = windows.n_positions
@@ -233,8 +238,8 @@ def _by_positions(
 
 def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
     """
-    Return the state of a fit with other normal equations, to first order, and the root of its
-    covariance, see `Posterior`.
+    Return, to first order, the state of a fit with other normal equations, and the root of the
+    state's covariance, see `Posterior`.
     """
     step, factor = point.unit_step(matrix)
     full_step = np.zeros(point.layout.n)
@@ -244,19 +249,21 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
 
 def _is_determined(by_others: float, by_all: float) -> bool:
     """
-    Whether the variance of a position's norm or drift by a fit without this position is below ten
-    times the variance by the fit of all, mounting offset and noise included.
+    Whether the variance of a position's norm or drift by a fit without the position is below ten
+    times the variance by the fit of all positions, including mounting offset and noise.
     """
     return by_others < 10.0 * by_all
 
 
 def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows: slice) -> bool:
-    """Whether a fit without this position, with this root, determines its drift."""
+    """
+    Whether a fit without a position determines the position's drift; `root` as in `Posterior`.
+    """
     regression, layout, sigma = point.regression, point.layout, point.prior.sigma
     in_bias, in_scale = layout.used
     if not in_bias.any():
         return True
-    # Every n-th window: 50 of them are sufficient for the variance.
+    # Every n-th window of the position is used: 50 windows are sufficient for the variance.
     some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
     some = some - some.mean(axis=0)
     p = regression.windows.position[rows.start]
@@ -272,7 +279,9 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
 
 
 def _is_norm_determined(point: Point, posterior: Posterior, root: Floats, p: int) -> bool:
-    """Whether a fit without this position, with this root, determines its norm."""
+    """
+    Whether a fit without a position determines the position's norm; `root` as in `Posterior`.
+    """
     if not point.regression.gravity:
         return False
     along = point.norms_by_unit[p]
@@ -299,7 +308,8 @@ def _by_sections(
     squares, counts = np.full(len(folds), np.nan), np.zeros(len(folds))
     for k, fold in enumerate(folds):
         point = regression.at(posterior.state, posterior.prior, products.without(fold))
-        # Two Gauss-Newton steps from the fit of all data are sufficient.
+        # Two Gauss-Newton steps from the fit of all data are sufficient for the fit without a
+        # section.
         for _ in range(2):
             point = point.moved(point.solution[0])
         force = regression.force(point.state)

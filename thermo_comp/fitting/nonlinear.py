@@ -3,8 +3,9 @@
 """
 Owns |f| that is not 1 g in all positions, and the choice of the nonlinear terms over |f|.
 
-A term that the data determine is removed if it lowers the log evidence, or if it does not improve
-the left-out norms. A term that the data do not determine stays near its prior, with the prior sd.
+A nonlinear term that the data determine is removed if it lowers the log evidence, or if it does
+not improve the left-out norms. A term that the data do not determine stays near its prior, with
+the prior sd.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ from .selection import TRIAL_GAIN, Selected
 from .unknowns import State
 from .windows import ThermalWindows
 
-# Smallest effective parameters per coefficient of a term that the data determine: 0.99 means that
-# the posterior sd is a tenth of the prior sd.
+# Smallest effective parameters per coefficient of a nonlinear term that the data determine: 0.99
+# means that the posterior sd is a tenth of the prior sd.
 _DETERMINED = 0.99
 
-_Active = frozenset[int]  # places of the coefficients in use
+_Active = frozenset[int]  # indices of the nonlinear coefficients in use
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Forces:
     t: board temperature of each window less the reference, shape (n,) [K]
     still: |f| without rotation; gravity if the unit rotates
     spin: centripetal acceleration w^2 r at the stated radius; 0 without rotation
-    sd: standard deviation of |f| without the part of the radius
+    sd: standard deviation of |f| without the part due to the radius
     radius_sd: relative standard deviation of the radius; 0 if the radius is not estimated
     """
 
@@ -59,7 +60,9 @@ class Forces:
     radius_sd: float = 0.0
 
     def norms(self, radius: Floats, stretch: Floats) -> Floats:
-        """Return |f| of each position, given the relative errors of radius and |f|."""
+        """
+        Return |f| of each position, given the relative errors of the radius and of the stated |f|.
+        """
         turned = self.spin * (1.0 + radius.sum())
         return np.asarray(np.hypot(self.still, turned) * (1.0 + stretch.sum(axis=1)))
 
@@ -70,7 +73,7 @@ class Forces:
 
     @property
     def sizes(self) -> Floats:
-        """|f| of each position as stated."""
+        """The |f| of each position as stated, without estimated errors."""
         return np.hypot(self.still, self.spin)
 
     @property
@@ -79,7 +82,7 @@ class Forces:
         return np.maximum(self.sd / self.sizes, 1e-12)
 
     def terms(self, force: Floats) -> tuple[Floats, Floats]:
-        """Return each term per unit coefficient and its slope, (*force.shape, k)."""
+        """Return each nonlinear term and its slope, per unit coefficient, (*force.shape, k)."""
         each = {
             'square': (force**2, 2.0 * force),
             'odd_square': (np.abs(force) * force, 2.0 * np.abs(force)),
@@ -136,31 +139,33 @@ def with_forces(
 
 
 def is_beyond(windows: ThermalWindows) -> bool:
-    """Whether |f| differs between the positions."""
+    """Whether the stated |f| differs between the positions."""
     forces = windows.data.forces
     return forces is not None and float(np.ptp(forces.sizes)) > 0.0
 
 
 def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
     """
-    Return the prior sd of the coefficients of k terms, then that of their changes per kelvin, 2 %
-    of the former, shape (2 k,).
+    Return the prior sd of the coefficients of k terms, then the prior sd of their changes per
+    kelvin, 2 % of those of the coefficients, shape (2 k,).
     """
     sd = np.array([options.nonlinear_sd(kind) for kind in kinds])
     return np.concatenate((sd, 0.02 * sd))
 
 
 def starting_sd(forces: Forces, options: FitOptions) -> Floats:
-    """Return the prior sd of the initial terms, square and cube; 0 for the odd square."""
+    """
+    Return the prior sd of the initial nonlinear terms: square and cube; 0 for the odd square.
+    """
     is_initial = np.array([kind != 'odd_square' for kind in forces.kinds])
     return np.asarray(prior_sd(forces.kinds, options) * np.tile(is_initial, 2))
 
 
 class _TermFits:
-    """Fits with some of the nonlinear coefficients, and the gain by a coefficient."""
+    """Fits with different nonlinear coefficients, and the gain by each coefficient."""
 
     def __init__(self, regression: Regression, selected: Selected, sd: Floats) -> None:
-        """Take the prior sd of the coefficients, shape (2 k,)."""
+        """Set the prior sd of the nonlinear coefficients, shape (2 k,)."""
         self._regression, self._begin, self._sd = regression, selected.posterior, sd
         self._n_kinds = len(sd) // 2
         self.posterior, self.score = cache(self._posterior), cache(self._score)
@@ -174,11 +179,13 @@ class _TermFits:
         return score_of(self._regression, self.posterior(used))
 
     def term(self, kind: int) -> _Active:
-        """Return the coefficients of a term: at the reference temperature, and per kelvin."""
+        """
+        Return the indices of a term's coefficients: at the reference temperature, and per kelvin.
+        """
         return frozenset((kind, self._n_kinds + kind))
 
     def loss(self, used: _Active, gone: _Active) -> float:
-        """Return the loss of log evidence without some coefficients."""
+        """Return the loss of log evidence without some nonlinear coefficients."""
         return self.posterior(used).log_evidence - self.posterior(used - gone).log_evidence
 
     def left_out_gain(self, used: _Active, gone: _Active) -> tuple[float, float]:
@@ -186,13 +193,13 @@ class _TermFits:
         return self.score(used - gone).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:
-        """Whether the data determine a coefficient."""
+        """Whether the data determine a nonlinear coefficient."""
         posterior = self.posterior(used)
         share = posterior.determined[posterior.layout.nonlinear[:, at]]
         return bool(share.mean() > _DETERMINED)
 
     def thinned(self, used: _Active) -> _Active:
-        """Remove terms that the data determine and that lower the log evidence."""
+        """Remove nonlinear terms that the data determine and that lower the log evidence."""
         kinds = [at for at in sorted(used) if at < self._n_kinds and self.is_determined(used, at)]
         losses = {at: self.loss(used, self.term(at)) for at in kinds}
         worst = min(losses, key=losses.__getitem__, default=None)
@@ -204,7 +211,7 @@ class _TermFits:
 def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
-    """Choose the nonlinear terms, and those of them whose coefficient depends on temperature."""
+    """Choose the nonlinear terms, and the terms whose coefficient depends on temperature."""
     forces = regression.forces
     if forces is None:
         return selected, ()
@@ -240,7 +247,7 @@ def choose(
 
 
 def blank_term(kind: Kind, sd: float, *evidence: float) -> NonlinearTerm:
-    """Return a term with all coefficients 0."""
+    """Return a nonlinear term with all coefficients 0."""
     return NonlinearTerm(kind, (0.0,) * 3, (0.0,) * 3, sd, *evidence)
 
 
@@ -253,7 +260,7 @@ def of_file(
         return None
     known = options.prior.nonlinearity if options.prior else None
     sizes = forces.sizes
-    # The file's range of |f| is 1 % wider than that of the positions at either end.
+    # The file's range of |f| is 1 % wider at either end than the range of the positions.
     low, high = 0.99 * float(sizes.min()), 1.01 * float(sizes.max())
     if known:
         low, high = min(low, known.force_range_m_s2[0]), max(high, known.force_range_m_s2[1])

@@ -4,7 +4,7 @@
 Owns the options of a fit: their checks, local gravity, families of curves.
 
 An error of the local gravity changes all three scale factors by the same ratio and is not visible
-in the residuals, so gravity must be given.
+in the residuals, so the user must state gravity.
 
 References
 ----------
@@ -36,8 +36,8 @@ from .windows import Sets
 COUNTS_FULL_SCALE = 32767.0
 # Families of curves over temperature that are polynomials, of order 1, 2 and 3.
 _POLYNOMIALS = ('linear', 'quadratic', 'cubic')
-#: Groups of columns that the fit selects: the curve, the difference of the two sets, the curves of
-#: the parts, the response.
+#: Groups of columns that the fit selects: the curve, the difference of the two sets, the curves
+#: over the temperatures of parts, the groups of the thermal response.
 GROUPS = tuple(
     dict.fromkeys(
         (
@@ -48,7 +48,7 @@ GROUPS = tuple(
         )
     )
 )
-#: Names of the refusals that a user can allow.
+#: Names of the refusals of data that a user can allow.
 REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compensated')
 
 
@@ -106,7 +106,8 @@ class FitOptions:
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        # The range of gravity on land, with a margin; a value outside it is a mistake in typing.
+        # The range of gravity on land, with a margin; a value outside this range is a typing
+        # error.
         low, high = 9.76, 9.84
         if not low <= self.gravity <= high:
             raise FitError(
@@ -141,7 +142,7 @@ class FitOptions:
 
     def nonlinear_sd(self, kind: Kind) -> float:
         """
-        Return the prior sd of a nonlinear term [g/g^2; of the cube g/g^3].
+        Return the prior sd of a nonlinear term [g/g^2; for the cube g/g^3].
 
         The defaults are above the limits of quartz pendulums: some 20 .. 60 ug/g^2, some ug/g^3.
         """
@@ -151,12 +152,12 @@ class FitOptions:
 
     @property
     def saturated_at(self) -> float | None:
-        """Magnitude of a saturated sample; None if it depends on the data."""
+        """Magnitude of a saturated sample; None if it has to be chosen from the data."""
         return self.full_scale or (COUNTS_FULL_SCALE if self.input == 'counts' else None)
 
 
 def sets_of(options: FitOptions, bags: Sequence[ReducedBag]) -> Sets:
-    """Choose the curves of the two sets."""
+    """Choose the families of curves of the two sets."""
     readings = [bag.board.value for bag in bags if len(bag.board.value)]
     if not readings:
         line = _family('linear', 0.0, 0.0)
@@ -177,9 +178,9 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name in _POLYNOMIALS:
         return Polynomial((0.0, *[1.0] * (1 + _POLYNOMIALS.index(name))))
     if name == 'exponential':
-        # The leakage of semiconductors doubles in about 10 K: an e-fold of 15 K, and of 30 K.
+        # E-folds of 15 K and 30 K: the leakage of semiconductors doubles in about 10 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
-    # A spline of four pieces; a knot near the reference is replaced by a knot at the reference.
+    # The spline has four pieces; a knot at the reference temperature replaces knots near it.
     knots = np.linspace(lower, upper, 5)
     step = max((upper - lower) / 4, 1.0)
     kept = sorted([0.0, *(float(k) for k in knots if abs(k) > 0.3 * step)])
@@ -201,7 +202,8 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     # Constants of WGS 84: gravity at the equator, Somigliana's k, eccentricity squared.
     root = math.sqrt(1.0 - 0.00669437999014 * sine2)
     at_ellipsoid = 9.7803253359 * (1.0 + 0.00193185265241 * sine2) / root
-    # WGS 84: semi-major axis, flattening, and m, centrifugal acceleration over equatorial gravity.
+    # Constants of WGS 84: semi-major axis, flattening, and m, the ratio of centrifugal
+    # acceleration to gravity at the equator.
     relative, flattening, m = height_m / 6378137.0, 1.0 / 298.257223563, 0.00344978650684
     slope = 2.0 * (1.0 + flattening + m - 2.0 * flattening * sine2)
     return at_ellipsoid * (1.0 - slope * relative + 3.0 * relative**2)

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the curves over the temperatures of parts: sums of columns with one weight each.
+Owns the curves over the temperatures of parts: each is a sum of columns with a common weight.
 
 The temperature of the part of an axis is ``x = t - m``, t being that of the board and m the lag of
 the part. By the binomial theorem x^p is a sum of the columns t^p, t^(p-1) m, ..., m^p, which the
-bank has. If all bags repeat one warm-up, t and m are functions of each other, and separate weights
-of the columns would not be those of the part.
+bank has. If all bags repeat the same warm-up, t and m are functions of each other, and separate
+weights of the columns would not describe the part.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy as np
 from ..typing import Floats, Ints
 from ..unit.columns import Column, Part
 
-#: Highest power of x, the temperature of a part.
+#: Highest power in the curves of x, the temperature of a part.
 ORDER = 3
-#: Kinds of the columns of m, m^2 and m^3.
+#: Kinds of the columns of the powers m, m^2 and m^3 of a part's lag m.
 _OF_LAG = 'board', 'square', 'cube'
 
 
@@ -30,8 +30,8 @@ class PartCurves(NamedTuple):
     """
     The curves over the temperatures of the parts of some axes.
 
-    axis, power: of each curve, shape (p,)
-    sums: factors of the columns of the sets and of the response, shape (p, m)
+    axis, power: axis and power of each curve, shape (p,)
+    sums: factors of the columns (of sets and response) in each curve, shape (p, m)
     """
 
     axis: Ints

@@ -7,9 +7,9 @@ The bias and the scale factor of an axis are modelled as functions of ``x = t - 
 temperature of one part of the unit: t is the board temperature less the reference temperature, and
 m = T - L(T + v g) the difference between the board temperature T and that of the part. The part
 lags a temperature between board and case: that of the board plus the share v of the gradient g.
-The lag has one stage or, for a part that is heated through another part, two in series. The time
-constants and v minimise the RMS residual of a spline of the bias and a cubic of the scale factor,
-both over x.
+The lag has one stage or, for a part that is heated through another part, two stages in series. The
+time constants and v minimise the RMS residual of a spline of the bias and a cubic of the scale
+factor, both over x.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .hyperparameters import undisturbed
 from .start import ConstantCalibration, position_means, white_noise_of
 from .windows import ThermalWindows
 
-# Ratio of a time constant of the columns to the next smaller one: half an octave.
+# Ratio of a time constant of the columns to the next smaller time constant: half an octave.
 _STEP = 2.0**0.5
 
 
@@ -47,9 +47,10 @@ class _Shape(NamedTuple):
     has_stress: bool = False
 
 
-# Fewest nodes of the spline of the bias.
+# Smallest number of nodes of the spline of the bias.
 _FEWEST_NODES = 4
-# A curve of few nodes determines a lag best, but has no kinks; so its residual must be noise.
+# Shapes tried in this order: a curve of few nodes determines a lag best but has no kinks, so the
+# residual must be noise.
 _SHAPES = (_Shape(_FEWEST_NODES, 1.1), _Shape(60, 1.5), _Shape(60, 1.5, has_stress=True))
 
 
@@ -70,7 +71,7 @@ class Parts:
 
 def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | None:
     """
-    Find the lag of each axis, and reduce the weights of windows that do not fit it.
+    Find the lag of each axis, and reduce the weights of windows that deviate from the model.
 
     Returns None if the model with one lag per axis does not explain the drift of all axes, or if
     the data do not determine a time constant.
@@ -86,7 +87,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
             rows = slice(None, None, max(len(data.time) // n_windows, 1))
             return _PartCurves(windows, start, rows, shape)
 
-        # Every k-th window: 500 of them are sufficient for a search, 3000 for its result.
+        # Every k-th window is used: 500 windows are sufficient for the search, 3000 for its
+        # result.
         searched = curves(500).lags(noise)
         if searched is None:
             continue
@@ -99,8 +101,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         parts = Parts((x, y, z), factors, float(noise.mean()))
         if (square <= (shape.most_noise * noise) ** 2).all():
             return parts
-        # A larger residual has another cause, e.g. slow noise: the lags are then accepted only if
-        # they reduce the RMS residual of each axis to an eighth or less of that without a lag.
+        # A larger residual has another cause, for example slow noise: the lags are then accepted
+        # only if they reduce the RMS residual of each axis to an eighth or less of the residual
+        # without a lag.
         is_last = shape.n_nodes > _FEWEST_NODES
         if is_last and accepted is None and min(map(subset.reduction, lags, range(3))) >= 8.0:
             accepted = parts
@@ -109,9 +112,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
 
 class _PartCurves:
     """
-    Bias and scale factor of each axis as functions of x (see the module), for any lags.
+    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
 
-    `rows`: the windows that are used
+    `rows`: the windows that the search uses
     """
 
     def __init__(
@@ -126,10 +129,10 @@ class _PartCurves:
         self._weight = data.weight[rows, None]
         self._t = windows.temperature[rows] - windows.model.reference_temperature
         self._taus = np.array([columns[k].tau_s for k in of_board])
-        #: Time constants tried [s]: those of the columns, and shorter ones.
+        #: Time constants tried [s]: those of the columns, and shorter time constants.
         self._tried = np.array([15.0, 21.0, 30.0, 42.0, *self._taus])
-        # The lag m at a time constant tau between those of the columns is interpolated: m / tau
-        # is a smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
+        # Between the time constants tau of the columns the lag m is interpolated: m / tau is a
+        # smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
         ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
         knots = _even(np.append(0.0, self._taus))
         self._ratio = CubicSpline(knots, ratios, axis=1)
@@ -148,7 +151,7 @@ class _PartCurves:
         self._measured = self._centred(data.mean[rows] / start.scale)
 
     def lags(self, noise: Floats) -> list[Part] | None:
-        """Return the lag of each axis; None if one explains little or is not determined."""
+        """Return the lag of each axis; None if any lag explains little or is not determined."""
         lags = []
         for axis in range(3):
             lag = self._lag(axis, noise[axis])
@@ -158,13 +161,13 @@ class _PartCurves:
         return lags
 
     def _is_of_use(self, lag: Part, axis: int, noise: float) -> bool:
-        """Whether a lag may meet the limits of `find_parts`; the limits here are wider."""
+        """Whether a lag may meet the limits of `find_parts`, tested with wider limits."""
         typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
         return bool(typical <= 3.0 * noise or self.reduction(lag, axis) >= 4.0)
 
     def _lag(self, axis: int, noise: float) -> Part:
         """
-        Return the lag with the smallest RMS residual; 0 s if none reduces it.
+        Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual.
 
         A second stage, or a share of the gradient, must reduce a residual above the white noise
         (`noise`) by 5 %.
@@ -174,8 +177,9 @@ class _PartCurves:
         if self._square(best, axis) > enough:
             lags = [self._searched(axis, _in_two_stages(best), (0.2, 0.4, 0.0))]
             if self._has_case:
-                # The residual has a valley of several minima along a constant time constant less
-                # the time by which the temperature between board and case leads the board.
+                # The residual has a valley of several minima, along which this difference is
+                # constant: the time constant less the time by which the temperature between board
+                # and case leads the board.
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
                 for near in (best, min(along, key=lambda lag: self._square(lag, axis))):
                     first = near._replace(tau_s=max(near.tau_s, 15.0))
@@ -188,7 +192,7 @@ class _PartCurves:
         return best
 
     def near(self, lag: Part, axis: int) -> Part:
-        """Return the lag with the smallest RMS residual near a lag."""
+        """Return the lag with the smallest RMS residual in the neighbourhood of a lag."""
         if not lag.tau_s:
             return lag
         tau_step, second_step, share_step = 0.03, 0.06, 0.02
@@ -196,7 +200,7 @@ class _PartCurves:
         return self._searched(axis, lag, steps)
 
     def _better(self, axis: int, simple: Part, other: Part) -> Part:
-        """Return the second lag if its RMS residual is 5 % below that of the first."""
+        """Return the second lag if its RMS residual is 5 % below that of the first lag."""
         is_better = self._square(other, axis) < self._square(simple, axis) / 1.05**2
         return other if is_better else simple
 
@@ -226,7 +230,7 @@ class _PartCurves:
         return lag_at(minimum.x)
 
     def _time_constant(self, axis: int, sensor_share: float = 0.0) -> Part:
-        """Return the lag of one stage with the smallest RMS residual; 0 s for none."""
+        """Return the lag of one stage with the smallest RMS residual; 0 s if no lag is better."""
 
         def square(tau_s: float) -> float:
             return self._square(Part(tau_s, 0.0, sensor_share if tau_s else 0.0), axis)
@@ -242,7 +246,9 @@ class _PartCurves:
         return Part(tau, 0.0, sensor_share) if square(tau) < square(0.0) else Part(0.0)
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
-        """Whether time constants larger, or smaller, by `_STEP` add 5 % to the RMS residual."""
+        """
+        Whether time constants larger or smaller by the ratio `_STEP` add 5 % to the RMS residual.
+        """
         tau, second, share = lag
         others = [Part(ratio * tau, ratio * second, share) for ratio in (1.0 / _STEP, _STEP)]
         if not tau:
@@ -293,7 +299,9 @@ class _PartCurves:
         return self._centred(np.hstack((bias, stress, scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
-        """Subtract the weighted mean over each position; multiply by the root of the weight."""
+        """
+        Subtract the weighted mean over each position from values; multiply by the weights' roots.
+        """
         weighted = np.hstack((values, np.ones_like(self._weight))) * self._weight
         sums = np.add.reduceat(weighted, self._first, axis=0)
         level = sums[:, :-1] / sums[:, -1:]
@@ -301,20 +309,20 @@ class _PartCurves:
 
 
 def _in_two_stages(lag: Part) -> Part:
-    """Return two stages of a lag of one stage, for the start of a search."""
-    # The residual has a valley along a constant sum of both time constants.
+    """Split a lag of one stage into two stages, as the start of a search."""
+    # The residual has a valley where the sum of both time constants is constant.
     return Part(0.8 * lag.tau_s + 1.0, 0.2 * lag.tau_s + 1.0, lag.sensor_share)
 
 
 def _in_order(tau_s: float, second_tau_s: float, sensor_share: float) -> Part:
-    """Return a lag with the longer time constant first, the shorter at most 0.89 of it."""
-    # Columns accept ratios up to 0.9; both time constants are rounded to 0.1 s before.
+    """Return a lag with the longer time constant first, the shorter at most 0.89 of the longer."""
+    # Columns accept ratios of both time constants up to 0.9, after rounding to 0.1 s.
     longer, shorter = max(tau_s, second_tau_s), min(tau_s, second_tau_s)
     return Part(longer, min(shorter, 0.89 * longer), sensor_share)
 
 
 def _even(tau_s: Floats) -> Floats:
-    """Map time constants [s] to 0 .. 1, for the interpolation; 200 s become 0.5."""
+    """Map time constants [s] to the interval 0 to 1, for the interpolation; 200 s become 0.5."""
     return np.asarray(tau_s / (tau_s + 200.0))
 
 
@@ -323,5 +331,5 @@ def _solved(series: Floats, measured: Floats) -> Floats:
     normal, right = series.T @ series, series.T @ measured
     size = np.sqrt(np.diag(normal)) + 1e-12
     normal = normal / np.outer(size, size)
-    normal[np.diag_indices_from(normal)] += 1e-7  # ridge, for nearly collinear regressors
+    normal[np.diag_indices_from(normal)] += 1e-7  # a ridge, for nearly collinear regressors
     return np.asarray(np.linalg.solve(normal, right / size) / size)

@@ -4,9 +4,10 @@
 Owns informative priors: an earlier calibration of the unit, or the population of its type.
 
 An informative prior is a calibration: mean and covariance of all parameters form the Gaussian
-prior of the regression, which has the calibration's columns. A population's mean and covariance
-are the mean and the scatter over units of the parameters relative to the scale factors. The
-covariance of an earlier calibration of the unit is increased by the ageing of the unit.
+prior of the regression, which has the calibration's columns. The mean and the covariance of a
+population are the mean and the scatter, over the units, of the parameters relative to the scale
+factors. The covariance of an earlier calibration of the unit is increased by the ageing of the
+unit.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from .start import ConstantCalibration
 from .unknowns import InformativePrior, State
 from .windows import Model, Sets
 
-#: Smallest number of units of a population: fewer give no scatter.
+#: Smallest number of units of a population: fewer units do not determine the scatter.
 UNITS_NEEDED = 3
 
 
@@ -81,7 +82,8 @@ def with_calibration(calibration: Calibration, regression: Regression, state: St
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError('the curves of the prior differ from axis to axis, or from bias to scale')
-    # Per axis: the level of the static set, then the other coefficients relative to this level.
+    # For each axis: the level of the static set, then the other coefficients relative to this
+    # level.
     both = np.array([[values[block.rows] for block in part] for part in layout[:2]])
     both[..., layout.bias[0].dynamic] -= both[..., 0]
     both[0] /= regression.nominal_scale[:, None]
@@ -98,8 +100,8 @@ def informative_priors(
     """
     Return candidate priors from a calibration, which the fit compares by evidence.
 
-    The last candidate is the widest; the fit begins with it. FitError if the calibration has no
-    covariance.
+    The last candidate is the widest; the fit begins with it. Raises FitError if the calibration
+    has no covariance.
     """
     if calibration.posterior is None:
         raise FitError('the prior has no covariance: an imported calibration cannot be a prior')
@@ -119,17 +121,19 @@ def informative_priors(
         return result
 
     stated = options.ageing_bias, options.ageing_scale
-    # Candidates of a further uncorrelated variance, relative to each variance of the prior.
+    # Candidate values of an additional uncorrelated variance, relative to each variance of the
+    # prior.
     tried = [(grown(*stated), share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
-        # Candidates of the sd of ageing: of the biases [g], and of the relative scale factors,
-        # which is 0, 0.01 or 1 times the number for the biases.
+        # Candidate values of the sd of ageing: of the biases [g], and of the relative scale
+        # factors, 0, 0.01 or 1 times the number for the biases.
         tried += [
             (grown(ageing * options.gravity, multiple * ageing), 0.0)
             for multiple in (0.0, 0.01, 1.0)
             for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
-    # The first fit must be wide: under a narrow prior the noise would absorb the differences.
+    # The first fit needs a wide prior: under a narrow prior the estimated noise would absorb the
+    # differences.
     tried.append((tried[-1][0], 1.0))
     layout = regression.layout(regression.windows.parts)
     kinds = regression.forces.kinds if regression.forces else ()
@@ -143,7 +147,8 @@ def informative_priors(
         sd = np.sqrt(floor)
         scaled, correlation = to_file / sd[:, None], variances / np.outer(sd, sd)
         # A relative jitter of 1e-6 bounds the correlations of the file's float32 covariance. The
-        # QR factor, not a product, keeps the precision of nearly equal parameters.
+        # QR factor of the covariance's factor, instead of a product, keeps the precision of nearly
+        # equal parameters.
         wider = correlation + (1e-6 + share) * np.eye(len(sd))
         whitened = solve_triangular(np.linalg.cholesky(wider), scaled, lower=True)
         root: Floats = np.asarray(np.linalg.qr(whitened, mode='r'))
@@ -156,11 +161,13 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from calibrations of at least three units.
 
-    Raises FitError if there are fewer, or if they differ in input, reference, sensors or curves.
+    Raises FitError if there are fewer calibrations, or if they differ in input, reference
+    temperature, sensors or curves.
     """
     if len(calibrations) < UNITS_NEEDED:
         raise FitError(f'{len(calibrations)} calibrations, need {UNITS_NEEDED} for a population')
-    # Nonlinear terms are left out: most units have none, since they need a centrifuge.
+    # Nonlinear terms are left out: most units have none, because a centrifuge is needed to
+    # determine them.
     calibrations = [
         without_terms(calibration) if calibration.nonlinearity else calibration
         for calibration in calibrations
@@ -219,7 +226,7 @@ def _alike(column: Column) -> Column:
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return the columns of the bank whose sum is a column, each with its share.
+    Return columns of the bank whose sum is (about) a given column, each with its share.
 
     The parts of two units of a type differ in their time constants. A lag is interpolated between
     the lags of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages,
@@ -257,7 +264,8 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         return [(shortest, share**column.term.order)]
     if at == len(FINE_TAUS):
         return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
-    # Cubic interpolation over the logarithm of the time constant, by Lagrange's polynomials.
+    # The shares are a cubic interpolation over the logarithm of the time constant, by Lagrange's
+    # polynomials.
     first = min(max(at - 2, 0), len(FINE_TAUS) - 4)
     near = FINE_TAUS[first : first + 4]
     return [
@@ -276,7 +284,9 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 def _relative_to(
     calibration: Calibration, like: Calibration, mean_K: Floats
 ) -> tuple[Floats, Floats]:
-    """Return a unit's parameters and covariance in the layout of `like`, at the mean scale."""
+    """
+    Return a unit's parameters and covariance in the layout of `like`, for the mean scale factor.
+    """
     if calibration.posterior is None:
         raise FitError(
             f'{calibration.unit.serial} has no covariance: an imported calibration cannot be part '
@@ -318,7 +328,7 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 
 
 def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
-    """Return a calibration with the union of the ranges and these columns, all weights 0."""
+    """Return a calibration with the union of the ranges and the given columns, all weights 0."""
     first = calibrations[0]
     slow = [
         [axis.residual_sd_m_s2 for axis in calibration.static.axes()]

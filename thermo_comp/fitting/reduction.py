@@ -3,10 +3,10 @@
 """
 Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
 
-The blocks are read once, in bounded memory. Samples are averaged to cells of about half a second
-(see `stillness`), and the cells of a still interval to windows of ten seconds; only the last
-window of an interval is shorter. Within a window every thermal regressor is linear in time to far
-below the noise, so the mean of a window is a sufficient statistic. The noise of the means is
+The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
+second (see `stillness`), and the cells of a still interval to windows of ten seconds; only the
+last window of an interval is shorter. Within a window every thermal regressor is linear in time to
+far below the noise, so the mean of a window is a sufficient statistic. The noise of the means is
 estimated by the regression, because that of a charge-balancing converter is smaller than the
 scatter of its samples implies.
 """
@@ -32,14 +32,14 @@ from ..typing import Floats, Ints
 from .coverage import best_rests, directions, distinct_directions, rough_centre
 from .sources import FitSource, angular_velocity
 
-#: Default length of a window [s].
+#: Default length of a window of the fit [s].
 WINDOW_S = 10.0
 
 
 class Readings(NamedTuple):
     """
     One thermometer's readings over a bag: rising stamps [ns] and temperatures [degC], shape (n,);
-    without arguments those of a thermometer that was not recorded.
+    without arguments, no readings.
     """
 
     stamp_ns: Ints = np.empty(0, np.int64)
@@ -49,14 +49,14 @@ class Readings(NamedTuple):
 @dataclass(frozen=True)
 class StillInterval:
     """
-    One interval without motion: one position.
+    One interval without motion, that is, one position.
 
-    start_ns, end_ns: stamps of the middles of its first and last cell
-    begin_s: start of its first window, since the bag's first sample [s]
-    n_whole: number of windows of full length; a shorter one may follow
+    start_ns, end_ns: stamps of the middles of the interval's first and last cell
+    begin_s: start of the interval's first window, since the bag's first sample [s]
+    n_whole: number of windows of full length; a shorter window may follow
     time, count, mean: mean time [s], number and mean of the samples of each window
-    sample_sd: standard deviation of single samples
-    angular_rate: mean of each window [rad/s]; None if a part of the bag has no rate
+    sample_sd: standard deviation of single samples in each window
+    angular_rate: mean angular rate of each window [rad/s]; None if a part of the bag has no rate
     """
 
     start_ns: int
@@ -80,10 +80,10 @@ class ReducedBag:
     n_cells, n_still_cells: length of the bag and of its rests in cells
     window_s: length of a window; longer than the option if the samples are slow
     cycle_s: typical interval between samples
-    middle: code at zero force if the codes are unsigned, else 0
+    middle: code at zero force of the samples if the codes are unsigned, else 0
     max_abs: largest reading without single glitches [input units]
-    since_s: start of the part of the bag that was read
-    restless: reason why there are no rests
+    since_s: start of the part of the bag that was read [s]
+    restless: reason why the bag has no rests
     angular_rate: part of the bag that has finite angular rates
     """
 
@@ -120,11 +120,11 @@ class ReducedBag:
 
 class _Pass:
     """
-    One pass over the blocks of a source.
+    The result of one pass over the blocks of a source.
 
     cells: statistics of the samples
     temperatures: readings of each thermometer
-    causes: counts of what can explain the lack of a rest
+    causes: counters of causes that can explain the lack of a rest
     has_rate: whether all blocks have a finite angular rate
     """
 
@@ -170,7 +170,7 @@ def reduce_source(
     least: int = stillness.MIN_SAMPLES,
 ) -> ReducedBag:
     """
-    Stream one source and keep its sufficient statistics.
+    Read one source in blocks and keep its sufficient statistics.
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
@@ -178,7 +178,7 @@ def reduce_source(
     rests are shorter than a cell.
     """
     reading = _Pass(source, CellAccumulator(min(cell_s, window_s), full_scale, window_s, least))
-    # The norms at rest determine the thresholds only if |f| at rest is gravity.
+    # The norms at rest are used to choose the thresholds only if |f| at rest is gravity.
     cells = reading.cells if source.force is None else stillness.without_rotation(reading.cells)
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
@@ -214,7 +214,7 @@ def _bag(
     fewest_windows: int,
     restless: str,
 ) -> ReducedBag:
-    """Make the statistics of a bag from its cells and its rests, ranges of cells."""
+    """Make the statistics of a bag from its cells and its rests, given as ranges of cells."""
     per_window = max(1, round(window_s / cells.cell_s)) if cells.cell_s else 1
     sizes = [min(per_window, max(1, (b - a) // fewest_windows)) for a, b in ranges]
     bag = ReducedBag(
@@ -231,7 +231,8 @@ def _bag(
         n_saturated=cells.n_saturated,
         n_cells=len(cells.count),
         n_still_cells=sum(upper - lower for lower, upper in ranges),
-        # A bag without a usable sample has no cells: its window length is the option's.
+        # A bag without a usable sample has no cells; the length of its windows is that of the
+        # options.
         window_s=round(per_window * cells.cell_s, 6) or window_s,
         cycle_s=cells.cell_s / float(np.median(cells.count)) if len(cells.count) else np.nan,
         is_integer=cells.is_integer,
@@ -250,17 +251,18 @@ def _with_shorter_cells(
     """
     Reduce a source of slow samples in shorter cells; None if cells of the usual length suffice.
 
-    `share`: the part of the bag at rest in cells of the usual length. Slow samples make cells so
+    `share`: the share of cells of the usual length that are at rest. Slow samples make cells so
     long that a bias which changes within minutes looks like a motion, and that short rests are
     lost.
     """
     if share < 0.95 and source.force is None:
-        # For interrupted rests: shorter cells are used if they add 5 % of the bag.
+        # If rests are interrupted, shorter cells are used if these add 5 % of the bag to the
+        # rests.
         shorter = reduced(least=10)
         if shorter.n_still_cells / shorter.n_cells > share + 0.05:
             return shorter
     if share < 0.5:
-        # For short rests: shorter cells are used if they show six attitudes.
+        # If rests are short, shorter cells are used if these show six attitudes.
         shorter = reduced(least=5)
         means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
         means = means.reshape(-1, 3)
@@ -270,7 +272,7 @@ def _with_shorter_cells(
 
 
 def _max_abs(cells: Cells) -> float:
-    """Return the 99 % quantile over the cells of the largest absolute mean plus 3 sd."""
+    """Return the 99 % quantile, over the cells, of a cell's largest absolute mean plus 3 sd."""
     if not len(cells.count):
         return 0.0
     sizes = np.max(np.abs(cells.mean) + 3.0 * np.sqrt(cells.variance), axis=1)
@@ -285,12 +287,13 @@ def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
 
 
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
-    """Find the rests, with the thresholds at which they determine the triad best."""
+    """Find the rests, with the thresholds at which the rests best determine the triad."""
     candidates: list[list[tuple[int, int]]] = []
-    # Largest ratio of a rest's variance to the quietest one, the strictest first.
+    # Candidates of the largest ratio of a rest's variance to that of the quietest rest, the
+    # strictest first.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
-    # Smallest length of a rest [s], the strictest first.
+    # Candidates of the smallest length of a rest [s], the strictest first.
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):
         for runs in of_ratios:
             ranges = stillness.long_enough(cells, runs, shortest_s)
@@ -344,7 +347,8 @@ def _windows(
     offsets = np.arange(0, end - lower, per_window)
     count = cells.count[rows].astype(np.float64)
     total = np.add.reduceat(count, offsets)
-    # If the bag ends within a cell the last window is shorter: less than 90 % of the samples.
+    # The last window is not of full length if the bag ends within it: it has less than 90 % of the
+    # samples.
     if n_whole and total[n_whole - 1] < 0.9 * np.median(total):
         n_whole -= 1
 
@@ -367,9 +371,9 @@ def _windows(
 
 def _thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     """
-    Keep plausible readings with stamps rising from the last one; average readings below 0.2 s.
+    Keep plausible readings with rising stamps; average readings that are less than 0.2 s apart.
 
-    No thermometer is faster than 0.2 s, and the recursion over the readings runs in Python.
+    No thermometer is faster than 0.2 s, and the recursion over all readings, in Python, is slow.
     """
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))

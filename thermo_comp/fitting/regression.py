@@ -5,8 +5,8 @@ Owns the regression: the posterior of all unknowns under a given prior, by Gauss
 
 All unknowns have Gaussian priors (attitudes: flat on the sphere). Gauss-Newton finds the mode; the
 inverse of the Hessian is the covariance. The unknowns of each bag are eliminated first, so the
-information of a bag about the unit is one matrix and one vector, which are subtracted to leave the
-bag out.
+information of a bag about the unit is one matrix and one vector; subtracting these leaves the bag
+out.
 
 References
 ----------
@@ -90,12 +90,12 @@ class Point:
 
     @property
     def precision(self) -> Floats:
-        """Inverse prior variances, see `Equations.precision`."""
+        """Inverse prior variances of the unknowns, see `Equations.precision`."""
         return self.regression.precision(self.prior, self.layout)
 
     @cached_property
     def away(self) -> Floats:
-        """The unknowns less the mean of the prior, shape (n,)."""
+        """The unknowns of the state less the mean of the prior, shape (n,)."""
         return self.regression.away(self.state, self.prior, self.layout)
 
     @cached_property
@@ -135,8 +135,8 @@ class Point:
     def _common_variance(self) -> float:
         """
         Prior variance of the sum over the bags of an initial lag state. The sd of the mean over
-        the bags is 0.1 of the sd of one bag: a mean that is not 0 is an effect of the unit, not of
-        the bags' initial states.
+        the bags is 0.1 of the sd of one bag: if the mean differs from 0, the cause is an effect of
+        the unit, not the bags' initial states.
         """
         return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_share
 
@@ -152,7 +152,7 @@ class Point:
 
     @cached_property
     def norms_by_unit(self) -> Floats:
-        """Derivatives of the mean norm of a reading, by the unit's unknowns, (n_positions, n)."""
+        """Derivatives of each position's mean norm by the unit's unknowns, (n_positions, n)."""
         regression, state, layout = self.regression, self.state, self.layout
         products = regression.products(layout.used)
         means = self.tangent.of(
@@ -195,7 +195,7 @@ class Point:
             hessian[np.diag_indices(n)] += precision
             factor = factored(hessian)
             return solved(factor, gradient - precision * away), factor
-        # In units of the prior's standard deviations the system is well conditioned.
+        # In units of the prior's standard deviations the normal equations are well conditioned.
         root = self.prior.informative.root
         turned = solve_triangular(root, information, trans='T')
         turned = solve_triangular(root, turned.T, trans='T')
@@ -220,17 +220,19 @@ class Point:
         return self._solution(self._reduced(_damped(self.normal, self.layout)))[0]
 
     def moved(self, step: Floats) -> Point:
-        """Add a step to the state."""
+        """Add a step to the state of the regression."""
         return replace(self, state=moved_by(self.state, step, self.layout))
 
     def stepped(self) -> Point:
         """
         Take Gauss-Newton's step.
 
-        If the step increases the energy, fractions of it are tried in the nonlinear unknowns,
-        which enter as products, and the linear unknowns are solved again for each fraction.
+        If the step increases the energy, fractions of the step are tried in the nonlinear
+        unknowns, which enter the equations as products, and the linear unknowns are solved again
+        for each fraction.
         """
-        # Compute the energy of this point first: the regression keeps only the last linearisation.
+        # The energy of this point is computed first, because the regression keeps only the last
+        # linearisation.
         energy, (step, _) = self.energy, self.solution
         result = self.moved(step)
         if result.energy <= energy:
@@ -247,7 +249,9 @@ class Point:
         return result
 
     def posterior(self, end: Point) -> Posterior:
-        """Return the posterior at `end`, a small step away, with the curvature of this point."""
+        """
+        Return the posterior at `end`, a small step from this point, with this point's curvature.
+        """
         layout, prior, precision, reduced = self.layout, self.prior, self.precision, self.reduced
         _, factor = self.solution
         n, unit_root = layout.n_unit, inverse_root(factor)
@@ -333,7 +337,7 @@ class Regression(Equations):
 
 
 def _damped(normal: Normal, layout: Layout) -> Normal:
-    """Damp the nonlinear unknowns in normal equations by a factor that holds them."""
+    """Damp the nonlinear unknowns of normal equations by a factor on their diagonal."""
     local, unit = normal.local.copy(), normal.unit.copy()
     at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
     local[..., at, at] *= 1e9

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the settings of thermometers and detector estimated from the bags, and the thermal states.
+Owns the estimation of thermometer and detector settings from bags, and the bags' thermal states.
 
-Rates are central differences over two minutes, which need a recording. The causal thermometers and
-the detector get the noise, lag and ramps of the recorded test.
+Rates are central differences over two minutes, which are not causal and need a recording. The
+causal thermometers and the detector are set to the noise, lag and ramps of the recorded test.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats
 from .reduction import Readings, ReducedBag
 
-# Interval of the grid of rates [s], and number of intervals on each side of a rate.
+# Interval of the grid of rates [s], and number of intervals on each side in a central difference.
 _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 
@@ -34,24 +34,26 @@ class Course:
 
     @property
     def is_resting(self) -> Bools:
-        """Grid points without a ramp for five minutes before and after."""
+        """Grid points that have no ramp within five minutes before and after."""
         moving = np.abs(self.rate) > max(0.2 * self.fastest, self.least_ramp)
         near = np.convolve(moving, np.ones(61))[30:-30] > 0.5
         return np.asarray(~near)
 
     @property
     def least_ramp(self) -> float:
-        """Smallest rate that counts as a ramp: 5 standard deviations of the noise [K/s]."""
+        """
+        Smallest rate that counts as a ramp [K/s]: 5 standard deviations of the noise of the rate.
+        """
         return 5.0 * self.rate_sd
 
     @property
     def fastest(self) -> float:
-        """99 % quantile of the absolute rate [K/s]."""
+        """The 99 % quantile of the absolute rate of the temperature [K/s]."""
         return float(np.quantile(np.abs(self.rate), 0.99))
 
 
 def learn_detector(bags: Sequence[ReducedBag]) -> DetectorSettings:
-    """Set the detector to the sensors and ramps that the bags show."""
+    """Set the detector according to the noise, lags and ramps in the bags."""
     base = DetectorSettings()
     board = learn_thermometer([bag.board for bag in bags], base.board)
     case = learn_thermometer([bag.case for bag in bags], base.case)
@@ -75,7 +77,7 @@ def learn_thermometer(
     if not long:
         return base
     quantum = quantum_of(np.concatenate(long))
-    # At least 0.1 mK: below it the recursion would follow rounding errors.
+    # The noise is at least 0.1 mK, because with less the recursion would follow rounding errors.
     noise = max(_noise_of(long, quantum), 1e-4)
     courses = _courses(recorded, noise, quantum)
     with_ramps = [course for course in courses if course.fastest > course.least_ramp]
@@ -95,14 +97,16 @@ def learn_thermometer(
         base,
         noise_sd_c=noise,
         quantum_c=quantum,
-        # In use, ramps may be faster than those of the chamber: a margin of 1.5.
+        # Ramps in use may be faster than the ramps of the test, by a factor of up to 1.5.
         fastest_ramp_k_min=max(base.fastest_ramp_k_min, 1.5 * 60.0 * fastest),
         lag_s=round(lag, 1),
     )
 
 
 def quantum_of(values: Floats) -> float:
-    """Find the quantum of a sensor's readings, shape (n,) [K]; 0 if they are not rounded."""
+    """
+    Find the quantum of a sensor's readings, shape (n,) [K]; 0 if the readings are not rounded.
+    """
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):
         return 0.0
@@ -114,19 +118,22 @@ def quantum_of(values: Floats) -> float:
 
 
 def _noise_of(values: Sequence[Floats], quantum: float) -> float:
-    # Second differences do not depend on a linear ramp; white noise of sd s gives s sqrt(6).
+    # Second differences of readings do not depend on a linear ramp; white noise of sd s gives them
+    # an sd of s sqrt(6).
     second = np.concatenate([np.diff(value, 2) for value in values])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
-    # Most rounded readings equal their neighbours, so the median is 0: use the mean square without
-    # the largest 1 %, less the variance of rounding.
+    # Most rounded readings equal their neighbours, so the median of the differences is 0: use
+    # their mean square without the largest 1 %, less the variance of rounding.
     square = np.sort(second**2)[: max(1, int(0.99 * len(second)))]
     variance = max(float(square.mean()) / 6.0 - quantum**2 / 12.0, (0.1 * quantum) ** 2)
     return float(np.sqrt(variance))
 
 
 def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list[Course]:
-    """Return the rates of temperature in each bag of 30 readings and 6 spans, or more."""
+    """
+    Return the temperature rates of the bags with at least 30 readings and 6 intervals of the rate.
+    """
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:
@@ -136,7 +143,8 @@ def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list
         n_bins = int(time[-1] / _BIN_S)
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
-        # The mean over a bin is the difference of the integral between its edges.
+        # The mean over a bin is the difference of the integral at the bin's edges over the bin's
+        # length.
         integral = np.concatenate(
             ([0.0], np.cumsum(0.5 * (readings.value[1:] + readings.value[:-1]) * np.diff(time)))
         )
@@ -172,7 +180,8 @@ def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
     noise = float(np.median([course.rate_sd for course in courses]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
     clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
-    # A ripple below the noise of the rates is not detected: assume the default at most.
+    # A ripple below the noise of the rates is not detected; the assumed ripple is at most the
+    # default.
     hidden = min(usual, 3.0 * noise * lag_s)
     return float(np.clip(max(clean * lag_s, hidden), 0.02, 1.0))
 
@@ -260,7 +269,7 @@ def thermal_states(
     board, *others = tracker.thermometers.values()
     limit_s, other_limit_s = tracker.config.temperature_timeout_s, tracker.config.case_timeout_s
     for stamp_ns in range(begin, max(bag.end_ns, begin) + step_ns, step_ns):
-        # As online, a state includes the readings up to and including its stamp.
+        # As online, a thermal state includes the readings up to and including the state's stamp.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)

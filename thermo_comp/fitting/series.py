@@ -35,14 +35,14 @@ from .unknowns import Noise, State, Windows
 
 
 class Whitener:
-    """Filters series of windows, in order of position and time, position by position."""
+    """Filters series of windows, sorted by position and time, separately for each position."""
 
     def __init__(self, position: Ints, time: Floats) -> None:
         starts = np.flatnonzero(np.r_[True, position[1:] != position[:-1]])
         lengths = np.diff(np.r_[starts, len(position)])
         n_steps = int(lengths.max())
         step = np.arange(n_steps)[:, None]
-        #: Row of each step of each position in the table; 0 for steps beyond the position's end.
+        #: Window number of each step of each position; 0 for steps beyond the position's end.
         self._is_there = step < lengths
         self._row = np.where(self._is_there, starts + step, 0)
         self._n = len(position)
@@ -60,7 +60,7 @@ class Whitener:
         while time_s <= span_s / 6.0:
             self.times_s.append(time_s)
             time_s *= 10.0**0.5
-        #: The next longer correlation time, up to which a search may go [s].
+        #: The correlation time after the longest candidate, up to which a search may go [s].
         self._longest_s = time_s
 
     def shows(self, time_s: float) -> bool:
@@ -109,9 +109,9 @@ class Whitener:
         """
         Find the Gauss-Markov noise of residuals, shape (n, 3), by their profile likelihood.
 
-        The axes have a common ratio and correlation time; their white variances are profiled out.
-        The result is white noise unless twice the log likelihood gains 9.2, the 1 % point of a
-        chi-square with two degrees of freedom.
+        The axes have a common variance ratio and correlation time; their white variances are
+        profiled out. The result is white noise unless twice the log likelihood gains 9.2, the 1 %
+        point of a chi-square with two degrees of freedom.
         """
         # Candidates of the ratio of the Gauss-Markov variance to the white variance of a window.
         ratios = 10.0 ** np.arange(-2.5, 3.6, 0.5)
@@ -154,7 +154,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the minimum of the parabola through three neighbouring values, -1 .. 1."""
+    """Return the place of the minimum of the parabola through three values at -1, 0 and 1."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
@@ -169,8 +169,8 @@ class Base:
     a lag by its initial state, t, the temperatures of the support, the measured values of the
     three axes less their mean in the position.
 
-    columns: the active columns; moved: those of them with a lag, as places in `columns`
-    lag: number of that lag
+    columns: the active columns; moved: places in `columns` of the columns with a lag
+    lag: number of the lag of each moved column
     at_start, t, tilts, measured: places of the derivatives by the initial lag states, of t for the
         nonlinear terms, shape (1,) or (0,), of the temperatures, and of the measured values
     """
@@ -193,7 +193,7 @@ class Base:
 
     @property
     def size(self) -> int:
-        """Number of base series."""
+        """Number of the base series."""
         return int(self.measured[-1]) + 1
 
 
@@ -220,7 +220,7 @@ class Products:
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
-        """Products of each position without some sections, of the same shape as `whole`."""
+        """Products of each position without some sections; their shape is that of `whole`."""
         result: Floats = self.whole.copy()
         position = np.cumsum(np.isin(np.arange(len(self.cells)), self.first)) - 1
         gone = np.isin(self.section, sections)
@@ -233,8 +233,8 @@ class Series:
     The series of the windows, in m/s^2 of the nominal scale factor.
 
     windows: the data
-    nominal_scale: [input units per m/s^2], shape (3,)
-    t: temperature of the nonlinear terms, shape (n, 1) or (n, 0)
+    nominal_scale: nominal scale factors [input units per m/s^2], shape (3,)
+    t: temperature for the nonlinear terms, shape (n, 1) or (n, 0)
     """
 
     def __init__(self, windows: Windows, nominal_scale: Floats, t: Floats) -> None:
@@ -266,13 +266,13 @@ class Series:
         self.reweigh(windows.weight * shares)
 
     def reweigh(self, weight: Floats) -> None:
-        """Set the weights of the windows, shape (n,)."""
+        """Use weights of the windows, shape (n,), in all products."""
         self.weight = weight
         self.noise: Noise | None = None
         self._products: tuple[Bools, Products] | None = None
 
     def whiten(self, noise: Noise) -> None:
-        """Use a noise model, to which the series are whitened."""
+        """Use a noise model, with which the series are whitened."""
         if noise == self.noise:
             return
         self._gains = self.whitener.gains(self.weight, noise)
@@ -310,7 +310,7 @@ class Series:
         return products[..., :k], products[..., k:]
 
     def _averaged(self, values: Floats) -> Floats:
-        """Return the mean of each position, shape (n_positions, k)."""
+        """Return the mean of series in each position, shape (n_positions, k)."""
         count = np.diff(self.windows.edges)[:, None]
         return np.asarray(np.add.reduceat(values, self._first, axis=0) / count)
 

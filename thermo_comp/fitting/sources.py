@@ -36,8 +36,8 @@ class FitSource:
     """
     One bag, table, array or simulated run.
 
-    blocks: returns an iterable of the blocks in file order, a new one at each call
-    force: known |f|; None: gravity
+    blocks: returns, at each call, a new iterable of the blocks in file order
+    force: known |f|; None if |f| is gravity
     reader: returns the last reader of the recording, or None for arrays
     """
 
@@ -53,7 +53,7 @@ def fit_sources(
     paths: Sequence[str | Path], topics: Topics | None = None, force: AskedForce = USUAL_FORCE
 ) -> tuple[list[FitSource], Input]:
     """
-    Make sources of recordings; each recording is opened once here and again by the fit.
+    Make sources of recordings; each recording is opened now, and again by the fit.
 
     Raises RecordingError if a recording cannot be read or lacks a topic; FitError if a recording
     is given twice, or if some have counts and some Imu messages.
@@ -85,10 +85,10 @@ def recording_source(
     force: AskedForce = USUAL_FORCE,
 ) -> tuple[FitSource, RecordingInfo]:
     """
-    Make a source of a recording, which is opened here and again for each pass.
+    Make a source of a recording, which is opened now and again for each pass.
 
-    `require`: topics that it must have; `force`: the user's options about |f|, which replace the
-    bag's metadata
+    `require`: topics that the recording must have; `force`: the user's options about |f|, which
+    replace the bag's metadata
     """
     path = Path(path)
     with open_recording(path, topics, require=require) as reader:
@@ -108,7 +108,7 @@ def recording_source(
     wanted = topics or Topics()
     name = f'{shown_name(path)}{wanted.part}'
     if topic and not any(is_called(topic, usual) for usual in (wanted.counts, wanted.imu)):
-        name += f' ({shown(topic)})'  # messages about this source then contain the topic
+        name += f' ({shown(topic)})'  # the topic is part of the name in messages about the source
     serial = info.metadata.get('serial')
     known = known_force(path, info, force)
     return FitSource(name, blocks, serial=serial, force=known, reader=lambda: latest), info

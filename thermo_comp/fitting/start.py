@@ -4,7 +4,8 @@
 Owns the initial triad: constant bias, scale and misalignment from the means of the positions.
 
 The means of the positions lie on an ellipsoid, which is fitted without temperature by least
-squares on ``|f| - g``. The initial values follow from the extremes of the means on each axis.
+squares on ``|f| - g``. The initial values of that fit follow from the extremes of the means on
+each axis.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from .unknowns import Windows
 
 @dataclass(frozen=True)
 class ConstantCalibration:
-    """The triad at one temperature: bias [input units], scale [the same per m/s^2], M."""
+    """The triad at one temperature: bias [input units], scale [input units per m/s^2], M."""
 
     bias: Floats
     scale: Floats
@@ -41,9 +42,9 @@ def constant_calibration(
     means: Floats, gravity: float | Floats, with_misalignment: bool
 ) -> ConstantCalibration:
     """
-    Fit the triad to position means, shape (n, 3); FitError if they are on no ellipsoid.
+    Fit the triad to position means, shape (n, 3); FitError if they do not lie on an ellipsoid.
 
-    `gravity`: |f| of all positions, or of each, shape (n,) [m/s^2]
+    `gravity`: |f| of all positions, or of each position, shape (n,) [m/s^2]
     """
     # Largest RMS distance from the ellipsoid [m/s^2]: 5 % of |f|, more than the drift of a cheap
     # sensor over 60 K, and less than the error of a moving unit.
@@ -64,7 +65,8 @@ def constant_calibration(
         scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
         tried.append(_refine(means, gravity, bias, scale, with_misalignment))
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # The best ellipsoid of scattered points can be very large, with a remote centre: reject it.
+    # The best ellipsoid of scattered points can be very large, with a remote centre: it is
+    # rejected.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
         raise FitError(
@@ -111,8 +113,8 @@ def position_means(windows: Windows) -> Floats:
 
 def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     """
-    Return the white noise of the windows of each axis [m/s^2], shape (3,), from their second
-    differences, which a drift does not enter; 0 without three windows in a position.
+    Return the white noise of the windows of each axis [m/s^2], shape (3,), from second differences
+    of windows, which do not depend on a drift; 0 if no position has three windows.
     """
     inner = windows.inner
     if not len(inner):

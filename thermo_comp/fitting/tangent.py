@@ -26,12 +26,12 @@ class Normal(NamedTuple):
     unit: Floats
 
     def scaled(self, factor: Floats) -> Normal:
-        """Multiply the equations of each axis by a factor, shape (3,)."""
+        """Multiply the normal equations of each axis by a factor, shape (3,)."""
         return Normal(self.local * factor[:, None, None], self.unit * factor[:, None, None])
 
     @property
     def square(self) -> Floats:
-        """Sum of squares of the residuals of each axis, shape (3,)."""
+        """Sum of squares of the whitened residuals of each axis, shape (3,)."""
         return np.asarray(np.maximum(self.unit[:, -1, -1], 0.0))
 
 
@@ -40,19 +40,19 @@ class Tangent:
     """
     The equations linearised about a state, as coefficients of the base series at this state.
 
-    Most derivatives are one base series times a factor; the others are one of a few combinations
-    of them. The derivative of axis i in position p by unknown u is ``factor[p, i, u]`` times the
-    series ``place[u]``, in the order base series, combinations. The unknowns of an axis are those
-    of the position: up (2), stretch, offset, tilts; of the bag: initial lag states; of the unit:
-    kappa, bias, weights, nonlinear coefficients, radius, misalignment (3). The last "unknown" is
-    the residual, measured minus predicted.
+    Most derivatives are one base series times a factor; the other derivatives are one of a few
+    combinations of base series. The derivative of axis i in position p by unknown u is ``factor[p,
+    i, u]`` times the series ``place[u]``, in the order base series, combinations. The unknowns of
+    an axis are those of the position: up (2), stretch, offset, tilts; of the bag: initial lag
+    states; of the unit: kappa, bias, weights, nonlinear coefficients, radius, misalignment (3).
+    The last "unknown" is the residual, measured minus predicted.
 
     combined: the combinations, shape (n_positions, 3, n_base, n_combined)
     place: series of each unknown, shape (k + 1,)
-    factor: shape (n_positions, 3, k + 1)
+    factor: factor of the series of each unknown, shape (n_positions, 3, k + 1)
     n_local: number of unknowns of position and bag
     n_bias: number of unknowns with factor 1 after kappa: bias and its weights
-    n_scale: number of weights of the scale, which follow
+    n_scale: number of weights of the scale, which follow those of the bias
     scale: factor of the weights of the scale, shape (n_positions, 3)
     """
 
@@ -70,7 +70,8 @@ class Tangent:
         (n_positions, n_base, n_base).
         """
         first, turned = self.n_local, products[:, None] @ self.combined
-        # Sums over the positions of the products times powers of the factor of the scale.
+        # Sums over the positions of the products, times powers of the factor of the scale's
+        # weights.
         bias = slice(first + 1, first + 1 + self.n_bias)
         scale = slice(bias.stop, bias.stop + self.n_scale)
         powers = np.stack([self.scale**k for k in range(3)])
@@ -108,7 +109,7 @@ class Tangent:
         return np.asarray(result)
 
     def at(self, p: int) -> Tangent:
-        """Return the tangent of one position."""
+        """Return the equations of one position."""
         return replace(
             self, combined=self.combined[[p]], factor=self.factor[[p]], scale=self.scale[[p]]
         )

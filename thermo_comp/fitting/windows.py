@@ -34,20 +34,20 @@ from .unknowns import Windows
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
 #: Groups whose columns, with those of the curve, are summed in a curve over a part's temperature.
 PART_SUMS = ('board', 'product', 'square')
-#: Smallest number of windows of a short rest: fewer do not determine its noise.
+#: Smallest number of windows of a short rest: fewer windows do not determine the rest's noise.
 FEWEST_WINDOWS = 20
-#: Number of sections of equal length in a position. The bags repeat the chamber's program, so a
-#: section is the same part of the program in all positions.
+#: Number of sections of equal length into which a position is divided. The bags repeat the
+#: chamber's program, so a section is the same part of the program in all positions.
 N_SECTIONS = 6
 
 
 @dataclass(frozen=True)
 class Sets:
     """
-    The curves of the two sets.
+    The families of the curves of the two sets.
 
     static, dynamic: families of the curves; their coefficients are not used
-    is_shared: whether the dynamic curve is the static one plus a difference; else it is separate
+    is_shared: whether the dynamic curve is the static curve plus a difference, or a separate curve
     """
 
     static: TemperatureFunction
@@ -55,7 +55,7 @@ class Sets:
     is_shared: bool = True
 
     def columns(self, t: Floats, weight: Floats) -> list[Floats]:
-        """Evaluate the columns of the sets."""
+        """Evaluate the columns of the curves of the two sets."""
         static, dynamic = self.static.basis(t), self.dynamic.basis(t)
         if not self.is_shared:
             static = [(1.0 - weight) * value for value in static]
@@ -68,18 +68,18 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of the two sets; a sum has the family of the higher order."""
+        """Families of both sets' curves; the sum of two curves has the family of higher order."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Group of each column."""
+        """Group of each column of the model."""
         return (CURVE,) * self.static.n_free + (SET,) * (1 + self.dynamic.n_free)
 
     @property
     def level(self) -> int:
-        """Place of the column of the dynamic set's level."""
+        """Index of the column of the dynamic set's level."""
         return self.static.n_free
 
 
@@ -89,7 +89,7 @@ class Model:
     The model of a fit: curves and columns, and the settings of the thermal state.
 
     name: name of the model in the provenance
-    parts: the lag of the part of each axis; None if not known
+    parts: the lag of the part of each axis; None if the lags are not known
     sensors: thermometers other than the board's; the first is the case's
     """
 
@@ -120,17 +120,17 @@ class Model:
 
     @cached_property
     def part_curves(self) -> PartCurves:
-        """The curves over the temperatures of the parts; none without known parts or columns."""
+        """The curves over the temperatures of parts; none if parts or columns are not known."""
         parts = self.parts if self.sets.has_cubic else None
         return curves_of(parts or (), self.columns, len(self.sets.groups))
 
 
 class Track(NamedTuple):
     """
-    The states of the tracker over a bag, without memory.
+    The thermal states of a tracker over a bag, without thermal memory.
 
     start_s, step_s: start and step of the time grid [s]
-    states: shape (n, width); is_known: which of them are known, shape (n,)
+    states: thermal states, shape (n, width); is_known: which states are known, shape (n,)
     """
 
     start_s: float
@@ -146,8 +146,8 @@ class ThermalWindows:
 
     model: model of the columns
     data: samples and columns for the regression
-    temperature, rate, weight: board temperature [degC], its rate [K/s], weight of the dynamic set,
-        shape (n,)
+    temperature, rate, weight: board temperature [degC], its rate of change [K/s], weight of the
+        dynamic set, shape (n,)
     gradient: T_case - T_board [K], shape (n,)
     raw: columns of the response without powers of t and ranges, shape (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3); (n, 0) if a bag lacks it
@@ -170,7 +170,7 @@ class ThermalWindows:
 
     @property
     def is_dynamic(self) -> Bools:
-        """Windows of the dynamic regime, shape (n,)."""
+        """Whether each window is in the dynamic regime, shape (n,)."""
         return np.asarray(self.weight > 0.5)
 
     @property
@@ -209,9 +209,11 @@ def thermal_windows(
     """
     Combine the windows of all bags with the columns of their thermal states.
 
-    Windows are left out before the board's first reading, while its estimate settles, and while
-    readings of a thermometer are missing. A bag without any temperature is taken to be at the
-    reference, where all columns are 0. `tracks`: known thermal states of this detector
+    Windows are left out before the board's first reading, while the estimate of the board
+    temperature settles, and while readings of a thermometer are missing. A bag without any
+    temperature is taken to be at the reference temperature, where all columns are 0.
+
+    `tracks`: thermal states of the bags, if they were computed before with the same detector
     """
     spec = memory_of(model.columns, model.sensors)
     tracks = tracks or [_track(bag, model, spec) for bag in bags]
@@ -256,9 +258,9 @@ def _rows(
     table: ColumnTable,
 ) -> _Rows:
     """
-    Average the windows of a rest that are used to 60 s, or less in a short rest.
+    Average the used windows of a rest to windows of 60 s, or shorter windows in a short rest.
 
-    `states`: their thermal states, shape (width, n); `begin_s`: start of the memory [s]
+    `states`: thermal states of the windows, shape (width, n); `begin_s`: start of the memory [s]
     """
     time, count = interval.time[use], interval.count[use]
     window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)
@@ -295,12 +297,13 @@ def _rows(
 
 
 def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: Ints) -> Windows:
-    """Make the data of the regression."""
+    """Make the data of the regression from windows of all rests."""
     curves = model.part_curves
     groups, columns, acts_on = model.sets.groups, model.columns, model.acts_on
     n_curves, lags = len(groups), Layout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 3]
-    # A support tilts with board and case temperature, linearly and with the square of the latter.
+    # A support tilts linearly with the board and case temperatures, and with the square of the
+    # case temperature.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
@@ -311,7 +314,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
     lag = np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64)
     of_part = rows.columns @ curves.sums.T
-    # The columns of a curve over a part's temperature have at most one lag, that of the part.
+    # The columns of a curve over a part's temperature have at most one lag, the lag of the part.
     lag_of_part = np.where(curves.sums != 0.0, lag, -1).max(axis=1, initial=-1)
     return Windows(
         position=position,
@@ -389,7 +392,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
 
 
 def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats]:
-    """Return a time grid [s], and the states on it with their lags."""
+    """Return a time grid [s], and the thermal states on this grid with their lags."""
     states = track.states
     grid = np.asarray(track.start_s + track.step_s * np.arange(len(states)), dtype=np.float64)
     # The lags are evaluated on the whole grid at once, which is much faster than at each reading.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the evaluation of recordings, each read once, and the history of a unit."""
+"""Owns the evaluation of calibrations on recordings, and the history of a unit's calibrations."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -27,9 +27,9 @@ from ..unit.provenance import Source
 from .judgement import Judgement, judge
 from .windows import WINDOW_S, corrected_windows, sum_length
 
-# Largest ratio of a unit's scatter at rest to the noise that its calibration states.
+# Largest accepted ratio of a unit's scatter at rest to the noise that its calibration states.
 _NOISES = 4.0
-# Smallest significant change, in standard deviations.
+# Smallest significant change of a constant between calibrations, in standard deviations.
 _SURE_SDS = 3.0
 
 
@@ -52,7 +52,8 @@ def open_bags(
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
     """
-    Read bags for windows of `window_s`, with topics and limits of the first calibration if any.
+    Read bags for windows of `window_s`, with the topics and limits of the first calibration, if
+    any.
 
     Raises RecordingError if a bag cannot be read, or lacks a board temperature that is needed.
     """
@@ -93,7 +94,7 @@ def judge_bags(
     window_s: float = WINDOW_S,
     tolerance: float | None = None,
 ) -> Judgement | None:
-    """Judge a calibration on reduced bags; None if no window was corrected."""
+    """Judge a calibration on reduced bags; return None if no window was corrected."""
     windows = corrected_windows(bags, calibration, gravity=gravity, window_s=window_s)
     known = {source.sha256 for source in calibration.provenance.sources if source.sha256}
     is_seen = all(bag.source.sha256 in known for bag in bags)
@@ -116,7 +117,8 @@ def evaluate(
     Judge calibrations of a unit, given with their names, on its recordings.
 
     Local gravity and topics default to those of the first calibration; `tolerance` is the largest
-    accepted RMS [m/s^2]; for `serial` see `replay.check_unit`; `force`: |f| where it is not g.
+    accepted RMS of ``|f| - g`` [m/s^2]; for `serial` see `replay.check_unit`; `force`: the user's
+    options about |f| that is not g.
 
     Raises RecordingError if a recording cannot be read, or none has a window at rest;
     CalibrationError if a calibration is for another unit.
@@ -153,7 +155,8 @@ def evaluate(
 class Epoch:
     """
     A calibration of a history, in a soak at the first calibration's reference temperature: bias of
-    x, y, z [ug], change of scale since the first [ppm], shape (6,); an unknown sd is NaN.
+    x, y, z [ug] and change of scale since the first calibration [ppm], shape (6,); an unknown sd
+    is NaN.
     """
 
     created: str
@@ -163,7 +166,9 @@ class Epoch:
 
 @dataclass(frozen=True)
 class Drift:
-    """The change of a constant between two calibrations; significant beyond three sd."""
+    """
+    The change of a constant between two calibrations; a change beyond three sd is significant.
+    """
 
     earlier: str
     later: str
@@ -174,7 +179,9 @@ class Drift:
 
     @property
     def is_sure(self) -> bool:
-        """Whether the change is significant given the uncertainty of both calibrations."""
+        """
+        Whether the change of a constant is significant given the uncertainty of both calibrations.
+        """
         return abs(self.change) > _SURE_SDS * self.sd
 
 
@@ -204,7 +211,7 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
 
 
 def drifts_of(history: Sequence[Epoch]) -> list[Drift]:
-    """List the changes from each calibration to the next, with independent errors assumed."""
+    """List the changes from each calibration to the next; their errors are assumed independent."""
     return [
         Drift(
             earlier=before.created,

@@ -22,17 +22,18 @@ from .windows import Windows
 
 # Claimed sd above which a valid calibration is called wide [m/s^2].
 _WIDE_CLAIM = 1e3 * MICRO_G
-# Smallest significant shift, in standard deviations.
+# Smallest significant shift of bias or scale, in standard deviations.
 _SURE_SDS = 3.0
-# Smallest sd assumed for a misalignment [rad], and for the mean of a position [1].
+# Smallest sd assumed for a misalignment [rad], and for the relative error of a position's mean
+# |f|.
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_MISS = 1e-5, 1e-8
-# Number of consecutive windows over which thermal residuals are correlated.
+# Number of consecutive windows that count as one, since thermal residuals are correlated.
 _ALIKE = 6.0
 
 
 @dataclass(frozen=True)
 class AxisShift:
-    """Shift of an axis: bias [m/s^2], relative scale; the sds include the claimed error."""
+    """Shift of an axis since the calibration: bias [m/s^2], relative scale, each with its sd."""
 
     bias: float
     bias_sd: float
@@ -46,9 +47,9 @@ class Judgement:
     The judgement of a calibration on recordings: the verdict, and a sentence with its numbers.
 
     `left_out_rms` is the fit's RMS on positions left out, NaN if the bags are not those of the
-    fit; `tolerance` is the user's limit [m/s^2]. `shifts` are per axis, empty with fewer than six
-    distinct positions; `moved` lists the significant shifts. For `axis_rms` see `rms_by_axis`. A
-    gyroscope is judged separately.
+    fit; `tolerance` is the user's limit [m/s^2]. `shifts` are those of bias and scale per axis,
+    empty with fewer than six distinct positions; `moved` lists the significant shifts. For
+    `axis_rms` see `rms_by_axis`. A gyroscope is judged separately.
     """
 
     kind: Verdict
@@ -66,18 +67,20 @@ class Judgement:
 
     @property
     def is_valid(self) -> bool:
-        """Whether the calibration was found valid."""
+        """Whether the verdict is that the calibration is valid."""
         return self.kind.is_valid
 
     @property
     def exit_code(self) -> int:
-        """0 for a valid calibration whose gyroscope, if any, is not refuted; else 1."""
+        """Exit code: 0 for a valid calibration whose gyroscope, if any, is not refuted; else 1."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 
     @property
     def headline_rms(self) -> float:
-        """RMS expected in a new attitude: on positions left out, or bags not used in the fit."""
+        """
+        RMS error expected in a new attitude: of positions left out, or of bags outside the fit.
+        """
         in_sample = self.sections['all'].rms
         return self.left_out_rms if np.isfinite(self.left_out_rms) else in_sample
 
@@ -89,11 +92,11 @@ class Judgement:
         return str(self.kind.value)
 
     def __str__(self) -> str:
-        """Return the verdict with its numbers, as every command prints it."""
+        """Return the verdict with its numbers, as printed by every command."""
         return f'{self.verdict}: {self.reason}'
 
     def facts(self) -> dict[str, Any]:
-        """Return everything except the windows, as in every command's JSON."""
+        """Return the judgement without the windows, as in every command's JSON."""
         return {
             'verdict': self.verdict,
             'reason': self.reason,
@@ -171,7 +174,7 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
         return Verdict.OUTSIDE, f'{text}; {_numbers(outside)}'
     worst = max([s.rms for s in sections.regimes or [full]] + [judgement.headline_rms])
     ratio = sections.worst_ratio
-    # Without a claimed sd `claimed_rms` is NaN, and the comparison false.
+    # Without a claimed sd `claimed_rms` is NaN, and the comparison is false.
     is_wide = full.claimed_rms > (tolerance or min(verdicts.WIDE_PART * full.raw_rms, _WIDE_CLAIM))
     if windows.is_swapped.any():
         kind = Verdict.SWAPPED
@@ -219,13 +222,13 @@ def _windows(n: int, windows: Windows) -> str:
 
 
 def distinct_positions(windows: Windows) -> int:
-    """Count the directions that are more than five degrees apart."""
+    """Count the directions of the force that are more than five degrees apart."""
     means = means_by(windows.position, windows.force)
     return len(distinct_directions(means / np.linalg.norm(means, axis=1, keepdims=True)))
 
 
 def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[AxisShift, ...]:
-    """Fit the nine shifts that make ``|f| = g``; none with fewer than six distinct positions."""
+    """Fit the shifts of nine constants to ``|f| = g``; none with fewer than six positions."""
     if distinct_positions(windows) < POSITIONS_NEEDED:
         return ()
     gravity = windows.gravity
@@ -238,7 +241,7 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     count = np.unique(windows.position, return_counts=True)[1]
     variance = 1.0 / known + scatter / np.maximum(count / _ALIKE, 1.0)
     sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)) / gravity, _SMALLEST_MISS)
-    # Linear in the small shifts: equations of the norms, and of the misalignment's prior.
+    # The equations of the norms, and of the misalignment's prior, are linear in the small shifts.
     sizes = np.linalg.norm(force, axis=1)
     seen = norm_columns(force / sizes[:, None]) / sd[:, None]
     seen = np.vstack(
@@ -263,7 +266,7 @@ def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
             ('scale', 1e6 * shift.scale, 1e6 * shift.scale_sd, 'ppm'),
         ):
             if abs(value) > _SURE_SDS * sd:
-                # Two digits of the sd, without an exponent.
+                # The sd is printed with two digits and without an exponent.
                 digits = max(0, 1 - int(np.floor(np.log10(sd)))) if sd > 0.0 else 3
                 collected.append(f'{axis} {name} {value:+.{digits}f} +- {sd:.{digits}f} {unit}')
     return tuple(collected)

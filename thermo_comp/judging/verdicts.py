@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the words of a judgement, its sections and limits, and the verdict on a gyroscope."""
+"""Owns the verdicts of a judgement, its sections and limits, and the judgement of a gyroscope."""
 
 from dataclasses import asdict, dataclass
 from enum import Enum
@@ -22,14 +22,14 @@ LARGEST_RATIO = 2.0
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST = 6
-# Successive known |f|, in rising order, belong to one level up to this ratio.
+# Largest ratio of successive values of |f|, in rising order, that belong to one level of |f|.
 _NEXT_LEVEL = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
 
 
 class Verdict(Enum):
-    """The verdicts; the value is the verdict's wording."""
+    """The verdicts on a calibration; the value of a member is the wording."""
 
     VALID = 'valid'
     WIDE = 'valid, but it only claims'
@@ -41,17 +41,19 @@ class Verdict(Enum):
 
     @property
     def is_valid(self) -> bool:
-        """Whether the calibration was found valid."""
+        """Whether the verdict is that the calibration is valid."""
         return self in (Verdict.VALID, Verdict.WIDE)
 
 
 @dataclass(frozen=True)
 class Section:
     """
-    Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or changes of the rate [rad/s].
+    Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or changes of the angular rate
+    [rad/s].
 
-    `raw` values use the constants at the reference temperature, the others the calibration;
-    `claimed_rms` is the RMS of the claimed sd of the same windows, NaN without a claim.
+    `raw` values use the constants at the reference temperature, other values the whole
+    calibration; `claimed_rms` is the RMS of the claimed sd of the same windows, NaN without a
+    claim.
     """
 
     n: int
@@ -64,30 +66,32 @@ class Section:
 
     @property
     def ratio(self) -> float:
-        """RMS over claimed RMS."""
+        """Ratio of RMS error to claimed RMS."""
         return self.rms / self.claimed_rms
 
 
 class Sections(dict[str, Section]):
-    """``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside`` them."""
+    """
+    The sections ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside``.
+    """
 
     @property
     def regimes(self) -> list[Section]:
-        """The regimes with enough windows to be judged separately."""
+        """The regimes that have enough windows to be judged separately."""
         return [part for part in (self['static'], self['dynamic']) if part.n >= _FEWEST]
 
     @property
     def worst_ratio(self) -> float:
-        """Largest ratio of a regime, or of all."""
+        """Largest ratio of RMS error to claimed RMS over the regimes, or of all windows."""
         return max(part.ratio for part in (*self.regimes, self['all']))
 
     def facts(self) -> dict[str, Any]:
-        """Return everything, as in JSON."""
+        """Return all sections, as in a command's JSON."""
         return {name: {**asdict(part), 'ratio': part.ratio} for name, part in self.items()}
 
 
 def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats) -> Sections:
-    """Summarise values of windows, shape (n,) or (n, axes), by section."""
+    """Summarise the residuals of windows, shape (n,) or (n, axes), by section."""
     inside, dynamic = windows.is_inside, windows.is_dynamic
     sections = Sections()
     rows_of = (inside & ~dynamic, inside & dynamic, inside, ~inside)
@@ -117,18 +121,18 @@ def _section(raw: Floats, residual: Floats, claimed: Floats, rows: Bools | Ints)
 
 @dataclass(frozen=True)
 class RateJudgement:
-    """The judgement of a gyroscope: sections of the changes of all axes [rad/s]."""
+    """The judgement of a gyroscope: sections of the changes of the rate of all axes [rad/s]."""
 
     kind: Verdict
     reason: str
     sections: Sections
 
     def __str__(self) -> str:
-        """Return the verdict with its numbers, as every command prints it."""
+        """Return the verdict with its numbers, as printed by every command."""
         return f'angular rate: {self.kind.value}: {self.reason}'
 
     def facts(self) -> dict[str, Any]:
-        """Return everything, as in every command's JSON."""
+        """Return the gyroscope's judgement, as in every command's JSON."""
         return {
             'verdict': self.kind.value,
             'reason': self.reason,
@@ -148,7 +152,8 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
     if not windows.gyro.size:
         return None
     raw, corrected, variance = (windows.gyro[:, k : k + 3] for k in (0, 3, 6))
-    # Windows outside the ranges are compared with the mean of the windows inside, if any.
+    # The rate in windows outside the calibrated ranges is compared with the mean of the windows
+    # inside, if there are any.
     _, place = np.unique(windows.position, return_inverse=True)
     has_inside = np.bincount(place, windows.is_inside) > 0.0
     weight = np.where(has_inside[place], windows.is_inside, 1.0)
@@ -160,16 +165,19 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
     triad = rate_triad(calibration)
     claims, claimed = triad.has_uncertainty, np.full_like(corrected, np.nan)
     if claims:
-        # The claimed variance of the changes, from that of the rate of one message.
+        # The claimed variance of the changes follows from the claimed variance of one message's
+        # rate.
         correction = Correction(triad, Correction(calibration).memory)
         bias, change = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
         slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
-        # The errors by thermometer noise and unseen starts of lags nearly vanish in a rest's mean.
+        # The errors by thermometer noise and unknown initial lag states nearly vanish in a rest's
+        # mean.
         of_thermometers = np.maximum(variance - np.array(correction.noise) - slow - bias, 0.0)
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
         hours = counts[:, None] * windows.window_s / 3600.0
-        # Variance of a random walk about its mean over a time: 1/6 of the variance gained in it.
+        # Variance of a random walk about its mean over a period: 1/6 of the variance gained in the
+        # period.
         walk = np.square(triad.slow_noise_m_s2_sqrt_h) * hours / 6.0
         claimed = np.sqrt(of_thermometers + change + noise + walk)
     changes = np.stack((raw - mean_of(raw), corrected - mean_of(corrected), claimed))
@@ -193,7 +201,8 @@ def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict
         f'{text}, {_mdeg(total.claimed_rms)} claimed {over}; '
         f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
     )
-    # At constant temperature the correction is constant: a residual equal to raw is no fault.
+    # At constant temperature the correction is constant, so a residual as large as the raw
+    # residual is no fault.
     if ratio > LARGEST_RATIO:
         return Verdict.NO_BETTER if total.rms >= total.raw_rms else Verdict.RECALIBRATE, text
     return Verdict.WIDE if total.claimed_rms > WIDE_PART * total.raw_rms else Verdict.VALID, text

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the windows of a judgement: means at rest, corrected as in the node."""
+"""Owns the windows of a judgement: means of samples at rest, corrected as in the node."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
 from ..unit.metrics import norm_residual
 
-#: Default length of a window [s].
+#: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
-# Distance outside a calibrated range that noise can explain and counts as inside [half ranges].
+# Distance outside a calibrated range that noise can explain, so that a window counts as inside
+# [half ranges].
 _EDGE = 0.02
-# Largest relative difference of a known |f| from gravity at which the rest counts as a rest at 1
-# g.
+# Largest relative difference of a known |f| from gravity for a rest that counts as at 1 g.
 _USUAL = 0.01
-# Smallest ratio of a partial sum's number of samples to the median number.
+# Smallest ratio of the number of samples in a partial sum to the median of this number.
 _LEAST_FILLED = 0.9
 
 
@@ -44,14 +44,15 @@ class Windows:
     Windows at rest of all bags, in order; arrays of n rows.
 
     A window lasts exactly `window_s` from `start_ns`; `time` is its middle since the bag's first
-    sample [s], `count` and `mean` are of its raw samples. A position is a still interval, numbered
-    through all bags. `rate` is the board's [K/s]. `is_dynamic`: the dynamic set has more than half
-    the weight; `is_inside`: entirely inside the calibrated ranges; `is_swapped`: the board leads
-    the case. `raw` is the specific force by the constants at the reference temperature, `force`
-    by the calibration, shapes (n, 3). `size`: |f| as known, gravity unless the bag states another.
-    `claimed_sd` of the norm of `force`: the calibration's error, that of `size`, and the white
-    noise of the mean; `noise_sd`: the white noise alone. Rows of `gyro`: angular
-    rate raw and corrected, its claimed variances, the thermal state; empty without a gyroscope.
+    sample [s]; `count` and `mean` are the number and the mean of its raw samples. A position is a
+    still interval, numbered through all bags. `rate` is the rate of the board temperature [K/s].
+    `is_dynamic`: the dynamic set has more than half the weight; `is_inside`: the window is
+    entirely inside the calibrated ranges; `is_swapped`: the board temperature leads that of the
+    case. `raw` is the specific force by the constants at the reference temperature, `force` by the
+    calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the bag states
+    another value. `claimed_sd` of the norm of `force`: error of the calibration, error of `size`,
+    and white noise of the mean; `noise_sd`: the white noise alone. Rows of `gyro`: angular rate
+    raw and corrected, its claimed variances, the thermal state; empty without a gyroscope.
     """
 
     window_s: float
@@ -78,33 +79,35 @@ class Windows:
         return len(self.time)
 
     def select(self, rows: Bools) -> Windows:
-        """Return the windows of some rows; all fields but length and gravity are arrays."""
+        """Return the windows of some rows; all fields but `window_s` and `gravity` are arrays."""
         kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[2:]}
         return replace(self, **kept)
 
     @cached_property
     def raw_residual(self) -> Floats:
-        """``|f| - g`` by the constants alone, or less the known |f|, shape (n,)."""
+        """|f| by the constants alone, less gravity or the known |f|, shape (n,)."""
         return norm_residual(self.raw, self.size)
 
     @cached_property
     def residual(self) -> Floats:
-        """``|f| - g`` by the calibration, or less the known |f|, shape (n,)."""
+        """|f| by the calibration, less gravity or the known |f|, shape (n,)."""
         return norm_residual(self.force, self.size)
 
     @property
     def is_usual(self) -> Bools:
-        """Whether |f| is gravity."""
+        """Whether |f| is gravity in each window."""
         return np.asarray(np.abs(self.size / self.gravity - 1.0) < _USUAL)
 
 
 def sum_length(window_s: float) -> float:
-    """Choose the longest part of a window in which the thermal state moves little."""
+    """Choose the duration of partial sums [s], in which the thermal state changes little."""
     return window_s / float(np.ceil(window_s / reduction.WINDOW_S))
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Choose the window length [s]: the least multiple of the bags' sums that is 60 s or more."""
+    """
+    Choose the duration of windows [s]: a multiple of the partial sums' duration, 60 s or more.
+    """
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 
@@ -131,7 +134,8 @@ def corrected_windows(
         raw = constants.force(raw)
         along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
         noise = along**2 @ np.array(Correction(calibration).noise)
-        # The converter carries the rounding error to the next sample, so a mean has none.
+        # The converter adds the rounding error to the next sample, so a mean has no rounding
+        # error.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
         mean_white = white / (calibration.unit.cycle_time_s * table['count'])
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
@@ -179,9 +183,10 @@ def columns_of(windows: Windows, bags: Sequence[str]) -> dict[str, npt.NDArray[A
     }
 
 
-# A structured array of partial sums or windows.
+# A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# Fields that a window has once; the others except `excess` are averaged over its sums.
+# Integer fields of a window; all other fields except `excess` are averaged over the partial sums
+# of a window.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')
 _TRIPLES = ('mean', 'force')
@@ -236,7 +241,7 @@ def _table(
             whole['force'] = whole['mean']
         else:
             _correct(calibration, bag, whole)
-        # Drop sums with lost messages, or cut by the end of the bag.
+        # Drop partial sums with lost messages, or that the end of the bag has cut.
         few = _LEAST_FILLED * np.median(whole['count']) if len(whole) else 0.0
         whole['excess'][whole['count'] < few] = np.nan
         parts.append(_joined(whole.reshape(-1, per)))
@@ -244,7 +249,9 @@ def _table(
 
 
 def _joined(sums: _Table) -> _Table:
-    """Join the sums of each row to a window; drop windows that were not entirely corrected."""
+    """
+    Join the partial sums of each row to a window; drop windows that are not corrected entirely.
+    """
     result = sums[:, 0].copy()
     result['count'] = sums['count'].sum(axis=1)
     result['excess'] = sums['excess'].max(axis=1)
@@ -255,12 +262,12 @@ def _joined(sums: _Table) -> _Table:
 
 
 def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
-    """Run the sums through the compensator, with the readings before each."""
-    # The checks for stuck samples and gravity do not apply to a mean.
+    """Run partial sums through the compensator, with the readings before each partial sum."""
+    # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
-    # A sum is many samples: a distance of more than 15 s to the sum and the reading before it, as
-    # with a slow thermometer, is no sample whose stamp alone is wrong.
+    # A partial sum contains many samples, so its stamp is right even if it is more than 15 s later
+    # than the partial sum and the reading before it, as with a slow thermometer.
     compensator.leap_ns = np.iinfo(np.int64).max
     thermal = compensator.thermal
     readings = iter(readings_in_order(bag, thermal.inputs))

@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the batch form of the compensator: whole arrays at once, with the bits of the stream.
+Owns the correction of whole arrays at once, bit-identical to that of single samples.
 
-The compensator takes the readings one by one. The segments of the stream are collected, evaluated
-together and applied to all samples with the arithmetic of the stream.
+The compensator takes the temperature readings one by one, as for single samples. The segments
+between the readings are collected, evaluated together and applied to all samples with the same
+arithmetic.
 """
 
 from dataclasses import dataclass, fields
@@ -22,15 +23,16 @@ from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
 
-#: Future readings, the next one last: number of samples before it, latest stamp of its thermometer
-#: so far, thermometer, stamp, degC.
+#: Future readings in reverse order; for each reading the number of samples before it, the latest
+#: stamp of its thermometer so far, the thermometer, the stamp [ns] and the temperature [degC].
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
-#: Segments, each with its number of samples.
+#: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
-#: Code of the reason for which a sample is dropped; 0 is a published sample.
+#: Code of the reason for which a sample is dropped; the code 0 marks a published sample.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
 _TOO_FAST, _REFUTED = _REASONS['n_too_fast'], _REASONS['n_refuted']
-PIECE: Final = 4096  # samples corrected at a time, so that their arrays stay in the cache
+# Number of samples corrected at a time, so that their arrays stay in the cache.
+PIECE: Final = 4096
 #: Indices in the result of `corrected`: force x, y, z, then the whole covariance matrix.
 _COLUMNS: Final = (0, 1, 2, 3, 4, 5, 4, 6, 7, 5, 7, 8)
 #: The rows of `_COLUMNS` that are force x, y, z and covariance xx, xy, xz, yy, yz, zz.
@@ -41,11 +43,12 @@ _SAMPLE = [0, 1, 2, 3, 4, 5, 7, 8, 11]
 class CompensatedBlock:
     """The published samples of a block."""
 
-    index: Ints  # indices of the samples in the block, shape (n,)
+    index: Ints  # indices of the published samples in the block, shape (n,)
     stamp_ns: Stamps
-    specific_force: Floats  # [m/s^2], shape (n, 3)
-    covariance: Floats  # row-major 3x3 [m^2/s^4], shape (n, 9)
-    #: [rad/s], and variances [rad^2/s^2], shape (n, 3); None unless a rate is given and corrected.
+    specific_force: Floats  # corrected specific force [m/s^2], shape (n, 3)
+    covariance: Floats  # covariance of the force, row-major 3x3 [m^2/s^4], shape (n, 9)
+    #: Corrected angular rate [rad/s] and its variances [rad^2/s^2], shape (n, 3); None without an
+    #: angular rate or a gyroscope in the calibration.
     angular_rate: Floats | None = None
     angular_rate_variance: Floats | None = None
 
@@ -53,7 +56,7 @@ class CompensatedBlock:
 def process_block(
     compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
-    """Correct a block, and its angular rate (n, 3), with the bits of the stream."""
+    """Correct a block, and its angular rate (n, 3), bit for bit as sample by sample."""
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)
@@ -88,7 +91,7 @@ def process_block(
 
 
 def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list[Ints]:
-    """Find the samples that are in order, split into runs where time jumps back."""
+    """Find the samples whose stamps are in order, split into runs where time jumps back."""
     before_ns, leap_ns = compensator.last_ns, compensator.leap_ns
     steps = np.diff(stamps, prepend=stamps[:1] if before_ns == EVER_NS else before_ns)
     is_plain = compensator.leapt_ns is None and (steps[before_ns == EVER_NS :] > 0).all()
@@ -121,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # A full queue applies its old readings, as in the node; after a first sample only
-            # those before the next sample.
+            # A full queue of readings applies the oldest readings, as in the node; once a sample
+            # has been received, it applies only those before the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -204,7 +207,7 @@ def _apply(
 
 
 def _line(correction: Correction, segments: Segments, part: slice) -> Floats:
-    """Evaluate `Correction.line` for segments, with `part` of their slow variance."""
+    """Evaluate `Correction.line` for segments, with the rows `part` of their slow variance."""
     each = [segment for segment, _ in segments]
     start, end, slow = (np.array([one[at] for one in each]).T for at in (4, 5, 6))
     excess = np.array([segment.noise_excess for segment in each])
@@ -249,7 +252,7 @@ def _corrected(
 def _judge(
     compensator: Compensator, segments: Segments, stamps: Stamps, samples: Floats, force: Floats
 ) -> Bools:
-    """Mark the samples that the stream would publish; count the reasons of the others."""
+    """Mark the samples to be published; count the reasons for which samples are dropped."""
     reasons = np.zeros(len(stamps), dtype=np.int8)
     reasons[compensator.stuck.find(stamps, samples)] = _REASONS['n_stuck']
     is_large = ~(np.abs(samples) < compensator.calibration.unit.full_scale).all(axis=1)

@@ -4,11 +4,12 @@
 Owns the plausibility checks of samples: a stuck converter, samples faster than conversions can be,
 and |f| at rest, which must be gravity.
 
-A converter with noise does not repeat three numbers for seconds; three exact zeros are a dead
-wire. A count is charge per cycle, so its scale changes with the rate. An aged calibration, or that
-of another unit, misses gravity by more than its uncertainty in still windows (the scatter of the
-sensor, the mean of the previous window) of a second or longer. A step of |f| from one rest to
-another is no motion: it is judged within a second.
+A converter with noise does not repeat three numbers for seconds; three exact zeros indicate a dead
+wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
+calibration, or that of another unit, |f| differs from gravity by more than the claimed
+uncertainty, in windows of a second or longer that are still: the scatter is that of the sensor,
+and the mean that of the window before. A step of |f| from one rest to another is no motion: the
+calibration is judged by the step within a second.
 """
 
 import math
@@ -21,21 +22,23 @@ from ..thermal.reading_queue import NEVER_NS
 from ..typing import Bools, Floats, Ints
 from .status import GravityResidual
 
-#: Smallest number of equal samples in a row that counts as stuck.
+#: Smallest number of equal samples in a row at which the converter counts as stuck.
 STUCK_SAMPLES: Final = 50
-#: Largest ratio of the long-term rate of samples to the calibrated rate.
+#: Largest accepted ratio of the long-term rate of samples to the calibrated rate.
 LARGEST_RATE: Final = 1.5
-#: Burst allowed beyond `LARGEST_RATE`, as by a driver's buffer: number of samples, or time [s].
+#: Burst of samples accepted beyond `LARGEST_RATE`, as from a driver's buffer: number of samples,
+#: or duration [s].
 BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
-#: Relative excess of the rate up to which the calibrated noise holds.
+#: Relative excess of the sample rate up to which the calibrated noise holds.
 RATE_TOLERANCE: Final = 0.1
-_WINDOW_S: Final = 1.0  # time over which the rate is measured [s]
-#: Shortest window [ns], and its longest extension if samples are few.
+_WINDOW_S: Final = 1.0  # time over which the rate of samples is measured [s]
+#: Duration of a window of the gravity check [ns]: shortest, and longest if samples are few.
 WINDOW_NS: Final = 1_000_000_000
 LONGEST_WINDOW_NS: Final = 30_000_000_000
-PROBE_NS: Final = 90_000_000  # shortest time between samples added to a window
-SMALLEST_WINDOW: Final = 5  # smallest number of samples in a window
+# Shortest time between two samples of a window of the gravity check [ns].
+PROBE_NS: Final = 90_000_000
+SMALLEST_WINDOW: Final = 5  # smallest number of samples in a window of the gravity check
 #: Largest ratio of a still window's scatter to the noise of its samples.
 SCATTER_FACTOR: Final = 3.0
 #: Largest change of the mean between two still windows beyond noise [m/s^2]: half a milli-g.
@@ -45,9 +48,9 @@ MEMORY_WINDOWS: Final = 30.0
 #: Number of consecutive still windows that refute a calibration, and that clear it again.
 REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
-#: Time at rest after a step of |f| from rest, after which the step is judged [ns].
+#: Time at rest after a step of |f|, after which the step is judged [ns].
 STEP_NS: Final = 300_000_000
-#: A residual above the tolerance and above this number of its sd refutes the calibration.
+#: A residual of |f| above the tolerance plus this number of its sd refutes the calibration.
 REFUTING_SIGMAS: Final = 5.0
 
 
@@ -57,8 +60,8 @@ class StuckCheck:
     def __init__(self, timeout_s: float) -> None:
         self.is_on = timeout_s > 0.0
         self.limit_ns = round(timeout_s * 1e9) if self.is_on else NEVER_NS
-        self.run = (math.nan, math.nan, math.nan, 0)  # first sample of the run, and its stamp
-        self.n_same = 0  # number of repetitions of that sample
+        self.run = (math.nan, math.nan, math.nan, 0)  # first of the equal samples, and its stamp
+        self.n_same = 0  # number of samples equal to the first sample in `run`
 
     def again(self, stamp_ns: int) -> bool:
         """Count another equal sample; return whether the samples are stuck."""
@@ -98,15 +101,17 @@ class RateCheck:
     def __init__(self, cycle_s: float, counts_cycles: bool = True) -> None:
         self._cycle_s, self._counts_cycles = cycle_s, counts_cycles
         self._allowance = max(BURST_SAMPLES, BURST_S / cycle_s)
-        self.is_too_fast = False  # more samples than conversions can make
-        self.ratio = 1.0  # samples per calibrated cycle over the last `_WINDOW_S`
+        self.is_too_fast = False  # whether more samples come than the converter can make
+        self.ratio = 1.0  # samples per calibrated conversion cycle over the last `_WINDOW_S`
         self._level = 0.0
         self._last: tuple[int, int] | None = None
         self._window = (0, 0)
 
     @property
     def noise_excess(self) -> float:
-        """Excess noise variance of a sample at this rate, relative to the calibrated variance."""
+        """
+        Relative excess of a sample's noise variance over the calibrated one at the measured rate.
+        """
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 
@@ -123,7 +128,8 @@ class RateCheck:
             self._level = 0.0
             self.is_too_fast = False
         else:
-            # Count up to twice the allowance, so that the alarm ends soon after a long excess.
+            # Excess samples are counted up to twice the allowance, so that the alarm ends soon
+            # after a long excess.
             self._level = min(level, 2.0 * self._allowance)
             self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
@@ -133,7 +139,7 @@ class RateCheck:
 
 
 def variance_along(force: Sequence[float], covariance: Sequence[float]) -> float:
-    """Project a covariance xx, xy, xz, yy, yz, zz on the direction of a force."""
+    """Return the variance along a force, given the covariance xx, xy, xz, yy, yz, zz."""
     x, y, z = force
     xx, xy, xz, yy, yz, zz = covariance
     square = x * x * xx + y * y * yy + z * z * zz + 2.0 * (x * y * xy + x * z * xz + y * z * yz)
@@ -141,32 +147,36 @@ def variance_along(force: Sequence[float], covariance: Sequence[float]) -> float
 
 
 class GravityCheck:
-    """Compares |f| with gravity over still windows; with a tolerance of 0 nothing is refuted."""
+    """Compares |f| with gravity in still windows; a tolerance of 0 refutes no calibration."""
 
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
-        self.is_refuted = False  # the last windows all missed gravity by more than the tolerance
+        # |f| of the last windows differed from gravity by more than the tolerance.
+        self.is_refuted = False
         self._n_alike = 0
         self._is_against = False
         self._forces: list[Sequence[float]] = []
-        #: Samples since |f| stepped away from rest, and the stamp of the first.
+        #: Samples since |f| stepped from one rest to another, and the stamp of the first of them.
         self._off: list[Sequence[float]] = []
         self._off_ns = 0
-        self._is_resting = False  # the last sample agreed with the still window before it
+        self._is_resting = False  # whether the last sample agreed with the last still window
         self._begin_ns = self._last_ns = 0
         self._last_mean: list[float] | None = None
         self._weight = 0.0
-        self.result: GravityResidual | None = None  # None before the first still window
+        # Residual of |f|; None before the first still window.
+        self.result: GravityResidual | None = None
 
     def wants(self, stamp_ns: int) -> bool:
-        """Whether enough time has passed since the last sample added."""
+        """Whether enough time has passed since the last sample that was added to a window."""
         return not 0 <= stamp_ns - self._last_ns < PROBE_NS
 
     def add(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Take a sample, its covariance xx .. zz, and the noise variance in its trace."""
+        """
+        Take a sample, its covariance xx .. zz, and the part of the covariance's trace by noise.
+        """
         self._watch_step(stamp_ns, force, covariance, noise)
         if (
             not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS
@@ -190,7 +200,8 @@ class GravityCheck:
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
             return
-        # Largest change plus four sd of the difference of two samples, as for means in `_close`.
+        # Two samples at rest differ by the largest change plus four sd of their difference at
+        # most, as do the means in `_close`.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
         was_resting, reference = (
             self._is_resting,
@@ -234,11 +245,12 @@ class GravityCheck:
             self.result = self.result and self.result._replace(is_still=False)
             return
         size = math.hypot(*mean)
-        # The calibration's error is common to the samples of a window, their noise averages out.
+        # The calibration's error is common to the samples of a window, the samples' noise averages
+        # out.
         noise = noise_variance / 3.0
         variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n
         if self._judge(abs(size - self.gravity), math.sqrt(variance)):
-            # Earlier windows no longer describe the present state.
+            # The windows before a change of the verdict do not describe the present error.
             self._weight = 0.0
         decay = 1.0 - 1.0 / MEMORY_WINDOWS
         self._weight = self._weight * decay + 1.0
@@ -249,7 +261,9 @@ class GravityCheck:
         self.result = GravityResidual(residual, sd, n + 1, is_still)
 
     def _judge(self, miss: float, sd: float) -> bool:
-        """Count consecutive windows of equal verdict; True if the verdict has just changed."""
+        """
+        Count consecutive windows with equal verdicts; return whether the verdict has changed.
+        """
         was_against = self._is_against
         is_against = miss > self._tolerance + REFUTING_SIGMAS * sd
         self._n_alike = self._n_alike + 1 if is_against == self._is_against else 1

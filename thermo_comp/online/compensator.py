@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns (counts, temperatures) -> (specific force, covariance, regime, status), streaming and batch.
+Owns the correction of a stream of samples: counts and temperatures to specific force, covariance,
+regime and status.
 
 A reading applies from the first later-arriving sample with an equal or later stamp, so stamps and
 order of arrival determine the output, and a node that received everything in order publishes the
 bits of the offline replay. The rate of the samples, and |f| against gravity, are checked at the
-first sample of each segment: the checks cost nothing per sample, and a batch gives the same.
+first sample of each segment, so that the checks cost nothing per sample.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ from .status import CompensatorConfig, Counters, GravityResidual
 #: Smallest backward step of the stamps that is a jump of time, as of a bag that loops [ns].
 TIME_JUMP_NS: Final = 1_000_000_000
 #: A forward step of the stamps above both limits ([ns], [cycles]) is accepted only if a reading or
-#: a second sample confirms it: a single damaged stamp would erase the memory.
+#: a second sample confirms it: a single damaged stamp would erase the thermal memory.
 LEAP_NS: Final = 15_000_000_000
 LEAP_CYCLES: Final = 10.0
-#: Age above which a board temperature is stale: number of reading intervals, at least this [s].
+#: Age above which a board temperature is stale: number of reading intervals, and lower bound [s].
 STALE_INTERVALS: Final = 5.0
 SHORTEST_STALE_S: Final = 0.5
-#: Texts about a status, for diagnostics and offline reports.
+#: Texts about the status of a compensator, for diagnostics and offline reports.
 SWAPPED: Final = (
     'the board leads the case in ramps: are temperature/board and temperature/case swapped, or is '
-    'it heated from inside?'
+    'the unit heated from inside?'
 )
 HELD: Final = 'outside the calibrated range, held at its edge'
 CONTINUED: Final = (
@@ -50,7 +51,8 @@ CONTINUED: Final = (
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]
-Real = TypeVar('Real', float, Floats)  # the value of one sample, or an array of many
+# Type of a quantity: the value of one sample, or an array of many samples.
+Real = TypeVar('Real', float, Floats)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,33 +60,35 @@ class CompensatorStatus:
     """State of a compensator at the stamp of its last sample."""
 
     stamp_ns: int | None
-    #: Fault of each thermometer, and the size of a rejected step [K].
+    #: Fault of each thermometer, and the size of a rejected step of its readings [K].
     faults: Mapping[str, tuple[Fault, float]]
     #: Time from the last sample to the latest waiting reading [s].
     pending_ahead_s: float
     #: Result of `ThermalTracker.sample`; empty until there is a board temperature.
     state: tuple[float, ...] = ()
     regime: Regime = Regime.UNKNOWN
-    direction: int = 0  # -1 cooling, +1 heating, 0 neither
-    is_settled: bool = False  # the unknown initial lag states have decayed
-    #: Ages of the last used readings at the last sample [s]; infinite without a reading.
+    direction: int = 0  # temperature change: -1 cooling, +1 heating, 0 neither
+    is_settled: bool = False  # whether the unknown initial lag states have decayed
+    #: Ages of each thermometer's last used reading at the last sample [s]; infinite without a
+    #: reading.
     board_age_s: float = math.inf
     case_age_s: float = math.inf
     is_board_stale: bool = True
     is_board_lost: bool = True
     is_case_lost: bool = True
     excess: Excess = Excess(0.0, 0.0, 0.0, 0.0)  # noqa: RUF009 - it is immutable
-    #: Whether the board has led the case in a ramp: most likely the two topics are swapped.
+    #: Whether the board temperature has led that of the case in a ramp: most likely the two topics
+    #: are swapped.
     is_lead_reversed: bool = False
-    gravity: GravityResidual | None = None  # None before the platform has been at rest
-    #: Whether |f| at rest misses gravity by more than the tolerance: nothing is published.
+    gravity: GravityResidual | None = None  # residual at rest; None before the first rest
+    #: Whether |f| at rest differs from gravity by more than the tolerance: nothing is published.
     is_refuted: bool = False
     #: Bias sd of each axis' angular rate [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
 
 
 class Compensator:
-    """Corrects one unit's samples, one by one."""
+    """Corrects the samples of one unit, each when it arrives."""
 
     def __init__(
         self, calibration: Calibration | Model, config: CompensatorConfig | None = None
@@ -96,7 +100,7 @@ class Compensator:
         self.thermal = ThermalSide(model, self.config, self.counters)
         self._use(model.calibration)
         self.last_ns = self.event_ns = EVER_NS
-        #: Stamp of a sample that leapt ahead and is not confirmed yet.
+        #: Stamp of a sample that is far ahead of the sample before and is not confirmed yet.
         self.leapt_ns: int | None = None
         self.reading_ns = EVER_NS  # the latest stamp of a reading
         #: Rate correction of the present segment (`Correction.line`); empty without a gyroscope.
@@ -126,7 +130,7 @@ class Compensator:
         Correct one sample in the calibration's input unit.
 
         Returns specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4];
-        None if the sample must not be published; `counters` counts the reason.
+        None if the sample must not be published, with the reason counted in `counters`.
         """
         if not self.last_ns < stamp_ns < self.event_ns:
             return self._process_first(stamp_ns, x, y, z)
@@ -174,7 +178,9 @@ class Compensator:
             self.counters.n_saturated += 1
 
     def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
-        """Correct the first sample after an event, and run the checks of the samples."""
+        """
+        Correct the first sample after a reading or the end of a segment, and check the samples.
+        """
         if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
             self.reading_ns = EVER_NS
@@ -186,7 +192,7 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Until a temperature arrives every sample takes this branch and is counted here.
+            # Until a temperature arrives, every sample is checked in full and counted as dropped.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -203,7 +209,7 @@ class Compensator:
             is_good &= is_sound(rate_line)
             self.rate_line = rate_line.tolist()
         if not is_good:
-            # While the correction is not finite every sample takes this branch and is dropped.
+            # While the correction is not finite, every sample is checked in full and dropped.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None
@@ -229,13 +235,13 @@ class Compensator:
         is_far = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
         if is_far and (leapt_ns is None or stamp_ns <= leapt_ns):
             self.leapt_ns = stamp_ns
-            self.event_ns = EVER_NS  # the next sample takes this branch, too
+            self.event_ns = EVER_NS  # the next sample is also checked for a leap
             return True
         return False
 
     def jump_back(self, stamp_ns: int) -> None:
-        """Restart at a sample before which time has jumped back: a bag that loops."""
-        # Waiting readings with later stamps belong to the time before the jump.
+        """Restart at a sample before which time has jumped back, as in a bag that loops."""
+        # Waiting readings with later stamps belong to the time before the backward jump.
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self.thermal.reset()
         self.stuck = StuckCheck(self.config.stuck_timeout_s)
@@ -244,7 +250,7 @@ class Compensator:
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Take the regime flags that are due: (stamp of the deciding reading, S)."""
+        """Take the regime flags since the last call: (stamp of the deciding reading, S)."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 
@@ -270,15 +276,16 @@ class Compensator:
         """
         Build a compensator that continues from the last sample with another model or settings.
 
-        Thermometers, regime and memory are kept as far as the new model has the same. The original
-        does not change, so a failure has no effect; only one of the two compensators may continue.
+        The states of thermometers, regime and memory that the new model also has are kept. The
+        original does not change, so a failure has no effect; only one of the two compensators may
+        continue.
         """
         new = copy(self)
         new.take_over(model, config)
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Go on with another model or settings; a compensator that was copied does not change."""
+        """Continue with another model or settings; the original of a copy does not change."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckCheck(config.stuck_timeout_s)
         self.config, self.thermal = config, copy(self.thermal)
@@ -288,11 +295,11 @@ class Compensator:
 
     @property
     def now_ns(self) -> int | None:
-        """Stamp of the last sample; None before the first."""
+        """Stamp of the last sample; None before the first sample."""
         return self.last_ns if self.last_ns != EVER_NS else None
 
     def status(self) -> CompensatorStatus:
-        """Return the state, for diagnostics."""
+        """Return the state of the compensator, for diagnostics."""
         thermal = self.thermal
         tracker, rate = thermal.tracker, thermal.rate_correction
         detector, gravity = tracker.detector, self.gravity
@@ -305,7 +312,8 @@ class Compensator:
         board_age_s, case_age_s = (
             math.inf if one is None else (stamp_ns - one) * 1e-9 for one in (board_ns, case_ns)
         )
-        # Stale at half the time-out at the latest, so that a warning precedes the error.
+        # The board temperature is stale at half the time-out at the latest: a warning precedes the
+        # error.
         timeout_s = self.config.temperature_timeout_s
         usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
         state = thermal.sample(stamp_ns)
@@ -333,11 +341,11 @@ class Compensator:
 def corrected(
     line: Iterable[Real], misalignment: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
-    """Return force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s into a segment."""
+    """Return force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s after a segment began."""
     (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
      ax, lx, qx, ay, ly, qy, az, lz, qz) = line  # fmt: skip
     yx, zx, zy, var_yx, var_zx, var_zy = misalignment
-    # Eq. (7), solved for the input of each axis.
+    # Eq. (7) of the paper, solved for the input of each axis.
     x = (x - (bx + bx1 * dt)) / (sx + sx1 * dt)
     y = (y - (by + by1 * dt)) / (sy + sy1 * dt)
     z = (z - (bz + bz1 * dt)) / (sz + sz1 * dt)
@@ -363,6 +371,6 @@ def corrected(
 def corrected_rate(
     line: Iterable[Real], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real]:
-    """Return the angular rate x, y, z and the variance of each axis, `dt` s into a segment."""
+    """Return the angular rate x, y, z and each axis' variance, `dt` s after a segment's start."""
     bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = line
     return x - (bx + bx1 * dt), y - (by + by1 * dt), z - (bz + bz1 * dt), xx, yy, zz

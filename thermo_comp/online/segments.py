@@ -4,9 +4,9 @@
 Owns the segments: time intervals between temperature readings, with a correction linear in time.
 
 A segment ends at a temperature reading, or after one second. The correction is evaluated in full
-at both ends, so a sample costs a few operations, the output has no staircase, and a batch needs
-one evaluation per segment. The slow part of the variance is evaluated at the first segment in each
-ten seconds of the stamps.
+at both ends of a segment, so a sample costs a few operations, the output has no steps, and a batch
+needs one evaluation per segment. The slow part of the variance is evaluated at the first segment
+in each ten seconds.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from .status import CompensatorConfig, Counters
 
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
-SLOW_NS: Final = 10_000_000_000  # time for which the slow part of the variance is held
+SLOW_NS: Final = 10_000_000_000  # time for which the slow part of the variance is held [ns]
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
 UNMEASURED_SD_K: Final = 10.0
@@ -39,17 +39,19 @@ class Segment(NamedTuple):
     """A time interval with a linear correction, and the checks that apply to its samples."""
 
     start_ns: int
-    is_new: bool  # False for the second part of a segment cut by the end of a block or a call
-    is_too_fast: bool  # samples come faster than conversions can
-    noise_excess: float  # excess noise variance by the rate of the samples, relative
-    start: tuple[float, ...]  # thermal states at both ends
-    end: tuple[float, ...]
-    #: Slow part of the variance of the force (`Correction.n_slow`), then of the angular rate.
+    # False for the second part of a segment that the end of a block or a call has cut.
+    is_new: bool
+    is_too_fast: bool  # whether samples come faster than the converter can make them
+    noise_excess: float  # relative excess of the noise variance because of the samples' rate
+    start: tuple[float, ...]  # thermal state at the start of the segment
+    end: tuple[float, ...]  # thermal state at the end of the segment
+    #: Slow part of the variance of the force, `Correction.n_slow` numbers, then of the angular
+    #: rate.
     slow: list[float]
 
 
 class Model:
-    """A calibration prepared for evaluation; immutable."""
+    """A calibration prepared for evaluation; the object is immutable."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
@@ -110,7 +112,7 @@ class ThermalSide:
             self.tracker.reconfigure(*self._tracker_config(), now_ns)
             return
         self.tracker = self._new_tracker()
-        # Start from the last temperatures, so that no sample is lost.
+        # Start from the last temperatures, so that no sample is dropped for lack of a temperature.
         for name, sensor in old.thermometers.items():
             if name in self.inputs and sensor.stamp_ns is not None:
                 self.tracker.read(name, sensor.stamp_ns, sensor.temperature)
@@ -175,7 +177,9 @@ class ThermalSide:
         return EVER_NS if board_ns is None else board_ns + timeout_ns
 
     def count_unmeasured(self, n_samples: int) -> None:
-        """Count samples that came without a board temperature, or too long after it."""
+        """
+        Count samples as dropped: without a board temperature, or too long after the last one.
+        """
         if self.tracker.board.stamp_ns is None:
             self.counters.n_no_temperature += n_samples
         else:
@@ -194,20 +198,20 @@ class ThermalSide:
         return Segment(start_ns, is_new, rate.is_too_fast, rate.noise_excess, start, end, slow)
 
     def bias_sd(self, correction: Correction, variances: Sequence[float]) -> tuple[float, ...]:
-        """Return the bias sd of each axis: the root of its variance minus a sample's noise."""
+        """Return the bias sd of each axis: the root of the variance without a sample's noise."""
         excess = 1.0 + self.rate.noise_excess
         pairs = zip(variances, correction.noise, strict=False)
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[float]:
-        """Return the slow part of the variance of a segment, evaluated at its end or held."""
+        """Return the slow part of a segment's variance, evaluated at the segment's end or held."""
         key = start_ns // SLOW_NS
         if key != self._slow_key:
             self._slow_key = key
             shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)
             if self.is_unmeasured:
-                # Without a reading, evaluate the variance one sd of the temperature from the
-                # reference.
+                # Without a temperature reading, evaluate the variance one sd of the temperature
+                # from the reference temperature.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             self._slow = [v for part in self.model.uncertainty for v in part.at(end_state, shares)]
         return self._slow

@@ -13,13 +13,13 @@ from ..thermal.settings import ThermalConfig
 class CompensatorConfig(ThermalConfig):
     """Settings of the user; ValueError if a value is out of its range."""
 
-    #: Time after which repeated equal samples are dropped [s]; three exact zeros always are; 0
-    #: switches both checks off.
+    #: Time after which repeated equal samples are dropped [s]; samples of three exact zeros are
+    #: always dropped; 0 switches both checks off.
     stuck_timeout_s: NotNegative = 2.0
-    #: Gravity at the place of use [m/s^2]; 0 = that of the calibration.
+    #: Gravity at the place of use [m/s^2]; 0 = the gravity of the calibration.
     local_gravity_m_s2: NotNegative = 0.0
-    #: Largest error of |f| at rest [m/s^2]. With a larger error the calibration is that of another
-    #: unit, or an axis is reversed, and nothing is published; 0 = no limit.
+    #: Largest accepted error of |f| at rest [m/s^2]. With a larger error the calibration is that
+    #: of another unit, or an axis is reversed, and nothing is published; 0 = no limit.
     gravity_tolerance_m_s2: NotNegative = 0.5
 
 
@@ -35,7 +35,7 @@ class Dropped:
     n_stuck: int = 0
     n_too_fast: int = 0
     n_refuted: int = 0
-    n_unsound: int = 0  # the corrected sample is not finite
+    n_unsound: int = 0  # samples whose correction is not finite
 
 
 DROPPED = tuple(field.name for field in fields(Dropped))
@@ -60,7 +60,7 @@ class Counters(Dropped):
 
 
 class GravityResidual(NamedTuple):
-    """|f| - g over still windows [m/s^2], its sd, their number, and whether the last was still."""
+    """|f| - g over still windows [m/s^2], its sd, their number, if the last window was still."""
 
     residual: float
     residual_sd: float

@@ -20,23 +20,27 @@ _STEP = re.compile(
 )
 _SECONDS = {'h': 3600.0, 'min': 60.0, 's': 1.0}
 _PROGRAMS = {
-    # The range and the style of the paper's Fig. 3: up, down and back, with long soaks.
+    # The temperature range and the style of the paper's Fig. 3: up, down and back, with long
+    # soaks.
     'paper': '20 60min, 35@0.5 90min, 20 60min, 5 90min, 20 60min, 35 60min',
-    # Four hours, one bag of a calibration: the whole range, both directions, two ramp rates.
+    # Four hours, for one bag of a thermal test: the whole temperature range, ramps in both
+    # directions, two rates.
     'chamber': '20 20min, 35@0.75 35min, 5@0.6 45min, 20@0.75 35min, 8@1 23min',
-    # The shortest program with the whole range, both directions and short soaks.
+    # The shortest program with the whole temperature range, ramps in both directions and short
+    # soaks.
     'three-hours': '20 10min, 35@0.8 30min, 5@1.2 40min, 22@0.5 22.25min',
-    # Nine and a half hours: slow and fast ramps in both directions, which bound all others.
+    # Nine and a half hours: slow and fast ramps in both directions; other ramps have rates in
+    # between.
     'long': '20 30min, 35@0.5 60min, 5@1 60min, 25@0.3 40min, 10@0.7 45min, 33@0.9 40min, '
     '15@0.35 40min, 20@0.5 19.92063492063492min',
-    # Rates, soak temperatures and an order that no fit has used.
+    # Ramp rates, soak temperatures and their order differ from those of all programs for a fit.
     'held-out': '12 40min, 31@0.35 45min, 17@0.9 30min, 26@0.6 50min, 7@0.7 60min, 22@0.25 40min',
     'slow': '20 60min, 35@0.1 60min, 5@0.2 60min, 20@0.15 60min',
     'fast': '20 45min, 35@3 75min, 5@2 90min, 25@1.5 75min, 10@3 60min',
-    # Ninety minutes, for the sample bags: both regimes and both directions.
+    # The program of the sample bags: both regimes, and ramps in both directions.
     'demo': '15 12min, 30@1 22min, 8@1.1 21min',
     'soak': '20 4h',
-    # Three temperatures with time to settle, for runs on a centrifuge or a rate table.
+    # Soaks at three temperatures, long enough to settle, for runs on a centrifuge or a rate table.
     'three-soaks': '20 60min, 35@1 60min, 5@1 60min',
 }
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
@@ -45,36 +49,38 @@ _EDGES = [
     *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
     *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
 ]
-# Corners: three diagonals with their opposites first.
+# Corners of the cube: the ends of three space diagonals first.
 _CORNERS = [
     *[(1, 1, 1), (-1, -1, -1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1), (1, -1, 1)],
     *[(-1, -1, 1), (1, 1, -1)],
 ]
-# Sd of the tilt about each transverse direction, as the block is not levelled [deg].
+# Sd of the tilt about each transverse direction [deg]: the mounting block is not levelled.
 _SPREAD_DEG = 3.0
-# Attitudes of three positions: each axis has both signs of gravity.
+# Attitudes of a test with three positions: each axis measures both signs of gravity.
 _THREE = np.array([(1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
 PLAN_NAMES = (
     *('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out'),
     *('centrifuge', 'rate-table'),
 )
-# Ends of the soaks; lead of a run before such an end, time at each rate, time between rates [s].
+# Runs at several rates, times in s: ends of the soaks; time from the start of a run to the end of
+# its soak; time at each rate; time between rates.
 _SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
-# Centrifuge: 1 m, 2 to 10 g beside the vertical 1 g; rate table: 0.25 m, up to 1000 deg/s.
+# Radius [m] and rotation rates [rad/s] of the simulated machines. Centrifuge: 1 m, 2 to 10 g
+# horizontally; rate table: 0.25 m, up to 1000 deg/s.
 _CENTRIFUGE = 1.0, tuple(math.sqrt(g * STANDARD_GRAVITY) for g in (2.0, 4.0, 7.0, 10.0))
 _RATE_TABLE = 0.25, tuple(math.radians(rate) for rate in (400.0, 600.0, 800.0, 1000.0))
 
 
 @dataclass(frozen=True)
 class Cyclogram:
-    """Air temperature [degC] over time [s]: linear between points, constant outside."""
+    """Air temperature [degC] over time [s]: linear between the points, constant outside."""
 
     time_s: tuple[float, ...]
     temperature_c: tuple[float, ...]
 
     @property
     def duration_s(self) -> float:
-        """Length of the program, s."""
+        """Duration of the program, s."""
         return self.time_s[-1]
 
 
@@ -84,8 +90,8 @@ def parse_cyclogram(text: str) -> Cyclogram:
 
     Steps are separated by commas, semicolons or lines: ``TARGET[@RATE] [SOAK]`` with the target in
     degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is the
-    starting temperature and takes no rate; a later one without a rate keeps the last rate (1 K/min
-    if none was given). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
+    starting temperature and takes no rate; a later step without a rate keeps the last rate (1
+    K/min if none was given). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
     """
     text = _PROGRAMS.get(text.strip(), text)
     time, temperature, rate = [0.0], list[float](), 1.0
@@ -118,14 +124,15 @@ def positions(n: int, seed: int = 0) -> Floats:
     """
     Return attitudes of a calibration test as unit vectors of the specific force, shape (n, 3).
 
-    Six are the faces of a cube, nine the corners of a three-capped prism, twelve the corners of an
-    icosahedron: for their number the best sets to determine bias, scale and misalignment. Other
-    sets take the faces of a cube, then its edges, then its corners; more than 26 follow a uniform
-    spiral on the sphere. The sets of 6, 9, 12, 18, 24 and 26 are balanced. `seed` tilts each
-    attitude by a small random angle.
+    Six attitudes are the faces of a cube, nine the corners of a three-capped prism, twelve the
+    corners of an icosahedron: for their number the best sets to determine bias, scale and
+    misalignment. Other numbers of attitudes take the faces of a cube, then its edges, then its
+    corners; more than 26 attitudes follow a uniform spiral on the sphere. The sets of 6, 9, 12,
+    18, 24 and 26 attitudes are balanced. `seed` tilts each attitude by a small random angle.
     """
     if n == 9:
-        # Three corners on the equator, six between them at elevations of +-44 degrees.
+        # The prism has three corners on the equator, and six between them at elevations of +-44
+        # degrees.
         third = np.arange(3) * 2.0 * math.pi / 3.0
         ring = np.stack([np.cos(third), np.sin(third)], axis=1)
         height, radius = 0.7, math.sqrt(1.0 - 0.7**2)
@@ -153,8 +160,8 @@ def positions(n: int, seed: int = 0) -> Floats:
 @dataclass(frozen=True, eq=False)
 class Position:
     """
-    A position of a test: the chamber's program, the direction of the specific force, and the
-    rotation that adds to it.
+    A position of a test: the chamber's program, the direction of the specific force at rest, and a
+    rotation that adds to this force.
     """
 
     program: Cyclogram
@@ -174,7 +181,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')
     rng = generator(seed, Stream.CYCLOGRAM, PLAN_NAMES.index(name))
     if name == 'held-out':
-        # Random attitudes without a vertical axis, which no other plan has.
+        # The attitudes are random and have no vertical axis, unlike those of all other plans.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(parse_cyclogram('held-out'), ups)
     if name in ('centrifuge', 'rate-table'):

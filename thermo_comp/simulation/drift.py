@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the physics of the errors: each effect belongs to a part, and is zero in the steady state in
-which the board's thermometer shows the reference temperature.
+Owns the physics of the thermal errors: each effect belongs to a part of the unit, and is zero in
+the steady state in which the board's thermometer shows the reference temperature.
 """
 
 from abc import ABC, abstractmethod
@@ -37,14 +37,15 @@ class PartHistory:
     step: float
 
     def of(self, part: str) -> Floats:
-        """Return the deviation of one part, shape (m,), K."""
+        """Return the temperature deviation of one part, shape (m,), K."""
         return self.deviation[:, self.nodes.index(part)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effect(ABC):
     """
-    A cause of errors; per axis ``bias * first + bias_curvature * second``, the scale likewise.
+    The base class of the causes of thermal errors. The bias of each axis changes by ``bias * first
+    + bias_curvature * second``, the scale likewise.
 
     Bias changes in ug and scale changes in ppm per unit of the first and the second signal.
     """
@@ -114,14 +115,15 @@ class FlowEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """Slow relaxation in a part: follows a fast change of temperature [K], then decays."""
+    """Slow relaxation in a part: the effect follows a fast temperature change [K], then decays."""
 
     part: str
     time_constant: float
 
     def _signals(self, history: PartHistory) -> tuple[Floats, float]:
         d = history.of(self.part)
-        # First-order lag of an input that is linear between grid points, settled at the start.
+        # First-order lag, in steady state at the start, of an input that is linear between grid
+        # points.
         kept = np.exp(-history.step / self.time_constant)
         new = 1.0 - self.time_constant / history.step * (1.0 - kept)
         lagged = lfilter([new, 1.0 - kept - new], [1.0, -kept], d - d[0]) + d[0]

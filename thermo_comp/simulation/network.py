@@ -4,9 +4,9 @@
 Owns the thermal network and its solution: lumped parts, conductances, self-heating, thermostat.
 
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
-parts, then the thermostat's integral; `u` is the air temperature; `p` is constant. Between knots
-of the air the solution is linear plus decaying modes. The nonlinear part of convection, beyond its
-conductance at 1 K, is held constant for a second.
+parts, then the thermostat's integral; `u` is the air temperature; `p` is constant. Between the
+knots of the air temperature the solution is linear plus decaying modes. The nonlinear part of
+convection, beyond its conductance at 1 K, is held constant for a second.
 """
 
 from collections.abc import Mapping
@@ -18,14 +18,15 @@ from scipy.optimize import root
 from ..typing import Floats
 
 AIR = 'air'
-_STEP_S = 1.0  # time over which convection is held constant [s]
+_STEP_S = 1.0  # time step over which convection is held constant [s]
 
 
 @dataclass(frozen=True)
 class Link:
     """
-    Heat path between two parts, or a part and the chamber's air, `AIR`: W/K (at 1 K). The flow is
-    proportional to the temperature difference to the power `exponent`, 1.25 for free convection.
+    Heat path between two parts, or a part and the chamber's air, `AIR`; conductance in W/K (at 1
+    K). The flow is proportional to the temperature difference to the power `exponent`, 1.25 for
+    free convection.
     """
 
     a: str
@@ -36,7 +37,9 @@ class Link:
 
 @dataclass(frozen=True)
 class Thermostat:
-    """Heater of a part, 0 to `max_power` W, controlled to `set_point` [degC]; W/K and W/(K s)."""
+    """
+    Heater of a part, 0 to `max_power` W, with PI control to `set_point` [degC]; W/K, W/(K s).
+    """
 
     node: str
     set_point: float
@@ -69,7 +72,9 @@ class ThermalNetwork:
         return {AIR: -1, **{name: i for i, name in enumerate(self.nodes)}}
 
     def system(self) -> tuple[Floats, Floats, Floats]:
-        """Return A, b and p, shapes (k, k), (k,) and (k,), as if every exponent were 1."""
+        """
+        Return A, b and p of the network's equation, shapes (k, k), (k,), (k,), for exponents of 1.
+        """
         n, index = len(self.nodes), self._places
         size = n + (self.thermostat is not None)
         both, p = np.zeros((size + 1, size + 1)), np.zeros(size)
@@ -107,7 +112,7 @@ class ThermalNetwork:
         return flow[:-1]
 
     def settled(self, air: float, power: Floats | None = None) -> Floats:
-        """Return the state after an endless soak under constant powers, shape (k,)."""
+        """Return the network's state after an endless soak under constant powers, shape (k,)."""
         A, b, p = self.system()
         drive = p if power is None else power
         state = np.linalg.solve(A, -b * air - drive)
@@ -124,7 +129,9 @@ class ThermalNetwork:
         return self.settled(air)[: len(self.nodes)]
 
     def air_for(self, node: str, temperature: float) -> float:
-        """Return the air temperature that brings a part to a temperature in an endless soak."""
+        """
+        Return the air temperature that brings a part to a given temperature in an endless soak.
+        """
         i = self.nodes.index(node)
 
         def miss(air: Floats) -> float:
@@ -135,7 +142,7 @@ class ThermalNetwork:
 
 class ThermalResponse:
     """
-    Temperatures of a network over a program, at any time.
+    Temperatures of a thermal network over a chamber program, at any time.
 
     `air` are the chamber's temperatures at the knots `time` [s], shape (m,); `power` is the
     dissipation between the knots in addition to the constant powers [W], shape (m - 1, n_parts).
@@ -170,14 +177,15 @@ class ThermalResponse:
         self._rate, self._modes = rate, modes
 
         length = np.diff(self._time)
-        # Linear part of each interval, alpha + beta (t - t_knot), and each mode at its start.
+        # Linear part alpha + beta (t - t_knot) of each interval, and each mode at the interval's
+        # start.
         self._beta = -(np.diff(air) / length)[:, None] * (inverse @ b)
         self._alpha = (self._beta - np.outer(air[:-1], b) - drive) @ inverse.T
         self._amplitude = np.empty((len(length), len(rate)), dtype=complex)
         state = network.settled(air[0], drive[0])
         before = network.convection(state, air[0])
         for k, lasts in enumerate(length):
-            # Mean convection of the interval, extrapolated from two values (Adams-Bashforth).
+            # Mean convection of the next interval, extrapolated from two values (Adams-Bashforth).
             now = network.convection(state, air[k])
             self._alpha[k] -= inverse @ (1.5 * now - 0.5 * before)
             self._amplitude[k] = unmix @ (state - self._alpha[k])

@@ -16,7 +16,7 @@ from .unit import GyroModel, Stream, UnitModel, generator, rounded
 
 
 class Specimen:
-    """Draws the constants of one specimen; `kind` numbers the stream of random numbers."""
+    """Draws the constants of one simulated unit; `kind` numbers the stream of random numbers."""
 
     def __init__(self, name: str, seed: int, kind: int) -> None:
         self.name = name
@@ -24,7 +24,7 @@ class Specimen:
         self._rng = generator(seed, Stream.UNIT, kind)
 
     def near(self, value: float) -> float:
-        """Draw within 5 % of a value."""
+        """Draw a number within 5 % of a value."""
         return value * (1.0 + 0.05 * self._rng.uniform(-1.0, 1.0))
 
     def between(self, low: float, high: float) -> float:
@@ -32,16 +32,16 @@ class Specimen:
         return float(self._rng.uniform(low, high))
 
     def axes(self, value: float, spread: float) -> Triple:
-        """Draw around a value, with the same sign."""
+        """Draw a number around a value, with the same sign."""
         return triple(value * (1.0 + spread * self._rng.uniform(-1.0, 1.0, 3)))
 
     def signed(self, low: float, high: float) -> Triple:
-        """Draw log-uniform magnitudes with random signs."""
+        """Draw numbers of log-uniform magnitudes with random signs."""
         size = np.exp(self._rng.uniform(math.log(low), math.log(high), 3))
         return triple(size * self._rng.choice((-1.0, 1.0), 3))
 
     def normal(self, sd: float) -> Triple:
-        """Draw from a normal distribution of mean 0."""
+        """Draw numbers from a normal distribution of mean 0."""
         return triple(sd * self._rng.standard_normal(3))
 
     def heat(self, **capacity: float) -> dict[str, float]:
@@ -63,7 +63,7 @@ class Specimen:
         misalignment_sd: float = 1e-3,
         **others: Any,
     ) -> UnitModel:
-        """Return the unit with random constants."""
+        """Return a unit with random constants."""
         K = self.axes(32768.0 / (full_scale_g * STANDARD_GRAVITY), spread)
         bx, by, bz = self.normal(bias_ug)
         yx, zx, zy = self.normal(misalignment_sd)
@@ -79,7 +79,8 @@ class Specimen:
 
     def triad(self, network: ThermalNetwork, drift: Iterable[Effect], **others: Any) -> UnitModel:
         """Return a triad of bare heads on a board, with random constants."""
-        # 3 ug/sqrt(Hz) and the converter's rounding at 4 Hz give 60 s means a noise of 0.65 ug.
+        # Noise of 3 ug/sqrt(Hz) and the converter's rounding at 4 Hz give 60 s means an sd of 0.65
+        # ug.
         noise: dict[str, Any] = {'noise_density': (3.0, 3.0, 3.0), 'full_scale_g': 9.975}
         return self.unit(network, tuple(drift), bias_ug=1500.0, **noise, **others)
 
@@ -99,10 +100,11 @@ def _thermostatted(draw: Specimen) -> UnitModel:
         thermostat=Thermostat('oven', 55.0, 20.0, 0.08, 25.0),
     )  # fmt: skip
     drift = (
-        # The reference current sets the scale of all axes; its curvature is a bandgap's.
+        # The reference current determines the scale of all axes; the curvature is that of a
+        # bandgap reference.
         PartEffect('reference', scale=draw.axes(40.0, 0.15), scale_curvature=draw.axes(0.02, 0.5)),
-        # Dielectric absorption and charge injection of each axis' potted integrator; the leakage
-        # of its switches, with positive curvature, is on the board.
+        # Each axis' potted integrator has dielectric absorption and charge injection; the leakage
+        # of the integrator's switches, with positive curvature, is on the board.
         PartEffect('integrator', scale=draw.normal(3.0), bias=draw.signed(6.0, 14.0)),
         PartEffect('board', bias=draw.normal(1.0), bias_curvature=draw.normal(0.03)),
         PartEffect('head', scale=draw.axes(80.0, 0.1), bias=draw.signed(0.3, 5.0)),
@@ -131,9 +133,10 @@ def _bare_quartz(draw: Specimen) -> UnitModel:
         PartEffect('reference', scale=draw.axes(29.5, 0.01)),
         PartEffect('pendulum', bias=draw.signed(0.3, 5.0), bias_curvature=draw.normal(0.005)),
         # The shunt that compensates the magnet's tempco and the coil on the pendulum have
-        # different temperatures in a ramp: effects that cancel in a soak do not cancel then.
+        # different temperatures in a ramp: effects that cancel in a soak do not cancel in a ramp.
         PartEffect('head', 'pendulum', scale=draw.axes(-115.0, 0.2), bias=draw.normal(15.0)),
-        # Stress through the joint to the mounting ring, heavy and slow, bolted to the case.
+        # Stress acts through the joint to the mounting ring, which is heavy, slow and bolted to
+        # the case.
         PartEffect('mount', 'head', scale=draw.axes(15.0, 0.3), bias=draw.normal(4.0)),
         CreepEffect('pendulum', 6.0 * 3600.0, bias=draw.normal(0.02)),
     )
@@ -180,16 +183,16 @@ def _mems(draw: Specimen) -> UnitModel:
 
 def _demo(draw: Specimen) -> UnitModel:
     """Draw the sample unit: tempcos on the board, `loads`, and a sensor head that lags."""
-    # The time constants are short, as the unit must settle in the soaks of the sample bags.
+    # The time constants are short, because the unit must settle in the soaks of the sample bags.
     board_tau, tau = 0.25 * draw.between(400.0, 900.0), draw.between(500.0, 1500.0)
     capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau}
     links = [*draw.links((AIR, 'case', 4.0)), Link('case', 'board', 0.4)]
-    # The head has a small heat capacity, so that it hardly affects the board.
+    # The sensor head has a small heat capacity, so that it hardly affects the board.
     capacity['head'] = 0.02 * tau
     links.append(Link('board', 'head', 0.02))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
     drift = PartEffect('board', **tempcos(draw))
-    # A stress that decays with the lag of the head, and a large load.
+    # A stress decays with the lag of the head; the load, a heat flow, has a large effect.
     stress = PartEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
     load = FlowEffect('case', 'board', 2.0, 0.5, True, bias=draw.signed(60.0, 120.0))
     return draw.triad(network, (drift, *loads(draw), load, stress))
@@ -225,7 +228,7 @@ _KINDS = {
     'thermostatted': (0, _thermostatted),
     'bare-quartz': (1, _bare_quartz),
     'mems': (2, _mems),
-    # The missing numbers belong to the triads of benchmarks/triads.py.
+    # The numbers missing between these belong to the triads of benchmarks/triads.py.
     'demo': (13, _demo),
 }
 UNIT_NAMES = tuple(_KINDS)
@@ -233,7 +236,7 @@ UNIT_NAMES = tuple(_KINDS)
 
 def unit_preset(name: str, seed: int = 0) -> UnitModel:
     """
-    Return a specimen of a kind of unit, different for every seed (>= 0).
+    Return a simulated unit of some kind, different for every seed (>= 0).
 
     'thermostatted' (quartz triad in an oven, the converter's board outside: the board's drift
     dominates), 'bare-quartz' (no oven: the magnet's scale tempco dominates), 'mems', or 'demo'

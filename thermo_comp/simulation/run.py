@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a run: a unit in a chamber over a program, whole or block by block, and its truth."""
+"""Owns a simulated run: a unit in a chamber over a program, whole or in blocks, and the truth."""
 
 import math
 import sys
@@ -23,13 +23,14 @@ from .unit import REFERENCE_C, Stream, SwitchedLoad, UnitModel, first_charge, ge
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 _NS = 1_000_000_000
-_GRID_S = 1.0  # step of the thermal grid; bias and scale are linear between its points
+_GRID_S = 1.0  # step of the thermal grid [s]; bias and scale are linear between grid points
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
     """
-    The truth of a run on the thermal grid (m points) and at the accelerometer's n cycles.
+    The true bias, scale and force of a run, on the thermal grid (m points) and at the
+    accelerometer's n cycles.
 
     Bias is in counts per cycle (`rate_bias`: rad/s), scale is relative; `bias_grid` includes the
     random walk, which no model predicts. `cycle_s` are the middles of the cycles; `specific_force`
@@ -49,17 +50,17 @@ class Truth:
 
     @property
     def bias(self) -> Floats:
-        """Bias of each cycle, shape (n, 3)."""
+        """Bias in each conversion cycle, shape (n, 3)."""
         return self.on_cycles(self.bias_grid)
 
     @property
     def scale(self) -> Floats:
-        """Relative scale of each cycle, shape (n, 3)."""
+        """Relative scale in each conversion cycle, shape (n, 3)."""
         return self.on_cycles(self.scale_grid)
 
     def on_cycles(self, grid: Floats) -> Floats:
-        """Interpolate linearly from the grid to each cycle."""
-        # No np.interp, whose rounding depends on the number of points.
+        """Interpolate values linearly from the thermal grid to each conversion cycle."""
+        # np.interp is not used, because its rounding depends on the number of points.
         place = self.cycle_s / self.grid_s[1]
         left = np.minimum(place.astype(np.int64), len(self.grid_s) - 2)
         share = (place - left)[:, None]
@@ -92,7 +93,9 @@ def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: An
 def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
-    """Run a unit through a test in memory; each position has another seed, stamps from 0."""
+    """
+    Run a unit through a test in memory; each position has a separate seed, and stamps from 0.
+    """
     return [
         simulate(
             unit,
@@ -123,9 +126,9 @@ def simulate_blocks(
     """
     Run a unit through a program in bounded memory; the result does not depend on the block size.
 
-    A reading is in the block of the cycles around it, or in the last block. `up` is the direction
-    of the specific force without `spin`; K [counts/cycle] does not depend on `rate_hz`. `seed`
-    determines all random numbers of the run.
+    A temperature reading is in the block of the cycles around the reading, or in the last block.
+    `up` is the direction of the specific force without `spin`; K [counts/cycle] does not depend on
+    `rate_hz`. `seed` determines all random numbers of the run.
     """
     readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz
     positive = {'rate_hz': rate_hz, 'temperature_rate_hz': readings_hz, 'gravity': gravity}
@@ -137,7 +140,7 @@ def simulate_blocks(
     if n_cycles < 1:
         raise ValueError(f'the program of {duration} s is shorter than one cycle')
     direction = np.asarray(up, dtype=float)
-    # Only a switched load makes the heat flow random.
+    # Only a load that switches at random times makes the temperatures random.
     truth = _heat_flow(unit, cyclogram, seed if unit.load else 0)
     truth = replace(
         truth,
@@ -162,7 +165,7 @@ def _blocks(
     seed: int,
     start_ns: int,
 ) -> Iterator[SimulatedRun]:
-    """Yield a run by blocks; `cycles`: number, largest number of a block, per second."""
+    """Yield a run by blocks; `cycles`: number of cycles, most in a block, cycles per second."""
     unit, (n_cycles, block_size, rate_hz) = truth.unit, cycles
     K = np.array(unit.scale_factor)
     to_axes = np.asarray(np.linalg.inv(unit.M), np.float64)
@@ -180,7 +183,7 @@ def _blocks(
         if spin is not None:
             force = spin.forces(truth.specific_force, part.cycle_s)
             part = replace(part, specific_force=force)
-        # Eq. (2), (8) and (9)
+        # Eqs. (2), (8) and (9) of the paper
         s = _along_axes(part, to_axes)
         charge = part.bias + K * part.scale * s + noise_sd * noise(len(cycle))
         counts, remainder = unit.converter(charge, remainder)
@@ -204,7 +207,9 @@ def _blocks(
 
 
 def _along_axes(part: Truth, to_axes: Floats) -> Floats:
-    """Return the force along the sensitivity axes, with the nonlinear part of their readings."""
+    """
+    Return the force along the sensitivity axes plus the nonlinear part of the axes' readings.
+    """
     s: Floats = np.zeros(3)
     for j in range(3):
         s = s + part.specific_force[..., j, None] * to_axes[:, j]
@@ -238,7 +243,9 @@ def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
 
 
 def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Bools]:
-    """Return the knots including the switching times of a load, and its state between them."""
+    """
+    Return the knots including the switching times of a load, and the load's state between knots.
+    """
     n = 2 + int(knots[-1] // load.spell[0])
     flips = np.cumsum(generator(seed, Stream.LOAD).uniform(*load.spell, size=n))
     fine = np.unique(np.concatenate([knots, flips[flips <= knots[-1]]]))

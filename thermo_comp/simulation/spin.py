@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns forces beyond 1 g in a simulation: a rotation in the chamber, and nonlinear axes."""
+"""Owns simulated forces beyond 1 g: a rotation in the chamber, and the nonlinearity of axes."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from .drift import ZERO, Triple
 class Bend:
     """
     Nonlinear terms of the axes, as in `unit.nonlinearity`: K2 [ug/g^2] and K3 [ug/g^3] at the
-    reference, and their relative change per kelvin of the board.
+    reference temperature, and their relative change per kelvin of the board.
     """
 
     square: Triple = ZERO
@@ -25,7 +25,7 @@ class Bend:
     per_kelvin: float = 0.0
 
     def added(self, force: Floats, t: Floats) -> Floats:
-        """Return the nonlinear part of readings, (n, 3) [m/s^2], at t K from the reference."""
+        """Return the nonlinear part of readings, (n, 3) [m/s^2], at t [K] from the reference."""
         f = force / STANDARD_GRAVITY
         terms = np.array(self.square) * f**2 + np.array(self.cube) * f**3
         return np.asarray(MICRO_G * (1.0 + self.per_kelvin * t)[:, None] * terms)
@@ -44,15 +44,15 @@ class Spin:
     inward: Floats
 
     def rate_at(self, time: Floats) -> Floats:
-        """Return the rate at times [s]."""
+        """Return the rotation rate [rad/s] at times [s]."""
         return np.interp(time, self.time_s, self.rate)
 
     def forces(self, upward: Floats, time: Floats) -> Floats:
-        """Return the specific force of the rotation and against gravity at times, shape (n, 3)."""
+        """Return the specific force by rotation and gravity at times [s], shape (n, 3)."""
         return np.asarray(upward + (self.rate_at(time) ** 2 * self.radius)[:, None] * self.inward)
 
     def sections(self, gravity: float) -> list[tuple[float, float, float]]:
-        """List the parts of constant rate: begin, end [s], |f| [m/s^2]."""
+        """List the intervals of constant rotation rate: begin [s], end [s], |f| [m/s^2]."""
         knots = zip(self.time_s, self.rate, strict=True)
         return [
             (begin, end, math.hypot(gravity, rate * rate * self.radius))
@@ -64,7 +64,9 @@ class Spin:
 def steps(
     begins_s: tuple[float, ...], rates: tuple[float, ...], dwell_s: float, ramp_s: float
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the knots of runs that begin at given times: each rate is held, between ramps."""
+    """
+    Return the knots of runs that begin at given times: times at constant rates, and ramps between.
+    """
     time, rate = [0.0], [0.0]
     for begin in begins_s:
         now = begin

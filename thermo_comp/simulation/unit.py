@@ -21,18 +21,19 @@ from .network import ThermalNetwork, ThermalResponse
 from .spin import Bend
 
 _NS = 1_000_000_000
-REFERENCE_C = 20.0  # board temperature in a soak at which K and bias are stated
+REFERENCE_C = 20.0  # board temperature at which K and bias are stated, in a soak [degC]
 _RANGE = -(1 << 15), (1 << 15) - 1  # range of the converter's output [counts]
 _FRACTION_BITS = 40
 _ONE = 1 << _FRACTION_BITS
-_ROWS = 1 << 20  # rows summed at a time: 2^20 fractions below 2^40 stay far below 2^63
+# Rows summed at a time: the sum of 2^20 fractions below 2^40 does not overflow 64 bits.
+_ROWS = 1 << 20
 
 
 class Stream(IntEnum):
     """
     Sources of random numbers, each with a separate stream: switching a source on or off, or
-    another block size, does not change the others. The values must never change or be reused, as
-    they are part of the meaning of a seed.
+    another block size, does not change the others. The numbers of the sources must never change or
+    be reused, because they determine the random numbers of a seed.
     """
 
     ACCEL_NOISE = 0
@@ -51,18 +52,20 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
-    """Return the generator of a source, for an axis or other number, at its stream's start."""
+    """
+    Return the random generator of a source, for an axis or other number, at the stream's start.
+    """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))
 
 
 def white(seed: int, stream: Stream) -> Callable[[int], Floats]:
-    """Return a function that gives the next n numbers of each axis, shape (n, 3)."""
+    """Return a function that gives the next n random numbers of each axis, shape (n, 3)."""
     axes = [generator(seed, stream, axis) for axis in range(3)]
     return lambda n: np.stack([axis.standard_normal(n) for axis in axes], axis=1)
 
 
 def first_charge(seed: int) -> Ints:
-    """Return the charge on the integrators at power-on, shape (3,), in 2^-40 count."""
+    """Return the charge on the integrators at power-on, shape (3,), in units of 2^-40 counts."""
     phases = [generator(seed, Stream.CONVERTER_PHASE, axis).integers(_ONE) for axis in range(3)]
     return np.array(phases, dtype=np.int64)
 
@@ -71,14 +74,15 @@ def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
     """
     Convert the real-valued counts of consecutive cycles, shape (n, 3), to 16-bit integers.
 
-    The `remainder` of a cycle, in fixed point, is carried to the next: the sum of the counts
-    follows the integral of the input to within one count for ever, whatever the block size.
+    The `remainder` of a cycle, in fixed point, is added to the next cycle: the sum of the counts
+    follows the integral of the input to within one count at any time, whatever the block size.
     Charge beyond the output range is lost, as in a saturated integrator.
     """
     counts = np.empty(charge.shape, dtype=np.int32)
     for first in range(0, len(charge), _ROWS):
         rows = charge[first : first + _ROWS]
-        # Eq. (1): the output is whole counts, and the fraction is carried to the next cycle.
+        # Eq. (1) of the paper: the output is whole counts, and the fraction is added to the
+        # next cycle.
         whole = np.floor(rows)
         fraction = np.rint((rows - whole) * _ONE).astype(np.int64)
         total = np.cumsum(fraction, axis=0) + remainder
@@ -90,7 +94,7 @@ def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
 
 
 def rounded(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
-    """Round every cycle independently, as a sampling converter does."""
+    """Round the counts of every cycle independently, as a sampling converter does."""
     return np.clip(np.rint(charge), *_RANGE).astype(np.int32), remainder
 
 
@@ -200,6 +204,6 @@ class UnitModel:
         return self.network.equilibrium(air)
 
     def with_thermometers(self, **changes: Any) -> UnitModel:
-        """Return the unit with other thermometers, the same changes on board and case."""
+        """Return the unit with changed thermometers, with the same changes on board and case."""
         board, case = (replace(sensor, **changes) for sensor in (self.board, self.case))
         return replace(self, board=board, case=case)

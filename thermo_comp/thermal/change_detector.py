@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the detection of a change: has the rate of one sensor left the baseline of the soak?
+Owns the detection of a change: whether the rate of a sensor has left the baseline of the soak.
 
 Two linear filters of temperature and rate, of different memory, integrate the second derivative.
 A rate has departed if it differs from the baseline by more than the swing plus a multiple of the
-filter's noise, which follows from the permitted rate of false alarms (Rice's formula, see
+filter's noise; the multiple follows from the permitted rate of false alarms (Rice's formula, see
 docs/regime.md). The swing is the larger of two rates: the declared ripple of the surroundings,
 reduced by the sensor's lag, and the observed swing.
 
@@ -25,15 +25,17 @@ from typing import Final
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
-BEND_SHARES = (1.0, 10.0)  # accelerations the two filters are tuned to / the smallest onset
+BEND_SHARES = (1.0, 10.0)  # accelerations of the two filters' tuning / that of the smallest onset
 TUNING: Final = 1.45  # best memory of a filter in units of (noise / acceleration)^0.4, at 1 Hz
-CELL_NOISE_SHARE: Final = 0.4  # noise / filter variance of a sensor whose noise is mostly quanta
-SETTLING: Final = 5.0  # age at which a filter's noise is stationary, in filter memories
-LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a ripple [s]
-LARGEST_BASELINE: Final = 0.25  # largest baseline rate / rate of the smallest ramp
-SWING_MARGIN: Final = 1.25  # swing assumed / swing observed about the trend of the rate
-SWING_SIGMAS: Final = 3.0  # noise subtracted from an observed swing, in standard deviations
-SWING_MEMORY_LAGS: Final = 10.0  # time constant of forgetting a swing, in sensor lags
+# Noise variance / filter variance for a sensor whose noise is mostly quantization.
+CELL_NOISE_SHARE: Final = 0.4
+SETTLING: Final = 5.0  # age of a filter at which its noise is stationary, in filter memories
+LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
+LARGEST_BASELINE: Final = 0.25  # largest rate of the soak's baseline / rate of the smallest ramp
+SWING_MARGIN: Final = 1.25  # assumed swing / observed swing of the rate about its trend
+SWING_SIGMAS: Final = 3.0  # noise subtracted from an observed swing of the rate, in sd
+# Time constant with which the swing of the rate decays, in sensor lags.
+SWING_MEMORY_LAGS: Final = 10.0
 
 
 class ChangeDetector:
@@ -53,7 +55,7 @@ class ChangeDetector:
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
         self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
-        # Memory (1 / tracking frequency) of each filter [s]: the one that detects the filter's
+        # Memory (1 / tracking frequency) of each filter [s]: the memory that detects the filter's
         # acceleration soonest at readings of 1 Hz. The spectral density of the acceleration
         # follows from the memory, and is used for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
@@ -62,7 +64,8 @@ class ChangeDetector:
             TUNING * math.pow(sqrt(self._noise) / (share * onset), 0.4) for share in BEND_SHARES
         ]
         self._powers = [self._noise / memory**4 for memory in memories]
-        # crossings per second of h: acos(rho) / (2 pi dt) exp(-h^2 / 2); two filters, two signs
+        # Crossings per second of a threshold of h sd: acos(rho) / (2 pi dt) exp(-h^2 / 2), for
+        # each of two filters and two signs.
         self._log_crossings = -log(2.0 * pi * false_alarms / (2.0 * len(self._powers)))
         self._edge_noise = sensor.noise_sd_c * sqrt(2.0)
         self._quantum = sensor.quantum_c
@@ -80,7 +83,8 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        self._doubt = self.swing  # error of the baseline, which may begin at a crest of the ripple
+        # Largest error of the baseline [K/s]; the baseline may begin at a crest of the ripple.
+        self._doubt = self.swing
         self._trend = 0.0
         self._is_above = False
         self._turned_s = 0.0
@@ -91,22 +95,22 @@ class ChangeDetector:
         self._reading = nan
 
     def settle(self, sensor: Thermometer, least_doubt: float = 0.0) -> None:
-        """Begin a soak with the rate as its baseline, uncertain by at least `least_doubt`."""
+        """Begin a soak with the rate as its baseline, with an error of at least `least_doubt`."""
         self._baseline = self.rate
         self._doubt = max(self.swing, least_doubt, 2.0 * sqrt(sensor.var_rate))
-        self._edge = nan  # edges crossed before the soak measure the rate of the ramp
+        self._edge = nan  # cell edges crossed before the soak measure the ramp
 
     def is_following(self, stamp_ns: int) -> bool:
-        """Whether `rate` includes the reading with this stamp."""
+        """Whether `rate` includes the reading with a given stamp."""
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
-        """Whether the rate is within a swing of the baseline."""
+        """Whether the rate is within the swing and the error of the baseline."""
         return abs(self.rate - self._baseline) < self.swing + self._doubt
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
         """
-        Take the sensor's last used reading. The baseline follows the rate at a relative speed
+        Use the sensor's last accepted reading. The baseline follows the rate at a relative speed
         `pace`: 1 in a soak, 0 in a ramp. Returns the sign of the rate's departure from the
             baseline, 0 = none.
         """
@@ -126,7 +130,7 @@ class ChangeDetector:
         self._age_s += dt
         if not 0.95 * self._dt < dt < 1.05 * self._dt:
             self._tune(dt)
-        # A rate between the baseline and 0 is no departure.
+        # A rate between the baseline and 0 does not count as a departure from the baseline.
         baseline, swing = self._baseline, self.swing + self._doubt
         high = baseline + swing if baseline > 0.0 else swing
         low = baseline - swing if baseline < 0.0 else -swing
@@ -205,7 +209,8 @@ class ChangeDetector:
         reading, before = sensor.reading, self._reading
         apart = (stamp_ns - self._edge_ns) * 1e-9
         if reading == before:
-            # No edge crossed since: the rate is at most one quantum in the time passed.
+            # Since no edge of a cell has been crossed, the rate is at most one quantum per time
+            # since the last edge.
             bound = self._quantum / apart
             if bound < self._doubt + abs(self._baseline):
                 self._doubt = max(min(self._doubt, bound), self.swing)
@@ -224,7 +229,9 @@ class ChangeDetector:
         return departure
 
     def _follow(self, rate: float, dt: float) -> None:
-        """Let the baseline follow a rate seen for `dt`, by at most one swing per memory."""
+        """
+        Let the baseline follow a rate that lasts for `dt` [s], by one swing per memory at most.
+        """
         baseline, doubt = self._baseline, self._doubt
         limit = self.swing + doubt
         share = dt / (dt + self._baseline_s)
@@ -232,7 +239,7 @@ class ChangeDetector:
         if not -limit <= step <= limit:
             step = limit if step > 0.0 else -limit
         moved = baseline + share * step
-        # A slow onset must not raise the baseline to the rate of a ramp.
+        # The slow onset of a ramp must not raise the baseline to the rate of the ramp.
         farthest = self._largest_baseline
         if not -farthest <= moved <= farthest:
             farthest = max(farthest, abs(baseline))
@@ -251,7 +258,8 @@ class ChangeDetector:
             self._peak = max(self._peak, abs(apart))
             return
         if self._age_s - self._turned_s < LONGEST_HALF_SWING_S:
-            # The smaller of two half swings: the onset or end of a ramp is large on one side only.
+            # Take the smaller of two half swings: the onset or end of a ramp is large on one side
+            # only.
             noise = SWING_SIGMAS * sqrt(self._noise_share * self._filters[0][4])
             swing = SWING_MARGIN * min(self._peak, self._peak_before) - noise
             self.swing = max(self.swing, min(swing, self._largest_swing))

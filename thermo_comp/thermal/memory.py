@@ -12,7 +12,7 @@ series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighte
 two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 
 A part may also exchange heat with both the board and another part, at a sensor s: it lags the
-temperature ``T + v g`` between them, with ``g = T_s - T``. The lag behind this temperature is that
+temperature ``T + v g`` between them, with ``g = T_s - T``. The lag behind ``T + v g`` is the lag
 of the board less v times the lag of the gradient.
 """
 
@@ -32,12 +32,13 @@ BOARD_INPUT: Final = 'board'
 #: Relative jitter on the diagonal of the start covariance: lags of similar time constants are
 #: almost collinear, and their covariance would not be invertible.
 START_JITTER: Final = 3e-4
-#: Prior sd of a lag of time constant `START_TAU_S` [s] at the start: of the board temperature and
-#: of a gradient [K].
+#: Prior sd of a lag's initial state [K], for lags of the board temperature and of a gradient with
+#: the time constant `START_TAU_S` [s].
 START_TAU_S: Final = 3600.0
 BOARD_START_SD: Final = 3.0
 GRADIENT_START_SD: Final = 1.0
-#: Interval between readings / time constant beyond which the input between them counts as unseen.
+#: Interval between readings / time constant beyond which the input between the readings is
+#: unknown.
 SPARSE_SHARE: Final = 0.1
 #: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
 _FADED: Final = 1e-18
@@ -66,7 +67,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def singles(self) -> dict[tuple[str, float], float]:
-        """Share of each single lag in this lag, by input and time constant."""
+        """Share of each single lag in a lag of two stages, by input and time constant."""
         stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
         return {
             (name, tau): factor * share
@@ -82,7 +83,7 @@ class Lag(_Lag, Quantity):
         return self.tau_s / difference, -self.second_tau_s / difference
 
     def start_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the remaining share of the start value at an age [s], 1 to 0, in the RMS."""
+        """Return the RMS share of the initial value that remains at an age [s], from 1 to 0."""
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
@@ -107,7 +108,8 @@ class _Play(NamedTuple):
 class Play(_Play, Quantity):
     """
     A play of half-width `width_k` less its input, a lag of the board (0 s: the board itself) [K].
-    A play has no variance: an error of its input shifts the play by the same amount.
+    A play less its input has no variance: an error of the input shifts the play by the same
+    amount.
     """
 
     input = BOARD_INPUT
@@ -126,7 +128,8 @@ class Play(_Play, Quantity):
 @dataclass(frozen=True)
 class MemorySpec:
     """
-    Contents of a tracker's state. `sensors`: thermometers by name, the first leads the detector.
+    Contents of the thermal state of a tracker. `sensors`: thermometers by name; the detector uses
+    the first as the leading sensor.
     `lags`: in the order of `inputs`. `rates`: sensors whose rate of change is in the state.
     """
 
@@ -177,7 +180,7 @@ class LagBank:
     """
     Single lags of one input; `start_ns` is the first stamp since the last `forget`.
 
-    taus: time constants of the lags [s]
+    taus: time constants of the single lags [s]
     """
 
     def __init__(self, taus: tuple[float, ...]) -> None:
@@ -187,17 +190,20 @@ class LagBank:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the input: the next value starts the lags anew."""
+        """Forget the input: the next value initialises the lags again."""
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
         self.lagging: list[float] = self._nil
         self.extra: list[float] = self._nil
-        #: Whether the lags have a variance `extra` in addition to that of their initial states.
+        #: Whether the lags have a variance `extra` in addition to the variance of their initial
+        #: states.
         self.has_extra = False
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
-        """Take the input's next value [K]: linear since the last one, with an error `sd` [K]."""
+        """
+        Take the input's next value [K], with an error `sd` [K]; the input was linear in between.
+        """
         seen_ns = self.stamp_ns
         if seen_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
@@ -225,13 +231,14 @@ class LagBank:
                 # Between readings far apart, the time at which the input changed is unknown.
                 grown += (change * (1.0 - e)) ** 2
             if sd:
-                # The error is the same from step to step: deviations add, not variances.
+                # The error is the same from step to step, so the standard deviations add, not the
+                # variances.
                 grown = (math.sqrt(grown) + sd * (1.0 - e)) ** 2
             result.append(grown)
         self.extra = result
 
     def note_jump(self, change: float) -> None:
-        """Add to the variances a change of the input that was a sensor's error."""
+        """Add to the variances the effect of a change of the input that was a sensor's error."""
         if self.taus:
             self.has_extra = True
             self.extra = [variance + change * change for variance in self.extra]
@@ -258,7 +265,7 @@ class LagBank:
 
 @lru_cache(maxsize=1024)
 def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], list[float]]:
-    """Return, per lag, the decay over a step and the gain on the input's change."""
+    """Return each lag's decay over a step, and the gain from the input's change to the lag."""
     dt = dt_ns * 1e-9
     lost = [-math.expm1(-dt / tau) for tau in taus]
     return [1.0 - part for part in lost], [
@@ -283,8 +290,8 @@ class ThermalMemory:
         }
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: For each lag the numbers of its single lags, each with its share; empty if the lags are
-        #: the single lags.
+        #: For each lag the indices of its single lags, each with its share; empty if all lags are
+        #: single lags.
         self._sums = [
             [(singles.index(single), share) for single, share in lag.singles.items()]
             for lag in spec.lags
@@ -315,7 +322,7 @@ class ThermalMemory:
         self.board.step(stamp_ns, board)
         values = self.board.lagging
         if self._needs_sensors:
-            # The sensors have no reading at this stamp: their gradients are the last ones.
+            # The other sensors have no reading at this stamp, so their last gradients are used.
             gradients = [self.banks[name].input for name in self.spec.sensors]
             values, _ = self._single_lags(stamp_ns, board, gradients)
         inputs = [
@@ -328,17 +335,17 @@ class ThermalMemory:
         ]
 
     def note_jump(self, change: float) -> None:
-        """Add to all variances a change of the board temperature that was a sensor's error."""
+        """Add to all variances the effect of a change of the board reading that was an error."""
         for bank in self.banks.values():
             bank.note_jump(change)
 
     def at(self, stamp_ns: int, board: float, gradients: list[float]) -> list[float]:
-        """Return (lag [K], extra variance [K^2]) per lag, then each play less its input [K]."""
+        """Return each lag [K] and its extra variance [K^2], then each play less its input [K]."""
         behind, extra = self._single_lags(stamp_ns, board, gradients)
         if self._sums:
             values, variances = behind, extra
             behind = [sum([share * values[k] for k, share in lag]) for lag in self._sums]
-            # The errors of the single lags have common causes: standard deviations add.
+            # The errors of the single lags have common causes, so their standard deviations add.
             extra = [
                 sum([abs(share) * math.sqrt(variances[k]) for k, share in lag]) ** 2
                 for lag in self._sums
@@ -366,7 +373,9 @@ class ThermalMemory:
         return values, extra
 
     def start_shares(self, stamp_ns: int) -> list[float]:
-        """Return the remaining share of each lag's start value at a stamp, in the spec's order."""
+        """
+        Return the remaining share of each lag's initial value at a stamp, in the spec's order.
+        """
         ages = {name: bank.age_s(stamp_ns) for name, bank in self.banks.items()}
         return [lag.start_share(min(map(ages.__getitem__, lag.inputs))) for lag in self.spec.lags]
 
@@ -375,7 +384,7 @@ def memory_on_grid(
     spec: MemorySpec, step_s: float, board: Floats, gradients: Sequence[Floats]
 ) -> Floats:
     """
-    Compute `ThermalMemory` for whole series on a uniform grid; equal to it except for rounding.
+    Compute the results of `ThermalMemory` for series on a uniform grid, equal except for rounding.
 
     Returns (n, 2 * n_lags + n_plays): (lag [K], 0) per lag, then each play less its input [K].
     """

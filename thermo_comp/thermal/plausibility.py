@@ -16,37 +16,42 @@ from typing import Final
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
-#: Largest possible change of a temperature: at once [K] and per second [K/s], quanta apart.
+#: Largest possible change of a temperature in addition to quantization: at once [K], and per
+#: second [K/s].
 LARGEST_STEP: Final = 3.0
 LARGEST_RATE: Final = 0.2
-#: Number of used readings after which steps are checked: a sensor's first readings may be wrong.
+#: Number of used readings after which steps of the temperature are checked: a sensor's first
+#: readings may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: A sensor counts as standing still after this number of equal readings (more if the declared
-#: noise makes so long a run more probable than `STILL_PROBABILITY`) over at least this time [s].
+#: A sensor's readings count as standing still after this number of equal readings over at least
+#: this time [s]; the number is larger if the declared noise makes the run more probable than
+#: `STILL_PROBABILITY`.
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
-#: Number of equal readings from which the variance grows.
+#: Number of equal readings in a row from which the variance of the temperature is increased.
 DOUBTFUL_READINGS: Final = 4
-#: Change of the other sensor [K] from which a still sensor counts as frozen: if the sensor's noise
-#: exceeds its quantum, and if the quantum hides the noise.
+#: Change of the other sensor's temperature [K] from which a sensor with constant readings counts
+#: as frozen: if its noise exceeds its quantum, and if its quantum hides the noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
-#: Largest assumed error of a frozen sensor [K].
+#: Largest assumed error of a sensor with frozen readings [K].
 LARGEST_DOUBT: Final = 60.0
 
-#: Smallest temperature difference that counts as a lead: in K, and as a share of the movement.
+#: Smallest temperature difference at which a sensor leads the other in a ramp: in K, and as a
+#: share of the temperature change.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
-#: A lead lasts for this number of consecutive readings, with at least this ratio of the slower
-#: rate to the faster; from the smaller ratio on a lead of the board adds to the variance.
+#: A sensor leads if the difference lasts for a number of consecutive readings, with at least the
+#: larger ratio of the slower rate to the faster rate; from the smaller ratio on, a lead of the
+#: board adds to the variance.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
 _SIGMAS: Final = 6.0
-#: Time [ns] for which both rates must be low before the temperatures count as constant: estimates
-#: of rates start at 0, also in a unit that heats itself after switch-on.
+#: Time [ns] for which the rates of both sensors must be low before the temperatures count as
+#: constant: estimates of rates start at 0, also in a unit that heats itself after switch-on.
 _CALM_NS: Final = 120 * 10**9
 
 
@@ -54,11 +59,11 @@ class Fault(Enum):
     """The faults of a sensor; values are the words of the diagnostics."""
 
     NONE = 'none'
-    #: The readings have been equal for too long: they are used, with a growing variance.
+    #: Readings that have been equal for too long: they are used, with a growing variance.
     STILL = 'stands still'
-    #: The readings stay equal while the other sensor moves: they are not used.
+    #: Readings that stay equal while the other sensor's temperature changes: they are not used.
     FROZEN = 'frozen'
-    #: The reading changed faster than any part can: it is not used.
+    #: A reading that changed faster than any part of a unit can: it is not used.
     STEP = 'jumped'
 
 
@@ -97,12 +102,12 @@ class SensorCheck:
         self._seen_ns: int | None = None
 
     def admits(self, stamp_ns: int, celsius: float) -> bool:
-        """Judge a reading [degC] before it is used: whether the estimator may have it."""
+        """Judge a reading [degC] before it is used: return whether the estimator may use it."""
         sensor = self.sensor
         last_ns, fault = sensor.stamp_ns, self.fault
         self.is_revived = False
         if last_ns is None or stamp_ns <= last_ns or not isfinite(celsius):
-            return True  # the first reading, or a reading that the estimator itself rejects
+            return True  # the first reading, or a reading that the estimator rejects
         if celsius == sensor.reading:
             self._n_same += 1
             self.fault = self._judge_still(stamp_ns)
@@ -110,12 +115,14 @@ class SensorCheck:
         if self._n_same >= self._n_doubtful and not self._has_cells:
             change = celsius - sensor.reading
             if abs(change) > self._largest_noise:
-                # The equal readings before were wrong, and the estimate has followed them.
+                # The equal readings before this reading were wrong, and the estimate has followed
+                # them.
                 self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
         age = (stamp_ns - last_ns) * 1e-9
-        # The usual case, decided cheaply: the reading is within a step of the estimate.
+        # The usual case is decided cheaply: the reading differs from the estimate by less than a
+        # step.
         if (
             fault is Fault.NONE
             and abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP
@@ -132,14 +139,17 @@ class SensorCheck:
                 self.step = step
                 return False
             if fault is Fault.STEP:
-                # Enough time has passed for the change, but the reading is not the expected one.
+                # Enough time has passed for the change, but the reading differs from the expected
+                # temperature.
                 self.is_revived = abs(step) > self._largest_noise + _SIGMAS * sqrt(variance)
         self.fault = Fault.NONE
         self._n_used += 1
         return True
 
     def watch_other(self) -> None:
-        """Note the other sensor's movement since this reading changed; call after its readings."""
+        """
+        Note the other sensor's change since this sensor's reading changed; call after a reading.
+        """
         other = self._other
         now_ns = other.stamp_ns
         moved = other.temperature - self._other_then
@@ -151,10 +161,11 @@ class SensorCheck:
         if self.lag_s > 0.0:
             dt = (now_ns - (self._seen_ns or now_ns)) * 1e-9
             if dt > 0.0:
-                # Expected movement of this sensor so far: a first-order lag behind the other.
+                # The expected change of this sensor is that of the other sensor with a first-order
+                # lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # The follower may reach this sensor's temperature, but not pass it.
+            # The sensor that follows may reach the leading sensor's temperature, but not pass it.
             ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns
@@ -175,7 +186,7 @@ class SensorCheck:
         return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
 
     def note_jump(self, stamp_ns: int, change: float) -> None:
-        """Note a jump of the sensor [K]: the readings before it or those after it are wrong."""
+        """Note a jump of the sensor [K]: the readings before or after the jump are wrong."""
         self._jumped = self._jump_at(stamp_ns) + change * change
         self._jumped_ns = stamp_ns
 
@@ -208,10 +219,11 @@ class LeadCheck:
     """
     Finds out which of two sensors leads in a ramp.
 
-    The movements since the last calm are compared while both sensors move in one direction. Heat
-    from outside moves the case first. If the board leads, the two topics are swapped or the heat
-    comes from inside; in both cases the gradient terms are wrong. `doubt` is the square of the
-    board's possible lead in this ramp [K^2].
+    The temperature changes since the last constant temperature are compared while both sensors
+    change in the same direction. Heat from outside changes the case temperature first. If the
+    board leads, the two topics are swapped or the heat comes from inside; in both cases the
+    gradient terms are wrong. `doubt` is the square of the board's possible lead in this ramp
+    [K^2].
     """
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:
@@ -228,7 +240,7 @@ class LeadCheck:
         self._is_against = False
 
     def update(self, is_static: bool) -> None:
-        """Take both sensors' last estimates; call after a reading of the case."""
+        """Use the last estimates of both sensors; called after each reading of the case."""
         case, board = self._case, self._board
         calm = self._calm_rate
         if is_static or (-calm < case.rate < calm and -calm < board.rate < calm):

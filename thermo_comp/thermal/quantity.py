@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what all quantities of the thermal state have in common."""
+"""Owns the base class of the quantities of the thermal state."""
 
 from typing import ClassVar
 
@@ -11,7 +11,7 @@ class Quantity:
     """A quantity of the thermal state; `input` is the thermometer that it is computed from."""
 
     input: str
-    #: Largest magnitude that a calibration may contain.
+    #: Largest magnitude of the quantity that a calibration may contain.
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
@@ -25,5 +25,7 @@ class Quantity:
 
     @property
     def by_board(self) -> float:
-        """Derivative by the board temperature, at given lags and other thermometers' readings."""
+        """
+        Derivative by the board temperature; lags and other thermometers' readings are constant.
+        """
         return float(self.input == 'board')

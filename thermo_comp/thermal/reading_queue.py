@@ -8,7 +8,8 @@ from typing import Final
 
 from .memory import BOARD_INPUT
 
-#: (stamp [ns], whether the thermometer is not the board's, its name, order of arrival, degC).
+#: A waiting reading: stamp [ns], whether the thermometer is not the board's, name of the
+#: thermometer, order of arrival, temperature [degC].
 Entry = tuple[int, bool, str, int, float]
 
 #: Largest number of waiting readings; more mean that readings and samples use different clocks.
@@ -21,7 +22,7 @@ NEVER_NS: Final = 1 << 62
 
 
 class ReadingQueue:
-    """Readings by stamp; at equal stamps the board first, so that the case decides with both."""
+    """Readings by stamp; at equal stamps the board's first, so that both decide the regime."""
 
     def __init__(self) -> None:
         self._entries: list[Entry] = []
@@ -35,7 +36,9 @@ class ReadingQueue:
         return self._entries[0][0] if self._entries else NEVER_NS
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> int:
-        """Add a reading; return the number refused: this one, or those of another clock."""
+        """
+        Add a reading; return the number refused: the reading, or earlier ones of another clock.
+        """
         n_before = len(self._entries)
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:
@@ -55,7 +58,7 @@ class ReadingQueue:
         heapq.heapify(self._entries)
 
     def due(self, stamp_ns: int) -> Iterator[Entry]:
-        """Take out the readings up to a stamp, in order."""
+        """Remove the readings up to a stamp, and return them in order."""
         while self._entries and self._entries[0][0] <= stamp_ns:
             yield heapq.heappop(self._entries)
 

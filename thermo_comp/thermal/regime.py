@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the causal static/dynamic decision with its memory; its only clock is the stamps.
+Owns the causal decision between the static and the dynamic regime; its only clock is the stamps.
 
 The dynamic state *opens* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`: the integral of the second derivative against ripple and noise), or when the
 rate of any sensor is clearly that of a ramp. The dynamic state is *held* while any sensor's rate,
-now or half a lag ahead, may exceed the relaxed rate: during the ramp, where the second derivative
-is 0, and after the ramp until the board has relaxed. With `closes` = 'case' (the paper's rule) the
-dynamic state ends with the change of the case temperature, and the board counts only while the
-case is lost. The derivation is in docs/regime.md.
+now or predicted half a lag ahead, may exceed the relaxed rate: during the ramp, where the second
+derivative is 0, and after the ramp until the board has relaxed. With `closes` = 'case' (the
+paper's rule) the dynamic state ends with the change of the case temperature, and the board is used
+only while the case is lost. The derivation is in docs/regime.md.
 
 References
 ----------
@@ -25,12 +25,12 @@ from .change_detector import ChangeDetector
 from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
-HOLD_LAGS: Final = 0.75  # the shortest dynamic state, in lags of the leading sensor
-# Margin for "the rate is below", in sd. Only half a sd: in a soak most of the rate's variance
-# allows for an onset that may begin.
+HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state, in lags of the leading sensor
+# Margin for "the rate is below a limit", in sd of the rate. A margin of half a sd is sufficient:
+# in a soak most of the rate's variance allows for an onset that may begin.
 SURE_SIGMAS: Final = 0.5
-OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above", in sd
-FIRST_READINGS: Final = 20  # readings after which a noise declared too small has been corrected
+OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above a limit", in sd of the rate
+FIRST_READINGS: Final = 20  # number of readings that correct a declared noise that is too small
 
 
 class Regime(IntEnum):
@@ -43,7 +43,7 @@ class Regime(IntEnum):
 
 class RegimeDetector:
     """
-    State machine over the estimates of the case and the board.
+    State machine over the temperature estimates of the case and the board.
 
     `direction` is -1 while cooling and +1 while heating; it is 0 in the dynamic state before the
     direction is known, and in all other states.
@@ -65,7 +65,9 @@ class RegimeDetector:
         self._is_grown = False
 
     def update(self, stamp_ns: int, case: Thermometer | None, board: Thermometer | None) -> Regime:
-        """Decide after a used reading of the leading sensor: the case, or without it the board."""
+        """
+        Decide after a used reading of the leading sensor: the case, or the board without a case.
+        """
         if case is not None:
             lead, change = case, self._case.change
             if not self._needs_calm_board:
@@ -85,8 +87,8 @@ class RegimeDetector:
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
-            # The detector detects an onset before the rate is large. Until the rate is large, the
-            # dynamic state ends only if the rate returns to the baseline.
+            # The detector finds the onset of a ramp before the rate is large. Until the rate is
+            # large, the dynamic state ends only if the rate returns to the baseline.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -96,7 +98,8 @@ class RegimeDetector:
 
         if not is_dynamic:
             speed = OBVIOUS_SHARE * self._relaxed_rate
-            # Two wide cells crossed in a row are a ramp, even if no soak has been seen.
+            # If two wide cells of a quantized sensor are crossed in a row, the temperature is in a
+            # ramp, even if no soak has been seen.
             is_static = regime is Regime.STATIC
             if departure and (
                 is_static or (lead.settings.has_wide_cells and departure * lead.rate > speed)
@@ -117,7 +120,7 @@ class RegimeDetector:
             >= self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
             and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
         ):
-            # In the first soak the swing has not been learnt yet.
+            # In the first soak the swing of the rate has not been estimated yet.
             is_first = self.regime == Regime.UNKNOWN
             change.settle(lead, 0.5 * self._relaxed_rate if is_first else 0.0)
             self.regime = Regime.STATIC
@@ -125,9 +128,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """
-        Take over a new direction once it lasts: with coarse readings the rate is a staircase.
-        """
+        """Use a new direction once it lasts: with coarse readings the rate changes in steps."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -143,13 +144,15 @@ class RegimeDetector:
         self.direction = direction
         self._turning_ns = None
         self._is_grown = False
-        # The onset is detected long before the rate has grown: give the ramp time to develop.
+        # The onset is detected long before the rate has grown: hold the dynamic state meanwhile.
         hold_ns = max(self._dwell_ns, round(HOLD_LAGS * 1e9 * lead.settings.lag_s))
         self._held_until_ns = stamp_ns + hold_ns
 
 
 class _Watch:
-    """Change detection of one sensor, and whether its rate is calm, now and half a lag ahead."""
+    """
+    Change detection of a sensor; whether its rate is low, now and as predicted for half a lag.
+    """
 
     def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
         self.change = ChangeDetector(
@@ -161,9 +164,9 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # A reading proves calm if it has been unchanged for longer than a change at the relaxed
-        # rate takes to cross a cell, and a reversal at the smallest ramp's acceleration stays in a
-        # cell.
+        # An unchanged reading proves a low rate if it lasts longer than a change at the relaxed
+        # rate takes to cross a cell, and longer than a reversal at the smallest ramp's
+        # acceleration stays in a cell.
         quantum = sensor.quantum_c
         bend = settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         self._still_ns = round(
@@ -173,7 +176,9 @@ class _Watch:
         self._mean = 0.0
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
-        """Follow the rate of the sensor; a lost or stale sensor counts as calm."""
+        """
+        Follow the sensor's rate; return whether it is low, as assumed of a lost or stale sensor.
+        """
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True
@@ -189,7 +194,7 @@ class _Watch:
         stamp = self._stamp_ns
         self._stamp_ns = stamp_ns
         if stamp is None or doubt > relaxed:
-            self._mean = rate  # the rate is too uncertain for a mean
+            self._mean = rate  # the rate is too uncertain to enter the mean
         else:
             dt = (stamp_ns - stamp) * 1e-9
             self._mean += dt / (dt + self._memory_s) * (rate - self._mean)
@@ -201,14 +206,14 @@ class _Watch:
         room -= SURE_SIGMAS * doubt
         if not -room < rate < room:
             return False
-        # Extrapolate half a lag ahead, from the mean over the last quarter lag.
+        # Extrapolate the rate half a lag ahead, from its mean over the last quarter lag.
         ahead = 3.0 * rate - 2.0 * self._mean
         limit = max(relaxed, 3.0 * lead_swing)
         return -limit < ahead < limit
 
 
 def _obvious(sensor: Thermometer, rate: float) -> int:
-    """Sign of the rate if it is surely beyond a limit, otherwise 0."""
+    """Sign of the rate if it exceeds a limit beyond doubt, otherwise 0."""
     margin = abs(sensor.rate) - rate
     if margin > 0.0 and margin * margin > OBVIOUS_SIGMAS**2 * sensor.var_rate:
         return 1 if sensor.rate > 0.0 else -1

@@ -11,12 +11,18 @@ from typing import Annotated, Final, Literal, get_args
 
 from ..quantities import QUANTITIES, NotNegative, Positive, refuse_impossible
 
-CELL_SIGMAS: Final = 2.5  # quantum / noise sd above which a reading is treated as a cell
-WIDE_CELL_SIGMAS: Final = 8.5  # the same for cells that noise never crosses: 6 sd of a difference
-OBVIOUS_SHARE: Final = 1.5  # hysteresis: rate that opens / relaxed rate, below which it closes
+CELL_SIGMAS: Final = (
+    2.5  # quantum / noise sd above which a reading is treated as an interval, its cell
+)
+# Quantum / noise sd above which noise never moves a reading: 6 sd of the difference of two
+# readings.
+WIDE_CELL_SIGMAS: Final = 8.5
+# Hysteresis of the dynamic state: rate that begins it / relaxed rate, below which it ends.
+OBVIOUS_SHARE: Final = 1.5
 #: Advised span of the board temperature over all bags of a unit's thermal test [K].
 ADVISED_SPAN_K: Final = 25.0
-#: Board temperature rate from which a change counts as a ramp [K/min]; below it is a soak's drift.
+#: Rate of the board temperature from which a change counts as a ramp [K/min]; a slower change is a
+#: drift within a soak.
 RAMP_K_MIN: Final = 0.1
 
 
@@ -75,12 +81,12 @@ class DetectorSettings:
         float,
         QUANTITIES['ripple'],
         "Amplitude of the surroundings' temperature in a soak (a chamber's control ripple), K. "
-        'A sensor with a lag shows the ripple as a rate up to ``ripple_c / lag_s``: no onset.',
+        'A sensor with a lag shows the ripple as a rate up to ``ripple_c / lag_s``, not an onset.',
     ] = 0.1
     relaxed_rate_k_min: Annotated[
         float,
         QUANTITIES['ramp'],
-        "The unit has relaxed when every sensor's rate is surely below this, K/min.",
+        "The unit has relaxed when every sensor's rate is surely below this limit, K/min.",
     ] = 0.05
     dwell_s: Annotated[
         float,
@@ -114,13 +120,13 @@ class DetectorSettings:
 class ThermalConfig:
     """Time limits that the user sets; ValueError if a value is out of its range."""
 
-    #: Time over which the sets are blended after a switch [s], longer if they differ much
-    #: (`Correction.gentle_transition`); 0 = the paper's hard switch.
+    #: Time over which the two sets of coefficients are blended after a change of regime [s],
+    #: longer if they differ much (`Correction.gentle_transition`); 0 = the paper's hard switch.
     transition_time_s: NotNegative = 30.0
     #: Age of the board temperature after which nothing is published [s]; a sensor that took an
     #: impossible step starts anew only after the same time.
     temperature_timeout_s: Positive = 60.0
-    #: Age of the case temperature at which the board decides the regime [s].
+    #: Age of the case temperature from which the board temperature decides the regime [s].
     case_timeout_s: Positive = 30.0
 
     def __post_init__(self) -> None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the thermal state of a unit at one stamp: its quantities, and their places in a sample."""
+"""Owns the quantities of a unit's thermal state at a stamp, and their places in a flat tuple."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -9,14 +9,15 @@ from ..quantities import QUANTITIES
 from .memory import BOARD_INPUT, MemorySpec
 from .quantity import Quantity
 
-#: Sd of every lag below which the memory counts as settled [K].
+#: Sd of every lag below which the thermal memory counts as settled [K].
 MEMORY_SETTLED_SD: Final = 0.05
 #: Lag of a board behind its case if the bags do not determine it [s]: 15 min, typical of a housing
 #: of a few hundred grams in a chamber.
 USUAL_BOARD_LAG_S: Final = 900.0
 
-#: First places of a sample: board temperature and its variance, board rate, weight of the dynamic
-#: set, 1.0 while the regime is unknown, gradient of the first sensor and its variance.
+#: First numbers of a thermal state: board temperature and its variance, rate of the board, weight
+#: of the dynamic set, 1.0 while the regime is unknown, gradient of the first sensor and its
+#: variance.
 (BOARD, VAR_BOARD, RATE, WEIGHT, UNKNOWN, GRADIENT, VAR_GRADIENT) = range(7)
 
 
@@ -29,7 +30,7 @@ class Board(Quantity):
 
 @dataclass(frozen=True)
 class Rate(Quantity):
-    """The rate of change of a thermometer [K/s]."""
+    """The rate of change of a thermometer's temperature [K/s]."""
 
     input: str = BOARD_INPUT
     largest = (QUANTITIES['temperature rate'].at_most or 0.0) / 60.0
@@ -40,7 +41,7 @@ class Rate(Quantity):
 
 @dataclass(frozen=True)
 class Gradient(Quantity):
-    """The temperature of a sensor less that of the board [K]."""
+    """The temperature of a sensor less the board temperature [K]."""
 
     input: str
     is_of_part = False
@@ -49,12 +50,12 @@ class Gradient(Quantity):
 
 class Layout:
     """
-    The numbers of a sample: those up to UNKNOWN; pairs of a quantity and its variance; plays.
+    The numbers of a thermal state: those up to UNKNOWN, pairs of quantity and variance, plays.
 
-    pairs, lags: number of each pair, and of each lag; the pairs of lags are `lag_pairs`
-    variances: places of the variances, in the order of the pairs
-    numbers: name of each number, in order
-    places: place of each quantity
+    pairs, lags: index of each pair, and of each lag; the pairs of lags are `lag_pairs`
+    variances: places of the pairs' variances in the state
+    numbers: name of each number of the state
+    places: place of each quantity in the state
     """
 
     def __init__(self, spec: MemorySpec) -> None:

@@ -25,23 +25,25 @@ from typing import Final
 
 from .settings import ThermometerSettings
 
-OUTLIER_SIGMAS: Final = 6.0  # innovation limit in sd, beyond which a reading is down-weighted
+OUTLIER_SIGMAS: Final = 6.0  # innovation in sd beyond which a reading is down-weighted
 OUTLIER_LIMITS: Final = 5.0  # innovation / OUTLIER_SIGMAS, beyond which a reading is rejected
-RESTART_READINGS: Final = 4  # outliers in a row on one side that count as a real change
-SOAK_S: Final = 900.0  # mean stay in the quiet mode; the mean stay in the bending mode is the lag
-QUIET_SHARE: Final = 5e-3  # acceleration, quiet / bending mode, of a sensor without wide cells
-CELL_SHARE: Final = 0.2  # acceleration, quiet / bending mode, of a sensor with wide cells
+RESTART_READINGS: Final = 4  # number of outliers in a row on one side that count as a real change
+# Mean time in the quiet mode [s]; the mean time in the bending mode is the lag.
+SOAK_S: Final = 900.0
+QUIET_SHARE: Final = 5e-3  # acceleration in quiet / bending mode, for a sensor without wide cells
+CELL_SHARE: Final = 0.2  # acceleration in quiet / bending mode, for a sensor with wide cells
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
 _DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
-#: Range of readings accepted as temperatures [degC]: from absolute zero.
+#: Range of readings accepted as temperatures [degC]; the lower end is absolute zero.
 COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
-HORIZON_INTERVALS: Final = 5.0  # reading intervals of linear extrapolation; held beyond
+# Horizon of linear extrapolation [reading intervals]; beyond it the temperature is held.
+HORIZON_INTERVALS: Final = 5.0
 NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor is averaged
 
 # The filters of the two modes are written out in floats: a matrix library costs more per call.
 State = tuple[float, float, float, float, float, float, float, float, float]
-"""Temperature, rate, acceleration; then P00, P01, P02, P11, P12, P22 of their covariance."""
+"""Temperature, rate, acceleration; then elements 00, 01, 02, 11, 12, 22 of their covariance."""
 
 _NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # nothing is known
 
@@ -50,12 +52,13 @@ class Thermometer:
     """
     Causal estimate of one sensor's temperature [degC], its rate [K/s] and acceleration [K/s^2].
 
-    The estimates hold at `stamp_ns`, the stamp of the last used reading; before the first they
-    are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
-    `interval_s`: typical interval; `n_in_row`: readings since the last start; `n_restarts`: starts
-    after a gap or a step; `is_ready`: two readings exist, so a rate does. `measured` and its
+    The estimates hold at `stamp_ns`, the stamp of the last used reading; before the first reading
+    they are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
+    `interval_s`: typical interval between readings; `n_in_row`: number of readings since the last
+    start; `n_restarts`: number of starts after a gap or a step; `is_ready`: two readings exist, so
+    that a rate is known. `measured` and its
     variance: the last reading, or for a sensor with cells the equivalent Gaussian measurement
-    (infinite variance: no information). `bending`: probability of that mode.
+    (infinite variance: no information). `bending`: probability of the bending mode.
     """
 
     def __init__(self, settings: ThermometerSettings) -> None:
@@ -64,7 +67,7 @@ class Thermometer:
         noise, quantum = settings.noise_sd_c, settings.quantum_c
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
-        self._noise_scale = 1.0  # actual noise variance / declared
+        self._noise_scale = 1.0  # actual / declared noise variance
         self._n_turns = 8.0  # number of innovations in `_noise_scale`; its prior counts as 8
         self._has_cells = settings.has_cells
         self._quantum = quantum
@@ -89,14 +92,16 @@ class Thermometer:
         self.measured = nan
         self.measured_variance = inf
         self.bending = 0.5
-        self._covariance = 0.0  # of temperature and rate
+        self._covariance = 0.0  # covariance of temperature and rate
         self._quiet: State = _NOWHERE
         self._bent: State = _NOWHERE
         self._surprise = 0.0
         self._n_strange = 0
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
-        """Take a reading [degC]; False if not used: not a temperature, not newer, an outlier."""
+        """
+        Take a reading [degC]; return False if it is no temperature, not newer, or an outlier.
+        """
         if not COLDEST <= reading_c <= HOTTEST:
             return False
         if self.stamp_ns is None:
@@ -111,7 +116,8 @@ class Thermometer:
             self._start(stamp_ns, reading_c)
             return True
 
-        # Interaction step of the IMM filter [1]: each mode starts from a mixture of both modes.
+        # Interaction step of the multiple-model filter [1]: each mode starts from a mixture of
+        # both modes.
         to_bending = dt / (dt + SOAK_S)
         to_quiet = dt / (dt + lag)
         bending = self.bending
@@ -132,12 +138,14 @@ class Thermometer:
         is_turning = surprise * self._surprise < 0.0
         self._surprise = surprise
         if is_turning and not self._has_cells:
-            # Only innovations that change sign are noise; a bend makes a run of one sign.
+            # Only innovations that change sign are noise; a change of the rate makes a run of
+            # equal signs.
             excess = min(surprise * surprise / spread - 1.0, 8.0)
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
             self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
-        # The cheap test first: the limit of an outlier is at least OUTLIER_SIGMAS deviations.
+        # The cheap test comes first: an outlier differs by at least OUTLIER_SIGMAS standard
+        # deviations.
         if surprise * surprise > OUTLIER_SIGMAS**2 * spread and abs(surprise) > (
             limit := OUTLIER_SIGMAS * sqrt(spread)
             + 5.0 * self._bend * dt * dt
@@ -160,7 +168,8 @@ class Thermometer:
                 reading_c, expected, variance, rate * dt, bent[6] * dt * dt
             )
 
-        # Update each mode, and the probability of the bending mode by both innovations.
+        # Update the filter of each mode, and the probability of the bending mode by both
+        # innovations.
         if noise < inf:
             quiet, innovation, s = correct(quiet, measured, noise)
             bent, bent_innovation, bent_s = correct(bent, measured, noise)
@@ -177,7 +186,7 @@ class Thermometer:
         self._quiet = quiet
         self._bent = bent
         self.bending = bending
-        # The mixture of both modes, without the acceleration, see `acceleration`.
+        # The estimate is the mixture of both modes; for its acceleration see `acceleration`.
         t, v, _, p00, p01, _, p11, _, _ = quiet
         apart, dv = bent[0] - t, bent[1] - v
         both = bending * (1.0 - bending)
@@ -200,7 +209,7 @@ class Thermometer:
         return True
 
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
-        """Extrapolate temperature, rate and variance to a stamp; held beyond a few intervals."""
+        """Extrapolate temperature, rate and variance to a stamp, for a few intervals at most."""
         if self.stamp_ns is None:
             return nan, nan, inf
         if not self.is_ready:
@@ -210,7 +219,8 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # Beyond the horizon the rate may change, and a ramp may begin without a reading.
+            # Beyond the extrapolation horizon the rate may change, and a ramp may begin without a
+            # reading.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
@@ -227,7 +237,7 @@ class Thermometer:
 
     @property
     def acceleration(self) -> tuple[float, float]:
-        """Estimate of the second derivative [K/s^2] and its variance [K^2/s^4]."""
+        """Estimate of the temperature's second derivative [K/s^2] and its variance [K^2/s^4]."""
         if self.stamp_ns is None:
             return nan, inf
         state = mix(self._quiet, self._bent, self.bending)
@@ -253,8 +263,8 @@ class Thermometer:
         half = 0.5 * self._quantum
         noise = self._noise
         if variance < 4.0 * noise:
-            # The prior is narrower than the noise: match the moments of the prior truncated to the
-            # cell, so that readings that flicker about an edge locate this edge.
+            # If the prior is narrower than the noise, match the moments of the prior truncated to
+            # the cell, so that readings that flicker about an edge of a cell locate the edge.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
@@ -275,7 +285,7 @@ class Thermometer:
         if jump > half:
             edge = 0.5 * (reading + self.reading) + 0.5 * move
             return edge, min(noise + (move * move + 4.0 * var_move) / 12.0, self._flat)
-        # A repeated reading has no new information: the cell only bounds the variance. An estimate
+        # A repeated reading has no new information: its cell only bounds the variance. An estimate
         # outside the cell is measured to be at the edge, once per time in which the temperature
         # changes by one sd.
         if abs(expected - reading) > half:
@@ -288,7 +298,7 @@ class Thermometer:
 
 
 def mix(state: State, other: State, share: float) -> State:
-    """Mix a state with a share of another: the covariance contains the distance of the two."""
+    """Mix a state with a share of another; the covariance contains the states' difference."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     u, w, b, r00, r01, r02, r11, r12, r22 = other
     dt, dv, da = u - t, w - v, b - a
@@ -314,7 +324,7 @@ def predict(state: State, dt: float, lag: float, power: float) -> State:
     decay = 1.0 / (1.0 + dt / lag)
     grown = power * dt
     driven = grown * half
-    # the transition times the covariance, above its diagonal
+    # the transition matrix times the covariance, above the diagonal
     c01 = p01 + dt * p11 + half * p12
     c02 = p02 + dt * p12 + half * p22
     c12 = p12 + dt * p22

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the thermal state of a unit at any stamp: its thermometers, regime, memory, set weight.
+Owns the tracker of a unit's thermal state: thermometers, regime, memory, weight of the sets.
 
 The compensator, the fit and the report all run this class, so a regressor means the same when it
 is fitted and when it is applied. The class is causal and reads no clock: each reading has a
@@ -19,9 +19,9 @@ from .settings import DetectorSettings, ThermalConfig
 from .state import MEMORY_SETTLED_SD, USUAL_BOARD_LAG_S, Layout
 from .thermometer import Thermometer
 
-#: Relative sd of the gradient estimated from the board's rate while a sensor is lost.
+#: Relative sd of the gradient that is estimated from the board's rate while a sensor is lost.
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
-#: Time without a reading / thermal lag, after which the regime is unknown.
+#: Time without a reading after which the regime is unknown, as a share of the thermal lag.
 UNWATCHED_SHARE: Final = 0.25
 
 
@@ -41,14 +41,14 @@ class ThermalTracker:
         self.board = Thermometer(detector.board)
         beside = {name: Thermometer(detector.case) for name in self.spec.sensors}
         self.thermometers = {BOARD_INPUT: self.board, **beside}
-        #: The leading sensor: the first one beside the board.
+        #: The leading sensor is the first sensor beside the board.
         self.case = beside[self.spec.sensors[0]]
         self.checks = {
             BOARD_INPUT: SensorCheck(self.board, self.case, board_lag_s),
             **{name: SensorCheck(sensor, self.board, 0.0) for name, sensor in beside.items()},
         }
         self.memory = ThermalMemory(self.spec)
-        #: Stamp of the newest reading that was used, None before the first.
+        #: Stamp of the newest reading that was used; None before the first reading.
         self.updated_ns: int | None = None
         self._decided_ns: int | None = None
         self._weight = 0.0
@@ -73,12 +73,12 @@ class ThermalTracker:
         self._unwatched_s = min(max(UNWATCHED_SHARE * lag_s, config.case_timeout_s), longest_s)
 
     def reconfigure(self, config: ThermalConfig, board_lag_s: float, stamp_ns: int | None) -> None:
-        """Use another configuration from a stamp on, without a step in the weight."""
+        """Use another configuration from a stamp on, without a step in the weight of the sets."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
         self._configure(config, board_lag_s)
-        # Copy: another tracker may share this check.
+        # The check is copied, because another tracker may share it.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
@@ -88,7 +88,7 @@ class ThermalTracker:
         return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self._case_timeout_s
 
     def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
-        """Take a reading [degC]; False if not used: not newer, an outlier or not plausible."""
+        """Take a reading [degC]; return False if it is not newer, an outlier or not plausible."""
         sensor, check = self.thermometers[name], self.checks[name]
         if not self._use(name, sensor, check, stamp_ns, celsius):
             return False
@@ -101,7 +101,7 @@ class ThermalTracker:
         if sensor is self.case:
             self.checks[BOARD_INPUT].watch_other()
             if check.fault is not Fault.STILL or self.detector.regime is not Regime.DYNAMIC:
-                # A sensor that stands still does not prove that a ramp has ended.
+                # Constant readings of a faulty sensor do not prove that a ramp has ended.
                 self._decide(stamp_ns, sensor)
             self.lead.update(self.detector.regime is Regime.STATIC)
         return True
@@ -126,11 +126,12 @@ class ThermalTracker:
     def _use(
         self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
-        """Update a thermometer; a jump adds to the memory's variance, a gap resets it."""
+        """Update a thermometer; a jump adds to the memory's variance, a gap resets the memory."""
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
-            # A sensor whose readings stay at the new value for long enough starts again.
+            # After a step, a sensor whose readings stay at the new value for long enough starts
+            # again.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             is_board = sensor is self.board
             patience_s = self.config.temperature_timeout_s if is_board else self._case_timeout_s
@@ -160,7 +161,7 @@ class ThermalTracker:
         board = self.board if self.board.stamp_ns is not None else None
         decided_ns, self._decided_ns = self._decided_ns, stamp_ns
         if decided_ns is not None and (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s:
-            # A ramp may have begun or ended between the readings.
+            # A ramp may have begun or ended between readings that are far apart.
             self._begin_watch()
         regime = self.detector.update(stamp_ns, case, board)
         target = 1.0 if regime is Regime.DYNAMIC else 0.0
@@ -185,8 +186,8 @@ class ThermalTracker:
         """
         Thermal state at a stamp as a flat tuple, in the order of `state.Layout`; the board must
         have at least one reading. The variance of a gradient is that of the sensor, without the
-        variance of the board temperature; the variance of a lag does not include that of its
-        unknown initial state.
+        variance of the board temperature; the variance of a lag does not include the variance of
+        the lag's unknown initial state.
         """
         board, rate, var_board = self.board.at(stamp_ns)
         decided_ns = self._decided_ns
@@ -208,10 +209,10 @@ class ThermalTracker:
         for name in self.spec.rates:
             sensor = self.thermometers[name]
             is_live = self.is_live(stamp_ns, sensor)
-            # The rate of a lost sensor is taken to be that of the board, with an sd of 100 %.
+            # The rate of a lost sensor is taken to be the board's rate, with an sd of 100 %.
             pairs += [sensor.rate, sensor.var_rate] if is_live else [rate, rate * rate]
         var_board += self.checks[BOARD_INPUT].doubt(stamp_ns)
-        # If the lead is reversed, the topics of case and board may be swapped.
+        # If the board leads the case in a ramp, the topics of case and board may be swapped.
         is_reversed = self.lead.is_reversed
         var_board += gradients[0] * gradients[0] if is_reversed else self.lead.doubt
         if not self.memory.is_empty:
@@ -232,7 +233,9 @@ class ThermalTracker:
         return gradient, variance
 
     def is_settled(self, stamp_ns: int) -> bool:
-        """Whether the unknown temperatures before the start no longer affect the memory."""
+        """
+        Whether the effect of the unknown temperatures before the start on the memory has decayed.
+        """
         layout = Layout(self.spec)
         extra = self.sample(stamp_ns)[layout.variances][layout.lag_pairs]
         start = start_covariance(self.spec.lags).diagonal().tolist()

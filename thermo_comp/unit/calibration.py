@@ -3,12 +3,12 @@
 """
 Owns the Calibration value of one unit, validated as a whole.
 
-The dataclasses mirror the calibration file key by key. The object is immutable, so a running node
-replaces it by one assignment.
+The dataclasses mirror the calibration file key by key. A Calibration is immutable, so a running
+node replaces it by a single assignment.
 
 Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
 (0..1), and phi_j the columns of the thermal response (`columns`), common to both sets (Eq. (6) to
-(9) of the paper; the response is an addition to it)::
+(9) of the paper; the paper has no thermal response)::
 
     bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
     scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from .. import Corrected, Temperature
 
-#: Version of the file's layout that this code reads and writes.
+#: Version of the calibration file's layout that this release reads and writes.
 FORMAT_VERSION = 2
 AXES = ('x', 'y', 'z')
 #: `provenance.model` of a calibration that describes a type of unit and serves as a prior.
@@ -65,7 +65,7 @@ class Unit:
     serial: Annotated[Serial, 'Serial number of the unit, one printable line.']
     input: Annotated[Input, 'Unit of the raw samples: counts per conversion cycle, or m/s^2.']
     full_scale: Annotated[
-        float, QUANTITIES['full scale'], 'A sample at or beyond this is saturated, in input units.'
+        float, QUANTITIES['full scale'], 'Magnitude of a saturated sample, in input units.'
     ]
     cycle_time_s: Annotated[
         float, QUANTITIES['cycle time'], 'Length of a conversion cycle = sample interval [s].'
@@ -77,7 +77,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class AxisReference:
-    """One axis at the reference temperature."""
+    """The constants of one axis at the reference temperature."""
 
     scale_factor: Annotated[float, 'K: input units per m/s^2 at the reference temperature.']
     bias: Annotated[float, 'dNs(0): zero offset at the reference temperature, in input units.']
@@ -93,7 +93,7 @@ class AxisReference:
 
 @dataclass(frozen=True)
 class Axes:
-    """The three axes at the reference temperature."""
+    """The constants of the three axes at the reference temperature."""
 
     x: AxisReference
     y: AxisReference
@@ -105,13 +105,15 @@ class Axes:
 
 @dataclass(frozen=True)
 class AxisSet:
-    """The curves of one axis in one regime."""
+    """The curves of bias and scale of one axis in one regime."""
 
     bias_function: Annotated[TemperatureFunction, 'Fs(t), input units; Fs(0) = 0.']
     scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
-    delta: Annotated[float, 'Bias of this regime relative to axes.bias, input units.'] = 0.0
+    delta: Annotated[float, 'Bias of this regime less axes.bias, input units.'] = 0.0
     residual_sd_m_s2: Annotated[
-        float, QUANTITIES['deviation'], 'Standard deviation of the residual, a slow error.'
+        float,
+        QUANTITIES['deviation'],
+        'Standard deviation of the residual, a slowly varying error.',
     ] = 0.0
 
     def __post_init__(self) -> None:
@@ -121,17 +123,19 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """Lack of fit of a set at a board temperature, a slow error in addition to the posterior's."""
+    """Lack of fit of a set at a board temperature: a slow error in addition to the posterior."""
 
-    temperature_c: Annotated[Celsius, 'Board temperature [degC].']
-    sd_m_s2: Annotated[tuple[_Error, _Error, _Error], 'Standard deviation of each axis.']
+    temperature_c: Annotated[Celsius, 'Board temperature of the entry [degC].']
+    sd_m_s2: Annotated[
+        tuple[_Error, _Error, _Error], 'Standard deviation of the lack of fit of each axis.'
+    ]
 
 
 @dataclass(frozen=True)
 class RegimeSet:
     """
-    The set of one regime. Outside `temperature_range_c` the curves continue along their tangents
-    for a quarter of the span and are constant beyond; the covariance increases.
+    The set of curves of one regime. Outside `temperature_range_c` the curves continue along their
+    tangents for a quarter of the span and are constant beyond; the covariance increases.
     """
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Board temperature [degC].']
@@ -168,17 +172,21 @@ class RegimeSet:
 class ResponseTerm(Column):
     """A column of the thermal response with its weights on the three axes."""
 
-    bias: Annotated[Vector, 'Input units per unit of the column.'] = field(kw_only=True)
-    scale: Annotated[Vector, 'Relative, per unit of the column.'] = field(kw_only=True)
+    bias: Annotated[Vector, 'Weights on the bias, input units per unit of the column.'] = field(
+        kw_only=True
+    )
+    scale: Annotated[Vector, 'Weights on the relative scale, per unit of the column.'] = field(
+        kw_only=True
+    )
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """One unit's calibration; ValueError if parts contradict each other."""
+    """Calibration of one unit; ValueError if its parts contradict each other."""
 
-    format_version: Annotated[int, f'Version of this layout: {FORMAT_VERSION}.']
+    format_version: Annotated[int, f'Version of the layout of this file: {FORMAT_VERSION}.']
     unit: Unit
-    reference_temperature_c: Annotated[Celsius, 'T_ref; the paper uses 20.']
+    reference_temperature_c: Annotated[Celsius, 'Reference temperature T_ref; the paper uses 20.']
     gravity_m_s2: Annotated[float, QUANTITIES['gravity'], 'Local gravity used by the fit.']
     axes: Axes
     static: Annotated[RegimeSet, 'The set of the static regime, S = 0.']
@@ -192,7 +200,7 @@ class Calibration:
     ] = (0.0, 0.0, 0.0)
     misalignment: Annotated[
         tuple[Vector, Vector, Vector],
-        'M, from sensitivity axes to the frame: lower triangular, unit diagonal.',
+        'Matrix M, from sensitivity axes to the frame: lower triangular, unit diagonal.',
     ] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     misalignment_sd: Annotated[
         tuple[_Tilt, _Tilt, _Tilt],
@@ -202,16 +210,16 @@ class Calibration:
         tuple[str, ...], 'Thermometers beside the board; the first one leads in a ramp.'
     ] = ('case',)
     response: Annotated[
-        tuple[ResponseTerm, ...], QUANTITIES['columns'], 'The response, common to both sets.'
+        tuple[ResponseTerm, ...], QUANTITIES['columns'], 'Thermal response, common to both sets.'
     ] = ()
     board_lag_s: Annotated[
         float,
         QUANTITIES['time constant'],
         'Lag of T_board behind T_case; while the case is lost, gradient = lag * dT_board/dt.',
     ] = 900.0
-    detector: Annotated[DetectorSettings, 'The thermometers and the regime detector.'] = field(
-        default_factory=DetectorSettings
-    )
+    detector: Annotated[
+        DetectorSettings, 'Settings of the thermometers and of the regime detector.'
+    ] = field(default_factory=DetectorSettings)
     provenance: Provenance = field(default_factory=Provenance)
     evidence: Annotated[tuple[GroupEvidence, ...], 'Contribution of each group of columns.'] = ()
     posterior: Annotated[
@@ -274,7 +282,7 @@ class Calibration:
         return correct(self, time_s, counts, board=board, **others)
 
     def regime_sets(self) -> tuple[RegimeSet, RegimeSet]:
-        """Return the static and the dynamic set."""
+        """Return the static and the dynamic set of curves."""
         return self.static, self.dynamic
 
     @property
@@ -362,7 +370,7 @@ def rate_triad(calibration: Calibration) -> Calibration:
 
 
 def gyroscope_of(triad: Calibration) -> Gyroscope:
-    """Take the gyroscope out of a triad whose scale is 1."""
+    """Make a gyroscope from a triad whose scale is 1."""
     x, y, z = (axis.bias for axis in triad.axes)
     static, dynamic = (
         RateSet(*(RateCurve(axis.bias_function, axis.delta) for axis in regime_set.axes()))

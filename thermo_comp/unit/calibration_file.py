@@ -19,11 +19,11 @@ from .calibration import FORMAT_VERSION, Calibration
 from .schema import SchemaError, build, fields_of, plain
 
 #: Largest calibration file [bytes]. A calibration with all columns of the bank takes about 900 kB
-#: with one thermometer beside the board, nearly all of it the posterior; with two thermometers it
-#: is also below the limit.
+#: with one thermometer beside the board, nearly all of it the posterior; with two thermometers
+#: beside the board it is also below the limit.
 SIZE_LIMIT = 1 << 23
 
-#: Former names of groups and kinds of columns, as files of version 0.2.0 may have them.
+#: Former names of groups and kinds of columns, which files of version 0.2.0 may have.
 _FORMER = {
     'now': 'gradient',
     'neighbour': 'gradient_lag',
@@ -38,7 +38,7 @@ def load_calibration(path: str | Path) -> Calibration:
     Read and validate a calibration file.
 
     Raises CalibrationError if the file cannot be read, is not YAML of the accepted kind, or holds
-    a value that is not acceptable; names the file, the key, the value and what was expected.
+    a value that is not acceptable; the message names file, key, value and what was expected.
     """
     try:
         content = read_bounded(path, SIZE_LIMIT)
@@ -61,7 +61,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
     missing = [key for key in fields_of(Calibration)[1] if key not in data]
     rule = f'not a calibration: the key `{missing[0]}` is missing' if missing else None
     version = data.get('format_version')
-    # Checked before the keys: keys of another version would be reported as unknown.
+    # The version is checked before the keys: keys of another version would be reported as unknown.
     if type(version) is int and version != FORMAT_VERSION:
         advice = 'the file is of a newer release; update thermo_comp'
         if version < FORMAT_VERSION:
@@ -76,7 +76,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
 
 
 def _rename(data: dict[str, Any]) -> None:
-    """Replace former names of columns in the plain values of a file."""
+    """Replace former names of columns in the plain values of a calibration file."""
     gyroscope = data.get('gyroscope')
     lists = [data.get('response'), data.get('evidence')]
     lists += [gyroscope.get('response')] if isinstance(gyroscope, dict) else []
@@ -89,7 +89,9 @@ def _rename(data: dict[str, Any]) -> None:
 
 
 def dump_calibration(calibration: Calibration) -> str:
-    """Write a Calibration as YAML text; CalibrationError if reading it gives another value."""
+    """
+    Write a Calibration as YAML text; CalibrationError if reading the text gives another value.
+    """
     text: str = yaml.dump(
         plain(calibration),
         Dumper=_Dumper,
@@ -114,8 +116,8 @@ def save_calibration(
     """
     Write a calibration file atomically.
 
-    Raises CalibrationError if the value is not valid. Raises OutputError if the file may not or
-    cannot be written; an existing file then stays as it was.
+    Raises CalibrationError if the calibration is not valid. Raises OutputError if the file may not
+    or cannot be written; an existing file then stays as it was.
     """
     text = dump_calibration(calibration)
     write_atomically(path, text.encode(), CALIBRATION, overwrite=overwrite)

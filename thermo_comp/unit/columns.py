@@ -18,7 +18,7 @@ cube: with the curve they sum up to the curves over the temperatures of parts.
 *gradient_even_about_rest* has the columns of *gradient_even* as functions of the gradient less its
 value at rest.
 
-Tracker, fit, correction, covariance and file use this table.
+Tracker, fit, correction, covariance and calibration file use this table of columns.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,23 +37,26 @@ from .functions import hold
 from .schema import check_ranges
 from .terms import GROUPS, LINE, TERMS, Term
 
-#: A column range that limits no value.
+#: A range of a column that limits no value.
 UNBOUNDED: Final = (-1e9, 1e9)
 #: Time constants of the bank [s], in ratios of sqrt(2), from a few readings to the longest lag
-#: that bags determine. Linear lags use all of them, so that sums of lags approximate any time
-#: constant in between; products and powers, whose effects are smaller, use every other.
+#: that bags determine. Linear lags use all time constants of the bank, so that sums of lags
+#: approximate any time constant in between; products and powers, whose effects are smaller, use
+#: every other time constant.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
-#: Widths of the even columns [K], half-widths of the plays [K], and the lags that they follow [s].
+#: Widths of the even columns [K], half-widths of the plays [K], and the lags that plays follow
+#: [s].
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Lags of the parts whose slope changes at a knee [s]; distance [K] and number of the knees.
+#: Lags of the parts whose slope changes at a knee, a temperature [s]; smallest distance of knees
+#: [K], and largest number of knees, also with known parts.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
-# The names of groups and kinds, as the schema of the file reads them.
+# The names of groups and kinds, as the schema of the calibration file reads them.
 if TYPE_CHECKING:
     _Group: TypeAlias = str
     _Kind: TypeAlias = str
@@ -64,10 +67,10 @@ _Value = Annotated[float, QUANTITIES['value of a column']]
 
 class Part(NamedTuple):
     """
-    The lag of a part of the unit, by the keys of a column.
+    The lag of a part of the unit behind the board, by the keys of a column.
 
     tau_s, second_tau_s: time constants of its two stages [s]; the second is 0 for one stage
-    sensor_share: the part lags the board temperature plus this share of the gradient of the sensor
+    sensor_share: the part lags the board temperature plus this share of the sensor's gradient
     """
 
     tau_s: float
@@ -85,7 +88,7 @@ class Column:
         '; '.join(term.formula for term in TERMS.values())
         + ', where g_s = T_s - T_board and q_s = g_s - rest_k.',
     ]
-    sensor: Annotated[str, 'The thermometer s of g_s.'] = 'case'
+    sensor: Annotated[str, 'The thermometer s of the gradient g_s.'] = 'case'
     tau_s: Annotated[
         float,
         QUANTITIES['lag'],
@@ -102,26 +105,26 @@ class Column:
         'The lag is that of T_board + sensor_share * g_s (board, square, cube, play, bend).',
     ] = 0.0
     width_k: Annotated[
-        float, QUANTITIES['width'], 'Width of gradient_even, half-width of play.'
+        float, QUANTITIES['width'], 'Width of gradient_even, or half-width of play.'
     ] = 0.0
     rest_k: Annotated[
         float,
         QUANTITIES['gradient'],
-        'g_s at rest, for gradient_even, size and square without lag.',
+        'Gradient g_s at rest, for gradient_even, size and square without lag.',
     ] = 0.0
     knee_k: Annotated[
         float,
         QUANTITIES['gradient'],
-        'Temperature at which the slope of bend changes, from the reference.',
+        'Temperature above the reference at which the slope of bend changes.',
     ] = 0.0
     power: Annotated[int, QUANTITIES['power'], 'The value is multiplied by t to this power.'] = 0
     during: Annotated[
         Literal['always', 'static', 'dynamic'],
-        'always, or multiplied by 1 - w (static) or w (dynamic), w = weight of the dynamic set.',
+        'Factor of the value: 1 (always), 1 - w (static) or w (dynamic), w = dynamic weight.',
     ] = 'always'
     range: Annotated[
         tuple[_Value, _Value],
-        'Range of the value before t and w multiply it; held at its edges outside.',
+        'Range of the value before t and w multiply it; the value is limited to the range.',
     ] = field(kw_only=True)
 
     def __post_init__(self) -> None:
@@ -172,8 +175,8 @@ def bank(
 ) -> tuple[Column, ...]:
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
-    of each sensor at rest [K], `span_k` the temperatures seen, from the reference [K],
-    `parts` the only lags, those of the part of each axis.
+    of each sensor at rest [K], `span_k` the range of temperatures in the data, from the reference
+    [K]; with `parts`, the lags of the part of each axis, there are no other lags.
     """
     fine, coarse, of_plays, of_bends = (
         list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
@@ -225,7 +228,7 @@ def _family(
     lags: Sequence[Part] = (Part(0.0),),
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
-    """Return the columns of a group with all combinations of the properties."""
+    """Return the columns of a group with all combinations of the given keys' values."""
     return [
         Column(
             *(group, kind, sensor, *part, width),
@@ -237,7 +240,7 @@ def _family(
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
-    """Return the memory that columns need of a tracker; ValueError if a sensor is missing."""
+    """Return the memory that a tracker needs for columns; ValueError if a sensor is missing."""
     sources: set[Quantity] = set()
     for column in columns:
         sources.add(column.source)
@@ -259,7 +262,9 @@ _DURING: Final = ('always', 'static', 'dynamic')
 
 
 class ColumnTable:
-    """Columns over states (width, n), each state evaluated alone; results have (n_columns, n)."""
+    """
+    Evaluates columns at thermal states (width, n), each state alone; results: (n_columns, n).
+    """
 
     def __init__(
         self,
@@ -279,7 +284,7 @@ class ColumnTable:
         self._power = np.array([column.power for column in columns], np.int64)
         self._lowered = np.maximum(self._power - 1, 0)
         self._during = np.array([_DURING.index(column.during) for column in columns], np.int64)
-        #: Whether any column belongs to one regime alone.
+        #: Whether any column applies in one regime alone.
         self.differs = bool(self._during.any())
         # Columns that differ only in power, range or regime share one evaluation.
         of = [
@@ -297,12 +302,12 @@ class ColumnTable:
             for term in dict.fromkeys(terms.tolist())
             if term.form is not LINE
         ]
-        # The temperature of a part is the difference of two numbers of a state.
+        # The temperature of a part is the difference of two numbers of a thermal state.
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
 
     def raw(self, states: Floats) -> Floats:
-        """Evaluate u of each column, without the limits of its range."""
+        """Evaluate the value u of each column, without the limits of the column's range."""
         u = self._scaled(states)
         for rows, term in self._terms:
             u[rows] = term.form.value(u[rows])
@@ -316,16 +321,18 @@ class ColumnTable:
         return np.asarray((numbers - self._centres) / self._widths)
 
     def held(self, raw: Floats) -> Floats:
-        """Limit the result of `raw` to the columns' ranges."""
+        """Limit the values of `raw` to the columns' ranges."""
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return the distance of each column outside its range, in half ranges."""
+        """
+        Return how far the value of each column is outside the column's range, in half ranges.
+        """
         lower, upper = self._range
         return np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
 
     def factors(self, board: Floats, weight: Floats) -> tuple[Floats, Floats]:
-        """Return the factor phi / u (power of t times regime weight) and its slope by t."""
+        """Return the factor phi / u (power of t times regime weight) and its derivative by t."""
         t = hold(board - self._reference, *self._t_range)
         n_powers = int(self._power.max(initial=0))
         powers = np.multiply.accumulate([np.ones_like(t), *[t] * n_powers])
@@ -334,14 +341,14 @@ class ColumnTable:
         return powers[self._power] * shares, lowered * shares
 
     def values(self, states: Floats) -> Floats:
-        """Evaluate phi of each column."""
+        """Evaluate each column phi at thermal states."""
         factors, _ = self.factors(states[BOARD], states[WEIGHT])
         return np.asarray(self.held(self.raw(states)) * factors)
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate u, without limits of range: by the number that it is computed from, and by
-        the board temperature at a given lag; None if no column depends on the latter.
+        Differentiate u, without limits of range: by the number that u is computed from, and by the
+        board temperature at a given lag; None if no column depends on the board temperature.
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the arithmetic of the correction: thermal states in, bias, scale and error variances out.
+Owns the arithmetic of the correction: bias, scale and error variances from thermal states.
 
-States are columns, shape (width, n), of the numbers that `thermal.state` lays out; one state is
-n = 1. Sums run in a fixed order and each state is evaluated alone, so a stream and a batch get the
-same bits. Results for three axes stand in rows: the bias of x, y, z, then their scale. The
-notation is that of `calibration`; x is the specific force of an axis before the misalignment, and
-the error variance of x is ``v(x) = a + b x + c x^2`` [m^2/s^4].
+Thermal states are columns, shape (width, n), of the numbers that `thermal.state` lays out; for a
+single state n = 1. Sums run in a fixed order and each state is evaluated alone, so a stream and a
+batch get the same bits. Results for three axes stand in rows: the bias of x, y, z, then the scale
+of x, y, z. The notation is that of `calibration`; x is the specific force of an axis before the
+misalignment, and the error variance of x is ``v(x) = a + b x + c x^2`` [m^2/s^4].
 """
 
 from collections.abc import Sequence
@@ -26,34 +26,34 @@ from .functions import hold
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection
 
-#: Largest rate of change of the output while the sets are blended [m/s^3]: 1 ug per second; to
-#: this end blending is lengthened up to a number of transition times.
+#: Largest rate of change of the output while the two sets are blended [m/s^3]: 1 ug per second;
+#: the blending is lengthened for this, up to a number of transition times.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
-#: Number of board temperatures at which curves and differences of the sets are evaluated.
+#: Number of board temperatures at which curves and differences of the two sets are evaluated.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
 #: cycle.
 ROUNDING_VARIANCE = 1.0 / 6.0
-#: Smallest noise variance of a message / largest variance of any axis: keeps the covariance
-#: positive definite in spite of rounding; far below the noise of any instrument.
+#: Smallest noise variance of a message / largest variance of any axis: this minimum keeps the
+#: covariance positive definite in spite of rounding, and is far below the noise of any instrument.
 _LEAST_SHARE = 1e-13
 #: Largest number accepted in a result of `Correction.line`: with smaller numbers the corrected
 #: samples do not overflow.
 _LARGEST = 1e140
-#: Number of states from which one call per column costs less than a table of all sums.
+#: Number of thermal states from which one call per column costs less than a table of all sums.
 _FEW = 64
-#: Largest number of states evaluated at once, to bound the memory.
+#: Largest number of thermal states evaluated at once, to bound the memory.
 _CHUNK = 2048
 
 
 class Excess(NamedTuple):
     """How far a thermal state lies outside the calibrated ranges; 0 inside."""
 
-    temperature: float  # beyond the range of the regime's set, signed [K]
+    temperature: float  # board temperature beyond the range of the regime's set, signed [K]
     rate: float  # rate of the board beyond the range, signed [K/s]
-    gradient: float  # gradient of the sensor farthest outside, signed [K]
-    relative: float  # sum of all distances, each in half ranges
+    gradient: float  # excess of the gradient farthest outside its range, signed [K]
+    relative: float  # sum of all distances outside, each in half ranges
 
 
 class Correction:
@@ -101,16 +101,18 @@ class Correction:
             of_elements = (posterior.matrix[-3:] ** 2).sum(axis=1) + posterior.variances[-3:]
             variances = of_elements.tolist()
         self.misalignment: tuple[float, ...] = (M[1][0], M[2][0], M[2][1], *variances)
-        #: The nonlinearity over specific force; None without.
+        #: The nonlinearity over specific force; None if the calibration has none.
         self.of_force: ForceCorrection | None = None
         if calibration.nonlinearity is not None:
             self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
             self.misalignment += self.of_force.constants
-        #: Number of rows of the slow part of the variance.
+        #: Number of rows of the slow part of the error variance.
         self.n_slow = 9 if self.of_force is None else 24
 
     def _find_felt(self) -> None:
-        """Find the columns that depend on each quantity whose variance is propagated."""
+        """
+        Find the columns that depend on each quantity of the state whose variance is propagated.
+        """
         self.layout = layout = Layout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
@@ -127,14 +129,14 @@ class Correction:
 
     def _blended(self, sets: Floats, weight: Floats, phi: Floats) -> Floats:
         result = self._weigh(phi, (1.0 - weight) * sets[0] + weight * sets[1])
-        # Eq. (8): scale factor at this temperature.
+        # Eq. (8) of the paper: scale factor at the board temperature.
         result[3:] *= self.K
         return result
 
     def _weigh(self, columns: Floats, start: Floats) -> Floats:
-        """Add ``W @ columns`` to a start, shape (6, n), column by column."""
+        """Add ``W @ columns`` to initial values, shape (6, n), column by column."""
         if columns.shape[1] > _FEW:
-            # The same sums without a table of intermediate values.
+            # With many states the sums are computed without a table of intermediate values.
             total: Floats = start.copy()
             for weights, column in zip(self._W.swapaxes(0, 1), columns, strict=True):
                 total += weights * column
@@ -142,7 +144,7 @@ class Correction:
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
-        """Lengthen a transition time [s] to keep the output slower than GENTLE_RATE."""
+        """Lengthen a transition time [s], so that the output changes by GENTLE_RATE at most."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
         static, dynamic = self.curves.values(board)
         gap = dynamic - static
@@ -153,7 +155,7 @@ class Correction:
         return min(max(given_s, largest / GENTLE_RATE), LONGEST_TRANSITION * given_s)
 
     def excess(self, state: Sequence[float], *, is_dynamic: bool) -> Excess:
-        """Return the distance of a state outside the calibrated ranges."""
+        """Return how far a thermal state is outside the calibrated ranges."""
         states = np.array(state)[:, np.newaxis]
         over, too_fast, relative = (row[:, 0].tolist() for row in self.curves.excess(states))
         weight = state[WEIGHT]
@@ -169,7 +171,8 @@ class Correction:
 
     def felt(self, slopes: Floats) -> Floats:
         """
-        Differentiate bias and relative scale by `Layout.pairs`, (p, 6, n), given `slopes` of phi.
+        Differentiate bias and relative scale by `Layout.pairs`, (p, 6, n), given derivatives of
+        phi.
         """
         columns = self._felt_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))
@@ -186,11 +189,14 @@ class Correction:
         noise_excess: npt.ArrayLike,
     ) -> Floats:
         """
-        Evaluate the correction of segments as linear in time between states at both ends.
+        Evaluate the correction of segments, linear in time between the thermal states at both
+        ends.
 
-        `slow` is the slow part of a, b, c by axis, shape (9, n). Returns by axis bias, its change,
-        scale, its change, then by axis a, b, c with a message's noise: (21,) or (21, n). With a
-        nonlinearity `slow` has 15 more rows and the result 21 more, see `ForceCorrection.rows`.
+        `slow` is the slow part of the error variance's coefficients a, b, c by axis, shape (9, n).
+        Returns by axis bias and its change over the segment, scale and its change, then by axis
+        the coefficients a, b, c of the error variance with the noise of a message: (21,) or (21,
+        n). With a nonlinearity `slow` has 15 more rows and the result 21 more, see
+        `ForceCorrection.rows`.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -213,7 +219,8 @@ class Correction:
         slow = np.reshape(slow, (self.n_slow, n))
         unchanging = slow[:9].reshape(3, 3, n)
         v = self._variance(states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, unchanging)
-        # The largest force that each axis can measure [m/s^2], and the variance there.
+        # The largest force that each axis can measure [m/s^2], and the error variance at this
+        # force.
         most = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
         variance = v[:, 0] + most * (
             np.abs(v[:, 1]) + most * (v[:, 2] + max(self.misalignment[3:]))
@@ -238,10 +245,11 @@ class Correction:
         slow: Floats,
     ) -> Floats:
         """
-        Evaluate a, b, c of each axis, shape (3, 3, n), without the noise of a message.
+        Evaluate a, b, c of each axis' error variance, (3, 3, n), without the noise of a message.
 
-        The difference of the sets (`gap`) is added while they are blended, outside the ranges, and
-        while the regime is unknown; in the last case the variances of both sets are added.
+        The difference of the two sets (`gap`) is added as an error while the sets are blended,
+        outside the ranges, and while the regime is unknown; while it is unknown the variances of
+        both sets are added.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         static_weight, beyond_range = 1.0 - weight, raw - held
@@ -261,21 +269,22 @@ class Correction:
         v[:, 0] += (shares[:, np.newaxis] * self.curves.unexplained(board)).sum(axis=0)
         v += slow
         is_beyond = bool(beyond_range.any())
-        # A part that lags the board may still be outside when the board is back inside.
+        # A part that lags the board may still be outside the range when the board is back inside.
         parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
         parts_out = np.abs(parts - hold(parts, *self._span)).max(axis=0)
         if is_beyond or outside.any() or parts_out.any():
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0).max(
                 axis=1, initial=0.0
             )
-            # Outside the range the curves are extrapolated, while lagging parts are still inside.
-            # Add the change of slope as a separate error: for parts outside, and where the slopes
-            # of bias and scale cancel.
+            # Outside the calibrated range the curves are extrapolated, while lagging parts are
+            # still inside. Add the change of the curves' slope as a separate error: for parts
+            # outside the range, and where the slopes of bias and scale cancel.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
             v += self._spread(np.concatenate((bent, bent)), bends)
-            # The variance is that of the calibrated ranges: it grows with the distance from them.
+            # The posterior holds within the calibrated ranges, so the variance grows with the
+            # distance outside.
             v *= (1.0 + (outside + columns_out) ** 2)[:, np.newaxis]
         doubt = unknown + weight * static_weight + outside * outside
         if not (is_beyond or doubt.any()):

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the curves of the two sets over the board temperature, within their ranges and beyond.
+Owns the curves of both sets over the board temperature, within and beyond their ranges.
 
-States and rows are laid out as in `correction`; each state is evaluated alone.
+Thermal states and rows of results are laid out as in `correction`; each state is evaluated alone.
 """
 
 from functools import cached_property
@@ -18,19 +18,20 @@ from .functions import TANGENT_SPANS, Functions, basis_slopes, hold
 
 class Curves:
     """
-    Bias and scale of both sets as functions of the board temperature; row 0 of a result is static.
+    Bias and scale of both sets as functions of the board temperature; the static set is row 0 of a
+    result.
 
-    Where only one set's range ends, the difference of the two sets is held. Beyond both ranges the
-    curves continue along their tangent at the edge for `TANGENT_SPANS` of the span, and are
-    constant from there on; a set whose range ends earlier than that of the other set follows the
-    tangent of the other set.
+    Where the range of only one set ends, the difference of the two sets is held constant. Beyond
+    both ranges the curves continue along their tangent at the edge for `TANGENT_SPANS` of the
+    span, and are constant from there on; a set whose range ends earlier than that of the other set
+    follows the tangent of the other set.
     """
 
     def __init__(self, calibration: Calibration) -> None:
         self._reference = calibration.reference_temperature_c
         sets = calibration.regime_sets()
         edges = np.array([(part.temperature_range_c, part.rate_range_k_min) for part in sets])
-        # Edges of each set, shape (2, 2, 1): the lower ones, then the upper ones.
+        # Edges of each set's range, shape (2, 2, 1): the lower edges, then the upper edges.
         self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
         self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
         rows = [
@@ -38,7 +39,8 @@ class Curves:
             for axes in (part.axes() for part in sets)
         ]
         self._functions, self._others = Functions(rows), Functions(rows[::-1])
-        # Which set's tangent a set follows at the lower and at the upper end, shape (2, 2).
+        # Index of the set whose tangent each set follows at the lower and at the upper end, shape
+        # (2, 2).
         regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
         self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - regimes, regimes)
         self._ends = lower.min(), upper.max()
@@ -59,7 +61,9 @@ class Curves:
         self._has_lacks = any(part.lack_of_fit for part in sets)
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return distances outside, (2, n): temperature [K], rate [K/s], sum in half ranges."""
+        """
+        Return distances outside the ranges, (2, n): temperature [K], rate [K/s], half ranges.
+        """
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         if not (over.any() or too_fast.any()):
@@ -83,13 +87,17 @@ class Curves:
 
     @cached_property
     def _tangents(self) -> Floats:
-        """Slopes at the lower and at the upper end, as `slopes` has them, shape (2, 2, 6, 1)."""
+        """
+        Slopes of the curves at the lower and the upper end, laid out as by `slopes`, (2, 2, 6, 1).
+        """
         ends = zip(self._t_range, self._leads, strict=True)
         return np.array([self._functions.evaluate(t, 'slope')[leads] for t, leads in ends])
 
     @cached_property
     def _basis_slopes(self) -> list[list[list[Floats]]]:
-        """Derivatives of the slope of each function, at both ends, by its free coefficients."""
+        """
+        Derivatives of each function's slope, at both ends, by the function's free coefficients.
+        """
         rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
         return [
             [[np.reshape(basis_slopes(curve, end), (-1, 1)) for end in ends] for curve in row]
@@ -97,12 +105,14 @@ class Curves:
         ]
 
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return the distances along the lower and the upper tangent of each set [K], (2, n)."""
+        """Return how far each set follows its lower and its upper tangent [K], (2, n)."""
         (lower, upper), (below, above) = self._ends, self._reaches
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """Evaluate the unexplained variance of each set and axis [m^2/s^4], shape (2, 3, n)."""
+        """
+        Evaluate the variance of residual and lack of fit by set and axis [m^2/s^4], (2, 3, n).
+        """
         if not self._has_lacks:
             return self._residuals
         result = np.repeat(self._residuals, len(board), axis=2)
@@ -118,12 +128,16 @@ class Curves:
         return result
 
     def slopes(self, board: Floats) -> Floats:
-        """Differentiate the result of `values` by the board temperature [per K], (2, 6, n)."""
+        """
+        Differentiate the bias and scale of both sets by the board temperature [per K], (2, 6, n).
+        """
         held = hold(board - self._reference, *self._t_range)
         return self._functions.evaluate(held, 'slope')
 
     def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
-        """Differentiate biases and scales by their parameters, in the posterior's order."""
+        """
+        Differentiate biases and scales by the parameters of the curves, in the posterior's order.
+        """
         t, weight = states[BOARD] - self._reference, states[WEIGHT]
         held, shares = hold(t, *self._t_range), np.array([1.0 - weight, weight])
         is_outside = bool((held != t).any())

@@ -3,10 +3,10 @@
 """
 Owns a function of temperature: polynomial, cubic spline or exponential, normalised at t = 0.
 
-A single ``t = T_board - T_ref`` [K] gives the bits of a batch: the code uses only ``+ - * /`` in a
-fixed order, and `math.exp` number by number. Each function is linear in its free coefficients, so
-`basis` gives the regressors of the fit and of the parameter covariance (Eq. (9) and (10) of the
-paper).
+A single ``t = T_board - T_ref`` [K] gives the same bits as an array: the code uses only ``+ - *
+/`` in a fixed order, and `math.exp` number by number. Each function is linear in its free
+coefficients, so `basis` gives the regressors of the fit and of the parameter covariance (Eq. (9)
+and (10) of the paper).
 """
 
 from __future__ import annotations
@@ -25,50 +25,52 @@ import numpy.typing as npt
 from ..quantities import QUANTITIES
 from ..typing import Floats
 
-#: One temperature difference or an array of them [K].
+#: One temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
-#: Length of the tangent that continues a curve beyond its range, in spans of that range. At the
-#: tangent's end a parabola differs from the tangent by a sixteenth of the difference at the far
-#: end of the range.
+#: Length of the tangent that continues a curve beyond its range, in spans of the range. At the end
+#: of the tangent a parabola differs from it by a sixteenth of the difference at the opposite end
+#: of the range.
 TANGENT_SPANS = 0.25
-#: Largest error of a function at the reference temperature.
+#: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
-#: Smallest distance of knots, and largest distance of a knot from the reference temperature [K];
-#: the spline would overflow beyond them.
+#: Smallest distance of a spline's knots, and largest distance of a knot from the reference
+#: temperature [K]; beyond these limits the spline would overflow.
 _KNOT_STEP = 1e-3
 _FARTHEST_KNOT = 2000.0
 
 
 def hold(value: Floats, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Floats:
-    """Limit values to a range, given in their unit."""
+    """Limit values to a range in the same unit."""
     return np.asarray(np.minimum(np.maximum(value, lower), upper))
 
 
 def by_element(function: Callable[[float], float], x: Kelvins) -> Floats:
-    """Map number by number: numpy's rounding may depend on the length of the array."""
+    """
+    Apply a function number by number: numpy's rounding may depend on the length of the array.
+    """
     return np.array([function(v) for v in np.ravel(x).tolist()]).reshape(np.shape(x))
 
 
 class _Family(ABC):
-    """The interface of all families."""
+    """The interface of all families of functions of temperature."""
 
     @property
     @abstractmethod
     def free_coefficients(self) -> tuple[float, ...]:
-        """The free coefficients, in the order of `basis`."""
+        """The free coefficients of the function, in the order of `basis`."""
 
     @property
     def n_free(self) -> int:
-        """Number of free coefficients."""
+        """Number of free coefficients of the function."""
         return len(self.free_coefficients)
 
     def value(self, t: Kelvins) -> Floats:
-        """Evaluate at `t` [K]."""
+        """Evaluate the function at `t` [K]."""
         return self._evaluate(np.asarray(t))
 
     def slope(self, t: Kelvins) -> Floats:
-        """Evaluate the derivative at `t`, per K."""
+        """Evaluate the derivative of the function at `t`, per K."""
         return self._evaluate(np.asarray(t), is_slope=True)
 
     @abstractmethod
@@ -88,11 +90,11 @@ class Polynomial(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """All coefficients except the value at the reference temperature."""
+        """All coefficients of the polynomial except the value at the reference temperature."""
         return self.coefficients[1:]
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Polynomial:
-        """Return the same shape with other coefficients."""
+        """Return the same family of polynomial with other coefficients."""
         return replace(self, coefficients=(at_reference, *values))
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -100,11 +102,11 @@ class Polynomial(_Family):
 
     @property
     def slopes(self) -> tuple[float, ...]:
-        """The coefficients of the derivative."""
+        """The coefficients of the polynomial's derivative."""
         return tuple(k * c for k, c in enumerate(self.coefficients))[1:] or (0.0,)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives with respect to the free coefficients: t, t^2, ..."""
+        """Evaluate the derivatives of the polynomial by its free coefficients: t, t^2, ..."""
         return list(np.multiply.accumulate([np.asarray(t)] * self.n_free)) if self.n_free else []
 
 
@@ -112,7 +114,7 @@ class Polynomial(_Family):
 class CubicSpline(_Family):
     """
     Natural cubic spline through values at rising knots [K from the reference], one of them 0,
-    where the value is 0 (bias) or 1 (scale). Beyond the knots the end value is held.
+    where the value is 0 (bias) or 1 (scale). Beyond the outer knots the spline keeps their values.
     """
 
     knots_k: Annotated[tuple[float, ...], QUANTITIES['knots']]
@@ -136,12 +138,14 @@ class CubicSpline(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """The values at all knots except t = 0 (the reference), less the value at t = 0."""
+        """
+        The values of the spline at all knots except t = 0 (the reference), less that at t = 0.
+        """
         at = self.knots_k.index(0.0)
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> CubicSpline:
-        """Return the same knots with other values."""
+        """Return a spline of the same knots with other values."""
         at = self.knots_k.index(0.0)
         moved = (*values[:at], 0.0, *values[at:])
         return replace(self, values=tuple(at_reference + v for v in moved))
@@ -159,7 +163,7 @@ class CubicSpline(_Family):
         return self._along(self._pieces, t, is_slope=is_slope)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives with respect to the free values: the cardinal splines."""
+        """Evaluate the derivatives of the spline by its free values: the cardinal splines."""
         return [self._along(pieces, np.asarray(t)) for pieces in self._cardinal_pieces]
 
     def _along(self, pieces: Floats, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -194,16 +198,17 @@ class Exponential(_Family):
                 f'got {len(self.e_fold_k)}'
             )
         if any(abs(e_fold) < 1.0 for e_fold in self.e_fold_k):
-            # Below 1 K the exponential overflows within any useful temperature range.
+            # With an e-fold below 1 K the exponential overflows within any useful temperature
+            # range.
             raise ValueError('`e_fold_k` must be at least 1 K in magnitude')
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """The amplitudes (the e-folds give the shape)."""
+        """The amplitudes of the exponentials, whose e-folds are fixed."""
         return self.amplitudes
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Exponential:
-        """Return the same shape with other amplitudes."""
+        """Return a sum of the same exponentials with other amplitudes."""
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -214,16 +219,18 @@ class Exponential(_Family):
         return np.asarray(result)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives with respect to the amplitudes at a fixed reference value."""
+        """Evaluate the derivatives by the amplitudes, for a fixed value at the reference."""
         return [by_element(math.exp, t / e_fold) - 1.0 for e_fold in self.e_fold_k]
 
 
-#: Any of the three families.
+#: A function of temperature of any of the three families.
 TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
 class Functions:
-    """Rows of functions, each row at its own temperatures; polynomials are evaluated together."""
+    """
+    Rows of functions of separate temperatures for each row; polynomials are joined for speed.
+    """
 
     def __init__(self, rows: Sequence[Sequence[TemperatureFunction]]) -> None:
         self.rows = rows
@@ -240,7 +247,9 @@ class Functions:
         }
 
     def evaluate(self, t: Floats, name: str = 'value') -> Floats:
-        """Evaluate at `t`, shape (n_rows, n) [K], values or slopes, (n_rows, n_functions, n)."""
+        """
+        Evaluate values or slopes at `t`, shape (n_rows, n) [K]: shape (n_rows, n_functions, n).
+        """
         result = _horner(self._tables[name], t[:, np.newaxis])
         for row, place, function in self._others:
             result[row, place] = getattr(function, name)(t[row])
@@ -263,14 +272,14 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
 
 
 def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:
-    """Differentiate the result of `basis` by the temperature, at `t` [per K]."""
+    """Differentiate the functions of `basis` by the temperature, at `t` [per K]."""
     units = np.eye(function.n_free).tolist()
     return [float(function.with_free(tuple(unit), 0.0).slope(t)) for unit in units]
 
 
 def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
-    """Give ``a, b, c, d`` of ``a + b h + c h^2 + d h^3``, h from the left knot, (4, n - 1)."""
-    # The usual tridiagonal system, in numpy: the node must not import scipy.
+    """Return ``a, b, c, d`` of a spline's ``a + b h + c h^2 + d h^3``, h from the left knot."""
+    # The tridiagonal system of the spline is solved with numpy: the node must not import scipy.
     y, h = np.asarray(values), np.diff(np.asarray(knots))
     slopes = np.diff(y) / h
     n = len(y)

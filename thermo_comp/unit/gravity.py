@@ -5,7 +5,8 @@
 import math
 import re
 
-#: [m/s^2], exact by definition: 3rd General Conference on Weights and Measures, 1901.
+#: Standard gravity [m/s^2], exact by definition: 3rd General Conference on Weights and Measures,
+#: 1901.
 STANDARD_GRAVITY = 9.80665
 #: Rotation of the Earth [rad/s]: WGS 84, NIMA TR8350.2.
 EARTH_RATE = 7.292115e-5

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns statistics of residuals: corrected - true, and ``|f| - g``, which needs no attitude."""
+"""
+Owns statistics of residuals: corrected less true force, and ``|f| - g``, which needs no attitude.
+"""
 
 from dataclasses import dataclass
 
@@ -20,7 +22,7 @@ class ResidualStatistics:
 
 
 def residual_statistics(residual: Floats) -> ResidualStatistics:
-    """Summarise residuals, shape (n,); those that are not finite are left out."""
+    """Summarise residuals, shape (n,); residuals that are not finite are left out."""
     values = residual[np.isfinite(residual)]
     if not len(values):
         return ResidualStatistics(0, np.nan, np.nan, np.nan)
@@ -35,7 +37,7 @@ def norm_residual(specific_force: Floats, gravity: float | Floats) -> Floats:
 
 
 def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floats:
-    """Average the rows of each label, in the order of the labels."""
+    """Average the rows that have the same label, in the order of the labels."""
     weight = np.ones(len(labels)) if weight is None else weight
     _, place = np.unique(labels, return_inverse=True)
     count = np.bincount(place, weight)
@@ -45,7 +47,7 @@ def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floa
 
 
 def statistics_by_regime(residual: Floats, is_dynamic: Bools) -> dict[str, ResidualStatistics]:
-    """Summarise residuals over the static sections, the dynamic ones and all together."""
+    """Summarise residuals over the static sections, over the dynamic sections, and over both."""
     return {
         'static': residual_statistics(residual[~is_dynamic]),
         'dynamic': residual_statistics(residual[is_dynamic]),

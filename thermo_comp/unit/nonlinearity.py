@@ -28,12 +28,15 @@ if TYPE_CHECKING:
     from .calibration import Calibration
 
 Kind = Literal['square', 'odd_square', 'cube']
-#: The terms in the order of a file, and the power of 1/g in the unit of their coefficient.
+#: The nonlinear terms in the order of a calibration file, and the power of 1/g in the unit of each
+#: coefficient.
 POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
-#: Largest slope of the terms within full scale, for which one step of the solver is sufficient.
+#: Largest slope of the nonlinear terms within full scale, for which one step of Halley's method is
+#: sufficient.
 LARGEST_SLOPE = 0.2
 
-Real = TypeVar('Real', float, Floats)  # the value of one sample, or an array of many
+# Type of a quantity: the value of one sample, or an array of many samples.
+Real = TypeVar('Real', float, Floats)
 
 
 @dataclass(frozen=True)
@@ -41,8 +44,12 @@ class NonlinearTerm:
     """One term of the nonlinearity; `coefficient` and `per_kelvin` are for x, y, z."""
 
     kind: Annotated[Kind, 'K2 f^2, Kq |f| f or K3 f^3.']
-    coefficient: Annotated[Vector, 'At the reference temperature [g/g^2; of the cube g/g^3].']
-    per_kelvin: Annotated[Vector, 'Change per kelvin of the board; constant outside the range.']
+    coefficient: Annotated[
+        Vector, 'Coefficient at the reference temperature [g/g^2; K3 in g/g^3].'
+    ]
+    per_kelvin: Annotated[
+        Vector, 'Change of `coefficient` per kelvin of the board, within the calibrated range.'
+    ]
     prior_sd: Annotated[float, QUANTITIES['nonlinearity'], 'Prior sd of `coefficient`.']
     effective_parameters: Annotated[
         float, QUANTITIES['number'], 'Effective number of coefficients determined by the data.'
@@ -51,7 +58,9 @@ class NonlinearTerm:
         float, QUANTITIES['log evidence'], 'Loss of log evidence without the term.'
     ] = 0.0
     left_out_gain: Annotated[
-        float, QUANTITIES['log evidence'], 'Gain by the term: log ratio of left-out mean squares.'
+        float,
+        QUANTITIES['log evidence'],
+        'Log ratio of left-out mean squares without and with the term.',
     ] = 0.0
 
 
@@ -61,15 +70,15 @@ class Nonlinearity:
     The nonlinearity of the three axes.
 
     Beyond the forces of the fit the polynomials continue, and the covariance is increased by an
-    unknown square term from the edge on, with the sd `beyond_sd_g_g2`.
+    unknown square term that begins at the largest force, with the sd `beyond_sd_g_g2`.
     """
 
     force_range_m_s2: Annotated[
         tuple[Annotated[float, QUANTITIES['error']], Annotated[float, QUANTITIES['error']]],
-        'Smallest and largest |f| of the fit.',
+        'Smallest and largest |f| in the data of the fit.',
     ]
     beyond_sd_g_g2: Annotated[
-        float, QUANTITIES['nonlinearity'], 'Sd of the square term beyond the largest |f|.'
+        float, QUANTITIES['nonlinearity'], 'Sd of an unknown square term beyond the largest |f|.'
     ]
     terms: tuple[NonlinearTerm, ...] = ()
 
@@ -80,7 +89,9 @@ class Nonlinearity:
             raise ValueError(f'`terms` must be of {list(POWERS)}, each once, in this order')
 
     def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
-        """Raise ValueError if the terms are too steep up to a force [m/s^2] at some t [K]."""
+        """
+        Raise ValueError if the terms' slope is too large up to a force [m/s^2] at some t [K].
+        """
         for t in temperatures:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
             slope = float(np.max(2.0 * (k2 + kq) * force + 3.0 * k3 * force * force))
@@ -100,15 +111,15 @@ class Nonlinearity:
 
 
 def unit_of(kind: Kind) -> float:
-    """Return the divisor that converts a coefficient in g/g^n to m and s."""
+    """Return the divisor that converts a coefficient in g/g^n to SI units."""
     return float(STANDARD_GRAVITY ** POWERS[kind])
 
 
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
     Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
-    error of the result is (k2^2 + k3) times the cube of the correction: at 10 g 1e-14 g with 100
-    ug/g^2, 1e-11 g with 10 ug/g^3.
+    error of the result is (k2^2 + k3) times the cube of the correction: at 10 g it is 1e-14 g with
+    k2 = 100 ug/g^2, and 1e-11 g with k3 = 10 ug/g^3.
     """
     r = k3 * x * x
     s = k2 * x + kq * abs(x) + r
@@ -119,13 +130,13 @@ def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
 def corrected_nonlinear(
     line: Iterable[Real], constants: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
-    """Correct a sample like `online.compensator.corrected`, for an axis with a nonlinearity."""
+    """Correct a sample as `online.compensator.corrected` does, for axes with a nonlinearity."""
     (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
      ax, lx, qx, ay, ly, qy, az, lz, qz,
      k2x, kqx, k3x, dx, ex, fx, gx, k2y, kqy, k3y, dy, ey, fy, gy,
      k2z, kqz, k3z, dz, ez, fz, gz) = line  # fmt: skip
     yx, zx, zy, var_yx, var_zx, var_zy, edge, growth = constants
-    # Eq. (7), solved for the input of each axis, then the nonlinearity.
+    # Eq. (7) of the paper is solved for the input of each axis, then the nonlinearity.
     x = linearised((x - (bx + bx1 * dt)) / (sx + sx1 * dt), k2x, kqx, k3x)
     y = linearised((y - (by + by1 * dt)) / (sy + sy1 * dt), k2y, kqy, k3y)
     z = linearised((z - (bz + bz1 * dt)) / (sz + sz1 * dt), k2z, kqz, k3z)
@@ -152,9 +163,11 @@ def corrected_nonlinear(
 
 
 def _grown(x: Real, edge: float, growth: float) -> Real:
-    """Return the variance of the unknown square term that begins at the edge."""
+    """
+    Return the variance of the unknown square term that begins at the largest force of the fit.
+    """
     over = abs(x) - edge
-    over = over + abs(over)  # twice the distance beyond the edge, or 0
+    over = over + abs(over)  # twice the distance beyond the largest force, or 0
     over = over * over
     return growth * over * over
 
@@ -176,11 +189,13 @@ class ForceCorrection:
         self.constants = nonlinearity.force_range_m_s2[1], growth * growth / 16.0
 
     def held(self, board: Floats) -> Floats:
-        """Return board temperatures less the reference, held at the calibrated range's edges."""
+        """Return board temperatures less the reference, limited to the calibrated range."""
         return hold(board, *self._span) - self._reference
 
     def linearise(self, x: Floats, board: Floats) -> Floats:
-        """Remove the terms from readings of the axes (n, 3) at board temperatures (n,)."""
+        """
+        Subtract the nonlinear terms from readings of the axes (n, 3), at board temperatures (n,).
+        """
         k2, kq, k3 = self._of.coefficients(self.held(board))
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
@@ -204,11 +219,12 @@ class ForceCorrection:
         self, t: float, rows: Floats, rest: Floats, on_bias: Floats, on_scale: Floats
     ) -> list[float]:
         """
-        Return the terms' contribution to the coefficients of x^2 to x^6 in an axis' variance.
+        Return the nonlinear terms' part of the coefficients of x^2 to x^6 in an axis' variance.
 
         `rows`, `rest`: factor of the covariance of the coefficients (2 k, rank), and variances
         added to it; `on_bias`, `on_scale`: factors of bias and relative scale, (rank,). The
-        covariances of |f| f with other parameters are omitted, which overstates the variance.
+        covariances of the coefficient of |f| f with other parameters are omitted, which overstates
+        the variance.
         """
         kinds = [term.kind for term in self._of.terms]
         n = len(kinds)
@@ -218,7 +234,7 @@ class ForceCorrection:
         none = np.zeros(rows.shape[1])
         n2, nq, n3 = (along[kinds.index(k)] if k in kinds else none for k in POWERS)
         v2, vq, v3 = (float(alone[kinds.index(k)]) if k in kinds else 0.0 for k in POWERS)
-        # Explicit products and sums: BLAS results depend on the arrays' alignment.
+        # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
         products = (
             2.0 * on_bias * n2,
             2.0 * (on_scale * n2 + on_bias * n3),

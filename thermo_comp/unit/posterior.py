@@ -17,16 +17,16 @@ from ..quantities import QUANTITIES
 from ..typing import Floats
 from .functions import TemperatureFunction
 
-#: Share of a variance that single precision does not resolve.
+#: Share of a variance that is below the resolution of single precision.
 _NEGLIGIBLE = 1e-7
-#: Smallest eigenvalue of a correlation matrix that rounding explains.
+#: Smallest (negative) eigenvalue of a correlation matrix that rounding explains.
 _MOST_NEGATIVE = -1e-6
 _FLOAT32 = np.dtype('<f4')
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Covariance of all parameters, by `ParameterLayout`: factor @ factor.T + diag(rest)."""
+    """Covariance of all parameters (order: `ParameterLayout`): factor @ factor.T + diag(rest)."""
 
     rank: Annotated[int, QUANTITIES['number'], 'Number of columns of the factor.']
     factor: Annotated[
@@ -57,12 +57,12 @@ class Posterior:
 
     @cached_property
     def matrix(self) -> Floats:
-        """The factor, shape (n_parameters, rank)."""
+        """The factor of the covariance, shape (n_parameters, rank)."""
         return _decoded('factor', self.factor).reshape(self.n_parameters, self.rank)
 
     @cached_property
     def variances(self) -> Floats:
-        """The variances added on the diagonal, shape (n_parameters,)."""
+        """The variances added to the covariance's diagonal, shape (n_parameters,)."""
         return _decoded('rest', self.rest)
 
     def covariance(self) -> Floats:
@@ -81,8 +81,9 @@ class Posterior:
 
 class Block(NamedTuple):
     """
-    Indices of the parameters of an axis' bias or scale. `static`, `dynamic`: level of the set,
-    followed by its function's coefficients; `response` to `end` (exclusive): weights.
+    Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
+    level of the set, followed by its function's coefficients; `response` to `end` (exclusive):
+    weights.
     """
 
     static: int
@@ -92,14 +93,14 @@ class Block(NamedTuple):
 
     @property
     def rows(self) -> slice:
-        """All parameters of the block."""
+        """Indices of all parameters of the block."""
         return slice(self.static, self.end)
 
 
 def lay_out(
     pairs: Iterable[tuple[TemperatureFunction, TemperatureFunction]], n_columns: int
 ) -> list[Block]:
-    """List the consecutive blocks of pairs of a static and a dynamic function."""
+    """List the blocks of parameters for pairs of a static and a dynamic function."""
     blocks = [Block(0, 0, 0, 0)]
     for static, dynamic in pairs:
         begin = blocks[-1].end
@@ -124,7 +125,7 @@ class ParameterLayout(NamedTuple):
 
     @property
     def force(self) -> list[slice]:
-        """The coefficients of the nonlinear terms of each axis."""
+        """Indices of the coefficients of the nonlinear terms of each axis."""
         n = (self.misalignment - self.nonlinear) // 3
         return [slice(first, first + n) for first in (self.nonlinear + n * k for k in range(3))]
 
@@ -134,7 +135,8 @@ def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')
-    # Scale to correlations: entries in counts^2 and relative^2 differ by 10 decades.
+    # The covariance is scaled to correlations: entries in counts^2 and relative^2 differ by 10
+    # decades.
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     with np.errstate(over='ignore'):
         correlation = (covariance + covariance.T) / 2.0 / scale / scale[:, np.newaxis]
@@ -158,7 +160,7 @@ def _encoded(numbers: npt.NDArray[np.floating[Any]]) -> str:
 
 
 def _single(numbers: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
-    # An overflow becomes inf, which the reader refuses.
+    # A number that overflows single precision becomes inf, which the reader refuses.
     with np.errstate(over='ignore'):
         return numbers.astype(_FLOAT32)
 

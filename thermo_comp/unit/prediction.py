@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns predictions for a thermal state: the slow part of the error variance (parameters, and lags
-whose start was not seen), and hypothetical states: a soak and a ramp.
+Owns predictions for a thermal state: the slow part of the error variance (by the parameters, and
+by lags whose initial state is unknown), and hypothetical states: a soak and a ramp.
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
 of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
 stop; in a soak (q = 0) all of them are 0. The static set applies in a soak, the dynamic set in a
-ramp. Noise and the uncertainty of the thermometers are left out.
+ramp. Predicted variances do not include noise and the uncertainty of the thermometers.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,13 +23,14 @@ from .correction import Correction
 
 
 class SlowUncertainty:
-    """Error variance by the posterior and the unseen starts of lags, with the bits of a batch."""
+    """Error variance of a thermal state by the posterior and by the unknown initial lag states."""
 
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
         self._correction = correction
         self._K = correction.K[:, 0].tolist()
         self._root = np.asarray(np.linalg.cholesky(start_covariance(correction.memory.lags)))
-        #: By axis rows of the factor and further variances: of bias, scale and nonlinear terms.
+        #: By axis the rows of the posterior's factor, and the added variances: of bias, scale and
+        #: nonlinear terms.
         self._blocks: list[list[tuple[Floats, Floats]]] = []
         posterior = calibration.posterior
         if posterior is None:
@@ -41,15 +42,16 @@ class SlowUncertainty:
             variances = [diagonal[part] for part in parts]
             rows = np.concatenate([matrix[part] for part in parts])
             if matrix.shape[1] > len(rows):
-                # The same covariance of one axis from fewer columns.
+                # An equivalent factor of the covariance of one axis has fewer columns.
                 rows = np.ascontiguousarray(np.linalg.qr(rows.T)[1].T)
             by_part = np.split(rows, np.cumsum([len(part) for part in variances])[:-1])
             self._blocks.append(list(zip(by_part, variances, strict=True)))
 
     def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[float]:
         """
-        Evaluate a, b, c of each axis at one state: ``v(x) = a + b x + c x^2`` [m^2/s^4]; with a
-        nonlinearity then its contribution to the coefficients of x^2 to x^6 of each axis.
+        Evaluate a, b, c of each axis' error variance ``v(x) = a + b x + c x^2`` [m^2/s^4] at one
+        thermal state; with a nonlinearity then its contribution to the coefficients of x^2 to x^6
+        of each axis.
         """
         states = np.array(state)[:, np.newaxis]
         table = self._correction.table
@@ -84,8 +86,8 @@ class SlowUncertainty:
         self, states: Floats, mean_of: Callable[[Floats], Floats]
     ) -> tuple[Floats, Floats]:
         """
-        Return the variance of the bias by the parameters at states (n, w), and the variance of its
-        difference from `mean_of` rows, shapes (n, 3) [m^2/s^4].
+        Return the variance of the bias by the parameters at thermal states (n, w), and the
+        variance of the bias less its mean over the rows `mean_of`, shapes (n, 3) [m^2/s^4].
         """
         columns = states.T
         phi = self._correction.table.values(columns)
@@ -99,7 +101,7 @@ class SlowUncertainty:
 
 
 def _products(bias: Floats, scale: Floats) -> Floats:
-    # Explicit products and sums: BLAS results depend on the arrays' alignment.
+    # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
     return np.array([(bias * bias).sum(), 2.0 * (bias * scale).sum(), (scale * scale).sum()])
 
 
@@ -145,14 +147,14 @@ def nonlinear_coefficients(calibration: Calibration) -> list[Coefficients]:
 
 
 def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
-    """Evaluate bias [m/s^2] and scale [input units per m/s^2] at states, shapes (n, 3)."""
+    """Evaluate bias [m/s^2] and scale [input units per m/s^2] at thermal states, shapes (n, 3)."""
     correction = Correction(calibration)
     bias, scale = correction.bias_scale(states.T)
     return (bias / correction.K).T, scale.T
 
 
 def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
-    """Predict the sd of the bias [m/s^2] and of the relative scale at states, shapes (n, 3)."""
+    """Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3)."""
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
     forgotten = [0.0] * len(correction.memory.lags)
@@ -171,7 +173,9 @@ def ramp_states(
     rate: float = 0.0,
     lasted_s: Floats | float = 0.0,
 ) -> Floats:
-    """Build states (n, width) of a ramp that has lasted for `lasted_s` [s] at `rate` [K/s]."""
+    """
+    Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s].
+    """
     layout = Layout(Correction(calibration).memory)
     states = np.zeros((len(temperature), layout.width))
     states[:, BOARD], states[:, WEIGHT] = temperature, float(rate != 0.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the origin of a calibration: its bags, residuals and the evidence for its columns."""
+"""Owns the record of a calibration's origin: bags, residuals and the evidence for the columns."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ _WeightSd = Annotated[float, QUANTITIES['deviation of a weight']]
 
 @dataclass(frozen=True)
 class GroupEvidence:
-    """Contribution of one group of columns to the fit."""
+    """Contribution of one group of columns to the correction of a fit."""
 
     group: Annotated[str, 'Name of the group, as in the key `response`.']
     part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
@@ -31,7 +31,7 @@ class GroupEvidence:
 
 @dataclass(frozen=True)
 class Source:
-    """One bag that the calibration was fitted on."""
+    """One bag of the data of a fit."""
 
     name: str
     sha256: str = ''
@@ -40,7 +40,9 @@ class Source:
 
 @dataclass(frozen=True)
 class ResidualSummary:
-    """|g| error over one section of the fitted data, before and after correction."""
+    """
+    Error of |f| against gravity over one section of the fitted data, before and after correction.
+    """
 
     section: str
     n_windows: _Number

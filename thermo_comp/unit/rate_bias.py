@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the gyroscope of a unit: its bias, with the columns of the accelerometer; scale 1."""
+"""Owns the bias of a unit's gyroscope, with the columns of the accelerometer; its scale is 1."""
 
 import math
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from .schema import Vector
 #: One millidegree per second, a unit of gyroscope errors [rad/s].
 MILLIDEGREE = math.radians(1e-3)
 NIL = (0.0, 0.0, 0.0)
-#: The largest angular rate of a gyroscope, and its largest bias [rad/s].
+#: The largest angular rate of a gyroscope, which is also its largest bias [rad/s].
 LARGEST_RATE = QUANTITIES['angular rate'].at_most or 0.0
 
 _Rate = Annotated[float, QUANTITIES['angular rate']]
@@ -26,10 +26,10 @@ _Deviation = Annotated[float, QUANTITIES['rate deviation']]
 
 @dataclass(frozen=True)
 class RateCurve:
-    """The curve of one axis in one regime."""
+    """The curve of the bias of one axis in one regime."""
 
     bias_function: Annotated[TemperatureFunction, 'Fs(t) [rad/s]; Fs(0) = 0.']
-    delta: Annotated[float, 'Bias of this regime relative to bias_rad_s [rad/s].'] = 0.0
+    delta: Annotated[float, 'Bias of this regime less bias_rad_s [rad/s].'] = 0.0
 
     def __post_init__(self) -> None:
         check_reference('bias_function', self.bias_function, 0.0)
@@ -37,7 +37,7 @@ class RateCurve:
 
 @dataclass(frozen=True)
 class RateSet:
-    """The curves of one regime."""
+    """The curves of the three axes in one regime."""
 
     x: RateCurve
     y: RateCurve
@@ -52,7 +52,9 @@ class RateSet:
 class RateTerm(Column):
     """A column of the thermal response with its weights on the three axes."""
 
-    bias: Annotated[Vector, 'rad/s per unit of the column.'] = field(kw_only=True)
+    bias: Annotated[Vector, 'Weights on the bias, rad/s per unit of the column.'] = field(
+        kw_only=True
+    )
 
 
 @dataclass(frozen=True)
@@ -64,24 +66,24 @@ class Gyroscope:
     """
 
     bias_rad_s: Annotated[
-        tuple[_Rate, _Rate, _Rate], 'At the reference temperature, averaged over positions.'
+        tuple[_Rate, _Rate, _Rate], 'Bias at the reference temperature, averaged over positions.'
     ]
     static: RateSet
     dynamic: RateSet
     noise_density_rad_s_sqrt_hz: Annotated[
-        tuple[_Density, _Density, _Density], 'White noise of each axis.'
+        tuple[_Density, _Density, _Density], 'White noise density of each axis.'
     ]
     slow_noise_rad_s_sqrt_h: Annotated[
-        tuple[_Slow, _Slow, _Slow], 'Random walk, per root hour.'
+        tuple[_Slow, _Slow, _Slow], 'Random walk of the bias, per root hour.'
     ] = NIL
     residual_sd_rad_s: Annotated[
         tuple[_Deviation, _Deviation, _Deviation],
-        'Sd of the residual, a slow error: turn-on bias.',
+        'Sd of the residual, a slowly varying error: turn-on bias.',
     ] = NIL
     response: Annotated[
         tuple[RateTerm, ...], QUANTITIES['columns'], 'The thermal response, common to both sets.'
     ] = ()
-    posterior: Annotated[Posterior | None, 'Covariance of all parameters; null: unknown.'] = None
+    posterior: Annotated[Posterior | None, 'Covariance of all parameters; null if unknown.'] = None
 
     def __post_init__(self) -> None:
         if self.posterior is not None:

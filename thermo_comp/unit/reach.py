@@ -3,9 +3,9 @@
 """
 Owns the limits of a calibration's bias and scale over its temperatures, relative to full scale.
 
-A bias is within the converter's range, so level and curve stay within twice the full scale. The
-largest value of a column, and the uncertainty, stay within a million times the limit of a bias:
-far beyond any instrument, and without overflow.
+A bias is within the converter's range, so the sum of level and curve is at most twice the full
+scale. The largest value of a column, and the uncertainty, stay within a million times the limit of
+a bias: far beyond any instrument, and without overflow.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from .posterior import ParameterLayout
 if TYPE_CHECKING:
     from .calibration import Calibration
 
-#: Limits of a relative scale function, with every term at its largest.
+#: Limits of a relative scale function, also when every term has its largest value.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale: samples in an offset code have a bias of half their range.
 FULL_SCALES = 2.0
-#: Largest effect of a column or of a parameter's uncertainty / largest bias.
+#: Largest accepted effect of a column or of a parameter's uncertainty / largest bias.
 WORST = 1e6
-#: Number of temperatures at which a function is checked.
+#: Number of temperatures at which a function of temperature is checked.
 _GRID = 513
-#: Distance beyond its range in which a function is checked.
+#: Part of the error messages: the temperatures over which a function is checked.
 _AROUND = f'and along its tangents, {TANGENT_SPANS:g} of the range on each side'
 
 
@@ -149,7 +149,7 @@ def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[fl
 def _regressors(
     functions: Sequence[TemperatureFunction], edges: Sequence[Sequence[float]]
 ) -> list[float]:
-    """Return the largest derivatives of two functions by their levels and free coefficients."""
+    """Return the largest derivatives of two functions by level and free coefficients of each."""
     pairs = zip(functions, edges, strict=True)
     both = [function.basis(np.array(ends)) for function, ends in pairs]
     return [size for basis in both for size in (1.0, *(float(np.abs(v).max()) for v in basis))]

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the step from plain values to dataclasses and back: type hints are the schema of a file.
+Owns the conversion of plain values to dataclasses and back: type hints are a file's schema.
 
 Hints are float, int, bool, str, Literal, tuple, dataclass, any of them or None, and
 ``Annotated[hint, Bounds(...), 'what it means']``. The only conversions are integer to float and
-list to tuple. Rules between keys belong to the dataclass: it raises a ValueError that starts with
-the key in backticks.
+list to tuple. Rules between keys belong to the dataclass, which raises a ValueError that starts
+with the key in backticks.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from ..quantities import Bounds
 
-#: Length at which a name or value is cut in messages; no key is longer.
+#: Length at which names and values are cut in error messages; every key is shorter.
 _LONGEST_NAME = 60
 _NAMED_FIRST = re.compile(r'`(?P<key>[\w.\[\]]+)` (?P<rest>.*)', re.DOTALL)
 _WORDS: dict[Any, str] = {str: 'text', int: 'integer', float: 'number', bool: 'true or false'}
@@ -36,7 +36,7 @@ class SchemaError(ValueError):
         super().__init__(f'{key}: {message}' if key else message)
 
 
-#: Three numbers, for x, y, z.
+#: Three numbers, for the axes x, y, z.
 Vector = tuple[float, float, float]
 
 
@@ -64,7 +64,7 @@ def plain(value: Any) -> Any:
     """Turn dataclasses and tuples into mappings and lists: the reverse of `build`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         items = {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        # `kind` selects the schema of the other keys, so it stands first.
+        # The key `kind` selects the schema of the other keys, so it is written first.
         return {'kind': items.pop('kind'), **items} if 'kind' in items else items
     return [plain(item) for item in value] if isinstance(value, tuple) else value
 
@@ -93,7 +93,7 @@ def _build(hint: Any, data: Any, key: str) -> Any:
 
 @lru_cache(maxsize=256)
 def fields_of(cls: type) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return the hints of a dataclass by key, and which keys must be given."""
+    """Return the type hints of a dataclass by key, and the keys that must be given."""
     hints = typing.get_type_hints(cls, include_extras=True)
     fields = dataclasses.fields(cls)
     required = tuple(
@@ -117,7 +117,7 @@ def _object(cls: type, data: Any, key: str) -> Any:
     if not isinstance(data, dict):
         _refuse(key, 'must be a mapping of keys', data)
     hints, required = fields_of(cls)
-    # A misspelt key is both unknown and missing; report the unknown name.
+    # A misspelt key is both an unknown and a missing key; the unknown key is reported.
     for name in data:
         if name not in hints:
             raise SchemaError(_joined(key, _shown_name(name)), 'unknown key')

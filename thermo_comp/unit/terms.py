@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function and its derivative; the bits of a result depend on its own x alone."""
+    """A function and its derivative; the bits of a result depend on one x alone."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -43,24 +43,25 @@ _CLASSES: Final[list[type[Term]]] = []
 
 
 class Term(ABC):
-    """A kind of regressor, for tracker, fit, correction, covariance, limits, file, certificate."""
+    """The base class of the kinds of regressors."""
 
-    kind: ClassVar[str]  # name in the file
-    formula: ClassVar[str]  # value, in the description of the file
+    kind: ClassVar[str]  # name of the kind in the calibration file
+    formula: ClassVar[str]  # formula of the value, for the description of the file
     #: Groups of columns that appear with this kind, each with its name in a certificate.
     groups: ClassVar[_Pairs] = ()
     form: ClassVar[Form] = LINE
-    #: Power of temperature in the value, not counting the factor t^power of a column.
+    #: Power of temperature in the value of a column, without the column's factor t^power.
     order: ClassVar[int] = 1
-    #: Keys of a column that hold the centre and the width of x; without a key they are 0 and 1.
+    #: Keys of a column that hold the centre and the width of x; without keys, centre 0 and width
+    #: 1.
     centre_key: ClassVar[str] = ''
     width_key: ClassVar[str] = ''
     #: Keys of a column that must be greater than 0.
     positive: ClassVar[_Names] = ()
-    #: Range of all values; None: the range that the bags show.
+    #: Range of all values of a column of the kind; None: the range of the values in the bags.
     bounds: ClassVar[tuple[float, float] | None] = None
     is_temperature: ClassVar[bool] = False
-    #: Whether the fit estimates a weight of the scale.
+    #: Whether the fit estimates weights for the scale as well as for the bias.
     has_scale: ClassVar[bool] = True
 
     def __init_subclass__(cls) -> None:
@@ -71,15 +72,15 @@ class Term(ABC):
         """Return the quantity of the thermal state that a column is computed from."""
 
     def centre(self, column: Column) -> float:
-        """Return the centre of x."""
+        """Return the centre of the normalised variable x of a column."""
         return float(getattr(column, self.centre_key, 0.0))
 
     def width(self, column: Column) -> float:
-        """Return the width of x."""
+        """Return the width of the normalised variable x of a column."""
         return float(getattr(column, self.width_key, 1.0))
 
     def largest(self, column: Column) -> float:
-        """Return the largest magnitude of u that is possible."""
+        """Return the largest possible magnitude of the value u of a column."""
         if self.bounds is not None:
             return max(map(abs, self.bounds))
         return (column.source.largest + abs(self.centre(column))) ** self.order
@@ -109,7 +110,7 @@ class Gradient(Term):
 
 
 class Rate(Term):
-    """Heat flow, from one thermometer."""
+    """Effect of a heat flow, estimated from one thermometer."""
 
     kind, formula = 'rate', 'dT_board/dt [K/s]'
     groups = (('rate', 'rate of the board'),)
@@ -120,13 +121,14 @@ class Rate(Term):
 
 
 class Board(Term):
-    """Parts that lag the board."""
+    """Effect of parts that lag the board."""
 
     kind, formula = 'board', 'T - lagged T'
     positive: ClassVar[_Names] = ('tau_s',)
     groups: ClassVar[_Pairs] = (
         ('board', 'parts that lag the board'),
-        # A sum of the curve and of columns of `board`, `product` and `square`, for each axis.
+        # A curve of group `part` is a sum of the curve over the board temperature and of columns
+        # of `board`, `product` and `square`, for each axis.
         ('part', 'curve of the part of each axis'),
     )
 
@@ -136,12 +138,13 @@ class Board(Term):
 
 
 class GradientLag(Term):
-    """Parts between the thermometers."""
+    """Effect of parts between the thermometers."""
 
     kind, formula, positive = 'gradient_lag', 'lagged g_s', ('tau_s',)
     groups = (
         ('gradient_lag', 'parts between case and board'),
-        # Coefficients of the kinds from `gradient` to this one that change with temperature.
+        # The columns of group `gradient_x_temperature` give coefficients that change with
+        # temperature.
         ('product', 'lags, changing with temperature'),
         ('gradient_x_temperature', 'heat flow, changing with temperature'),
     )
@@ -152,7 +155,7 @@ class GradientLag(Term):
 
 
 class Square(Term):
-    """Curves of parts that lag the board; without a lag losses of a heat flow."""
+    """Curves of parts that lag the board; without a lag, losses of a heat flow."""
 
     kind, formula = 'square', '(T - lagged T)^2, or q_s^2 without lag'
     groups = (('square', 'curves of parts that lag'),)
@@ -171,14 +174,14 @@ class Cube(Board):
 
 
 class Size(Gradient):
-    """Heat load, as of a heat pump."""
+    """Effect of a heat load, as of a heat pump."""
 
     kind, formula, groups = 'size', 'abs(q_s)', ()
     form, centre_key = Form(np.abs, np.sign), 'rest_k'
 
 
 class GradientEven(Gradient):
-    """Heat load that saturates."""
+    """Effect of a heat load that saturates."""
 
     kind, formula = 'gradient_even', 'tanh((q_s / width)^2)'
     groups = (
@@ -205,7 +208,7 @@ class Play(Term):
 
 
 class Bend(Board):
-    """A slope that changes at one temperature of a part."""
+    """A curve whose slope changes at one temperature of a part."""
 
     kind, formula, positive = 'bend', 'max(t - knee_k, 0), of t lagged', ()
     groups = (('bend', 'change of slope'),)
