@@ -41,6 +41,16 @@ def test_jump_along_gravity(rng, with_gyro):
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 
 
+@pytest.mark.parametrize('rate_hz', [0.5, 2.0, 5.0])
+def test_jump_in_a_slow_log(rng, rate_hz):
+    # WHY: the gap between the rests beside a jump is some 200 samples long, 80 s at 2 Hz.
+    rest = Rest(rng, duration_s=8000.0 / rate_hz, rate_hz=rate_hz, pace_s=4000.0)
+    rest.add((0.0, 0.0, 20.0 * MG), from_s=4000.0 / rate_hz)
+    source = rest.source()
+    (event,) = find_jumps(reduce_source(source, window_s=60.0, min_rest_s=5.0, full_scale=None))
+    assert event.time == pytest.approx(4000.0 / rate_hz, abs=1.5 / rate_hz)
+
+
 def turned(rest, from_s, angle, with_rate):
     rows = rest.time >= from_s
     c, s = np.cos(angle), np.sin(angle)

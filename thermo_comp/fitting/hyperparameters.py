@@ -34,7 +34,7 @@ STUDENT_NU = 4.0
 #: a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
 LEAST_GAIN = 1.0
 #: Largest prior sd of an element of the misalignment [rad]: 2 degrees, as of three single sensors
-#: on a printed bracket. Larger misalignments would explain the norms of six faces, to second order.
+#: on a printed bracket. Larger misalignments explain the norms of six faces, to second order.
 LARGEST_MISALIGNMENT_SD = 0.03
 
 

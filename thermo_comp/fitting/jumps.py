@@ -28,8 +28,11 @@ from ..typing import Floats, Ints
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest duration of the readings on either side of a gap that give the level [s].
-_MARGIN_S = 10.0
+# Shortest duration of the readings on either side of a gap that give the level: seconds, samples.
+_MARGIN_S, _MARGIN_SAMPLES = 10.0, 120
+# Longest gap between two rests that are compared: seconds, samples. A slow log has long gaps, as
+# a rest is found to some twenty samples.
+_GAP_S, _GAP_SAMPLES = 30.0, 250
 # Smallest number of samples on either side of a step that is tested.
 _FEWEST_SAMPLES = 8
 # Smallest significant step, in units of its sd; the search over the place of a step reaches about
@@ -62,9 +65,12 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     """
     Find the jumps between a bag's rests; the bag is read again if there are close rests.
 
-    Two rests are compared if the gap between them is at most 30 s and their directions differ by
-    less than 10 degrees.
+    Two rests are compared if the gap between them is at most 30 s, or 250 samples, and their
+    directions differ by less than 10 degrees.
     """
+    cycle_s = bag.cycle_s if np.isfinite(bag.cycle_s) else 0.0
+    longest_ns = 1e9 * max(_GAP_S, _GAP_SAMPLES * cycle_s)
+    margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
     means = [
         np.average(interval.mean, axis=0, weights=interval.count) for interval in bag.intervals
     ]
@@ -72,13 +78,13 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     gaps = [
         ((before.end_ns - bag.start_ns) * 1e-9, (after.start_ns - bag.start_ns) * 1e-9)
         for (before, up), (after, other) in pairwise(zip(bag.intervals, ups, strict=True))
-        if after.start_ns - before.end_ns <= 30e9 and up @ other > np.cos(np.radians(10.0))
+        if after.start_ns - before.end_ns <= longest_ns and up @ other > np.cos(np.radians(10.0))
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
-    near = _near(bag, gaps, [_MARGIN_S] * len(gaps))
+    near = _near(bag, gaps, [margin_s] * len(gaps))
     # If the noise is correlated, the level beside a gap is a mean over a longer time.
     margins = [_margin(part, quiet_sd) for part in near]
-    slow = [place for place, margin in enumerate(margins) if margin > _MARGIN_S]
+    slow = [place for place, margin in enumerate(margins) if margin > margin_s]
     wider = _near(bag, [gaps[place] for place in slow], [margins[place] for place in slow])
     for place, part in zip(slow, wider, strict=True):
         near[place] = part
