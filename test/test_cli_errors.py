@@ -139,7 +139,7 @@ class TestBags:
         self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--topic board=')
         refused(cli, 1, r'temperature/board', 'evaluate', path, '-c', unit)
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.8')
-        assert 'no temperature was recorded' in cli('fit', path, *arguments).stdout
+        assert 'no change of temperature was read' in cli('fit', path, *arguments).stdout
 
     def test_another_unit_s_bag(self, cli, unit, tmp_path):
         path = bag(tmp_path / 'bag', serial='T-2')

@@ -161,6 +161,21 @@ def test_six_faces_claim_the_cross_axis_sensitivity_of_a_mems(rng):
     assert 0.5 < np.sqrt(np.mean(ratio**2)) < 2.0
 
 
+def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
+    source = turned(rng, positions(12, 3))
+    findings = {finding.name: finding for finding in fit([source], OPTIONS).findings}
+    assert 'dropped' not in findings
+    (block,) = source.blocks()
+    stamps = block.accel_stamp_ns
+    # The clock is set back by a quarter of the recording after a half of the recording.
+    n = len(stamps)
+    stamps[n // 2 :] -= stamps[n // 4] - stamps[0]
+    blocks = (replace(block, accel_stamp_ns=stamps),)
+    back = fit([replace(source, blocks=lambda: iter(blocks))], OPTIONS)
+    message = next(finding.message for finding in back.findings if finding.name == 'dropped')
+    assert message.startswith('25 % of the samples')
+
+
 def test_short_rests_have_windows_enough_to_learn_the_noise_from(rng):
     # WHY: one window per rest is fitted exactly by its attitude, and the estimated noise was 0.
     calibration = fit([turned(rng, positions(12, 3), rest_s=5.0)], OPTIONS).calibration

@@ -95,6 +95,13 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             f'{100.0 * part:.2f} % of the samples are at the full scale: an axis sees more than '
             'it can measure, or --full-scale is wrong',
         )
+    part = sum(bag.n_dropped for bag in bags) / max(sum(bag.n_samples for bag in bags), 1)
+    if part > 0.01:
+        yield _advice(
+            'dropped',
+            f'{100.0 * part:.0f} % of the samples are not finite, or have a stamp that does not '
+            'rise, and are left out: was a clock set back?',
+        )
     still = sum(bag.n_still_cells for bag in bags) / max(sum(bag.n_cells for bag in bags), 1)
     if still < 0.5:
         yield _advice(
@@ -188,7 +195,7 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
     """Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest."""
     yield _judge_positions(up)
     if not windows.has_temperature:
-        text = 'no temperature was recorded: the calibration holds at the temperature of the test'
+        text = 'no change of temperature was read: the calibration holds at the temperature of the test'
         yield _advice('temperature', text)
         return
     used_bags = {id(bag): bag for bag, _ in windows.rests}.values()

@@ -26,6 +26,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..typing import Bools, Floats, Ints
 from .gains import log_bayes_factors
 from .regression import Posterior, Regression
+from .start import white_noise_of
 from .unknowns import Noise, Prior, State
 
 #: Degrees of freedom of the half-Student prior of the mounting's standard deviation; 4 as in [2]_.
@@ -177,7 +178,12 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
     # At least 1e-8 m/s^2, below any sensor's noise: the estimate for constant samples is 0.
-    return np.asarray(np.maximum(sigma, 1e-8))
+    least = np.full(3, 1e-8)
+    if not regression.windows.has_drifts:
+        # Without columns that change the slow noise describes the whole drift of a position, and
+        # the white noise would be estimated as zero. Second differences do not contain a drift.
+        least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
+    return np.asarray(np.maximum(sigma, least))
 
 
 def with_slow_noise(
