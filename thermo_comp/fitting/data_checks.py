@@ -195,7 +195,10 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
     """Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest."""
     yield _judge_positions(up)
     if not windows.has_temperature:
-        text = 'no change of temperature was read: the calibration holds at the temperature of the test'
+        text = (
+            'no change of temperature was read: the calibration holds at the temperature of the '
+            'test'
+        )
         yield _advice('temperature', text)
         return
     used_bags = {id(bag): bag for bag, _ in windows.rests}.values()
