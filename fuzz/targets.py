@@ -79,7 +79,7 @@ def check_calibration(data: bytes) -> None:
         return
     assert parse_calibration(dump_calibration(value).encode()) == value
     row = Compensator(value).process(START_NS, 1.0, 2.0, 3.0)
-    # There is no temperature yet; a correction by constants needs none.
+    # No temperature has been given; only a correction by constants needs no temperature.
     assert row is None or not value.needs_temperature
 
 

@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> None:
     hold_standard_streams()
     # With several BLAS threads small matrices take up to 16 times longer on busy cores.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that clean-up code runs
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM runs clean-up code
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -91,7 +91,7 @@ def run(arguments: list[str]) -> int:
     except _UsageMistake as mistake:
         context = getattr(mistake, 'ctx', None)
         command = 'thermo_comp' if context is None else context.command_path
-        if message := mistake.format_message():  # empty if typer has printed the help
+        if message := mistake.format_message():  # no message: typer printed the help
             output.error(f'{_plain(message, arguments)} (see: {command} --help)')
         return int(mistake.exit_code)
     except typer.Abort:

@@ -142,8 +142,8 @@ def text(cell: Cell) -> str:
 
 
 def micro(value: float) -> str:
-    """Return a number of millionths as the tables show it."""
-    # Adding 0.0 turns -0.0 into 0.0.
+    """Return a number in ppm, micro-g or micro-rad as the tables show it."""
+    # Adding 0.0 turns a negative zero into 0.0.
     return f'{round(value, 1) + 0.0:.1f}' if abs(value) < 99.95 else f'{value:.0f}'
 
 

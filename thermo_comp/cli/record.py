@@ -203,7 +203,7 @@ def _tell(out: Output, account: 'Account', problems: Sequence[str], last: dict[s
     for number, position in enumerate(account.positions, 1):
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
-    # Ignore the reading after the semicolon, which always changes a little.
+    # Ignore the accelerometer reading after the semicolon, which changes with the noise.
     new = {name: text for name, text in news.items() if last.get(name) != text.partition(';')[0]}
     for name, text in new.items():
         last[name] = text.partition(';')[0]

@@ -188,7 +188,7 @@ def _write(
             ]
             start_ns = max(first) if len(first) == 2 else 0
         keep = run.accel_stamp_ns >= start_ns
-        # Temperatures first: at equal stamps a reading precedes the sample.
+        # Write temperatures first: at equal stamps a temperature precedes the sample.
         writer.write_temperature(topics.board, run.board_stamp_ns, run.board)
         writer.write_temperature(topics.case, run.case_stamp_ns, run.case)
         stamp_ns, counts = run.accel_stamp_ns[keep], run.counts[keep]

@@ -104,7 +104,7 @@ def read_autopilot(
 
 
 def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
-    """Drop the samples logged while the parameter was 1; RecordingError if none is left."""
+    """Drop samples that the autopilot has corrected; RecordingError if none is left."""
     name, since_ns, values, advice = correction
     at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0

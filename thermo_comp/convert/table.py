@@ -54,7 +54,7 @@ _Rows = Iterator[tuple[int, list[str]]]  # line number and cells of each row
 
 @dataclass(frozen=True)
 class Format:
-    """Layout of a table of text; what is None is detected."""
+    """Layout of a table of text; an attribute that is None is detected."""
 
     delimiter: Literal[',', ';', '|', 'tab', 'blank'] | None = None
     header: bool | None = None
@@ -122,8 +122,9 @@ def read_text(
 def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
     Return the delimiter of a text table and the number of cells per row: the delimiter that splits
-    most lines into one number of cells (a blank is any run of white space). The last lines of
-    `head` decide, because a logger's preamble may come first; the very last line may be cut.
+    most lines into the same number of cells (a blank is any run of white space). Only the last
+    lines of `head` count, because a logger's preamble may come first; the very last line may be
+    cut.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = lines[:-1] if len(lines) > 2 else lines

@@ -104,7 +104,7 @@ def unused_thermometers(reader: RecordingReader) -> list[str]:
     paths = {role: field.path for role, field in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}
     for name, (kind, count) in sorted(reader.info.topics.items()):
-        # A message of one bare number needs no name of a field.
+        # A message that holds a single number needs no field name.
         if not count or not used.isdisjoint({(name, None), (name, PLAIN.get(kind))}):
             continue
         if kind == TEMPERATURE or (kind in PLAIN and 'temp' in name.lower()):

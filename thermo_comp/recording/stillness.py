@@ -33,14 +33,14 @@ _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # In a rotation the rate is compared with its median over this time [s].
 _ROTATION_S = 10.0
-# Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
+# Size of a step that ends a rest, in robust sd of all steps; noise alone does not reach it.
 _STEP_SDS = 8.0
 # Number of steps whose median is the drift, and the largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
 # Samples searched for a quantum, and smallest number of different steps that prove it.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # possible lengths of a cell of slow samples, in windows
-_LONGEST_CELL_NS = 86400e9  # a longer cell comes from wrong stamps
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that a cell of slow samples may last
+_LONGEST_CELL_NS = 86400e9  # a longer cell is due to wrong stamps [ns]
 MIN_SAMPLES = 30  # smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: the square of a larger one may overflow
 _WORD = 32768.0  # the middle of unsigned 16-bit words
@@ -99,10 +99,11 @@ class CellAccumulator:
         self._asked_cell_s, self._window_s, self._full_scale = cell_s, window_s, full_scale
         self._cell_ns = self._start_ns = 0
         self._last_ns: int | None = None
-        self._last = np.zeros((0, 3))  # the sample before
+        self._last = np.zeros((0, 3))  # last sample of the previous block
         self._shift = np.zeros(3)
         # Row of a cell: its number, number of samples, and sums of times, samples and their
-        # squares; change from the cell before; sum of squared changes. The last cell is open.
+        # squares; change from the cell before; sum of squared changes. The last cell may get
+        # further samples.
         self._sums: list[Floats] = [np.empty((0, 15))]
         self._n_dropped = self._n_saturated = self._n_looked_at = 0
         self._is_integer, self._is_negative = True, False
@@ -145,9 +146,9 @@ class CellAccumulator:
         self._sums = [self._sums[0][n:]]
 
     def finish(self) -> Cells:
-        """Return all cells so far, including the open one."""
+        """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # the next call then joins only new sums
+        self._sums = [sums]  # so that the next call joins new sums only
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)

@@ -24,8 +24,8 @@ from .blocks import Input, Role
 PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {key: topic.type for key, topic in INPUTS.items()}
-#: Name of a driver's topic in REP 145 and of the node's output; the bag's other topics show which
-#: of both.
+#: Name of a driver's topic in REP 145 and of the node's output; the bag's other topics show
+#: whether driver or node has published it.
 _RAW = IMU_OUT.name
 #: Words in the names of vector topics that are not a specific force.
 _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
@@ -84,8 +84,8 @@ class Topics:
     """
     Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
     A name matches with or without its leading slash and, if only one topic fits, with any
-    namespace. Without a usual name imu/data_raw is used, or else the bag's only topic of the
-    type, preferably an Imu. Further thermometers are named, or found as ``temperature/<name>``
+    namespace. If no topic has a usual name, imu/data_raw is used, or else the bag's only topic of
+    the type, preferably an Imu. Further thermometers are named, or found as ``temperature/<name>``
     in the board's namespace. A thermometer may be a field of any message, ``TOPIC:FIELD``, as for
     ``ros2 topic echo --field``.
     """

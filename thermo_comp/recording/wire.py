@@ -52,9 +52,9 @@ def decode_blocks(
     messages: Messages, feeds: Collection[Feed], roles: Iterable[Role], *, keep_raw: bool = False
 ) -> list[Block]:
     """
-    Decode messages in their order; a block ends where the frame changes. `roles` are those of the
-    whole bag. The reading of a field is kept as a Temperature. Raises RecordingError, without a
-    path, if the bytes of a message do not fit its type.
+    Decode messages in their order; a block ends where the frame changes. `roles` lists the inputs
+    found in the whole bag. The reading of a field is kept as a Temperature. Raises RecordingError,
+    without a path, if the bytes of a message do not fit its type.
     """
     roles = tuple(dict.fromkeys((*ROLES, *roles)))
     topics = {feed.role: feed.topic for feed in feeds}
@@ -191,7 +191,7 @@ def as_cdr(messages: Messages, kind: str) -> Messages:
     convert = typestore().ros1_to_cdr
     try:
         pieces = [bytes(convert(message, kind)) for message in messages]
-    except Exception as error:  # damaged bytes surface there as nearly any exception type
+    except Exception as error:  # rosbags raises nearly any exception on damaged bytes
         raise _misfit(kind) from error
     return Messages.of(pieces, messages.channel, messages.log_ns)
 

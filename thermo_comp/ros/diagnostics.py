@@ -30,10 +30,10 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-IDLE_S = 5.0  # time without samples after which readings take effect without them [s]
+IDLE_S = 5.0  # after this silence of the samples readings are applied [s]
 #: Lead of the readings' stamps over the samples' [s] above which the clocks differ.
 AHEAD_S = 5.0
-#: Samples have stopped when the next sample is late by both limits: cycles, and [s].
+#: Delay of the next sample, in cycles and in s, beyond both of which the samples have stopped.
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Largest error of |f| at rest, in its standard deviations.
 GRAVITY_SIGMAS = 5.0

@@ -150,7 +150,7 @@ class CompensationNode:
             if new:
                 self._say_calibration()
             self._loop.call_soon(partial(self._relay.release, before.samples))
-            # Up to this line a failure changes nothing.
+            # A failure before this line restores the previous calibration.
             return result  # noqa: TRY300
         except BaseException:
             self._run_with(before)

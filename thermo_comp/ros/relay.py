@@ -79,7 +79,7 @@ class Relay:
             for flag, pack in FLAGS.items()
         ]
         self.rests = RestKeeper(config.rest_log) if config.rest_log else None
-        #: Samples that the rest log has not summed yet; None without one.
+        #: Samples that the rest log has not summed yet; None without a rest log.
         self.waiting: list[bytes] | None = [] if self.rests else None
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None

@@ -160,9 +160,7 @@ class RestKeeper:
         if not len(stamps):
             return
         if stamps[-1] < self._last_ns - _JUMP_NS:
-            self._last_ns = (
-                0  # a new recording, in which only its own samples out of order are left out
-            )
+            self._last_ns = 0  # a new recording begins, with earlier stamps
         if stamps[0] <= self._last_ns or (np.diff(stamps) <= 0).any():
             before = np.maximum.accumulate(np.concatenate(([self._last_ns], stamps[:-1])))
             samples, stamps = samples[stamps > before], stamps[stamps > before]

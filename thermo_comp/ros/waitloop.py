@@ -145,7 +145,7 @@ class RawSubscription:
         self.interval_ns = (self._newest_ns - before_ns) // len(messages)
         before, self._sequence = self._sequence, numbers[-1]
         if before is not None and self._sequence is not None:
-            # max: the numbers of another publisher can be smaller.
+            # Another publisher can have a smaller sequence number.
             self.n_lost += max(0, self._sequence - before - len(messages))
         return messages, received_ns, numbers
 
