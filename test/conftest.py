@@ -40,7 +40,7 @@ os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WO
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.pop('ROS_STATIC_PEERS', None)
 
-# A shell starts background processes with SIGINT ignored, which their children inherit.
+# A shell starts background processes with SIGINT ignored, and their children inherit this.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -48,7 +48,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # No deadline, as the duration of an example depends on the machine.
 settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
-# For `make nightly`; tests with a stated number of examples are unchanged.
+# For `make nightly`; a test that states its number of examples keeps it.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 

@@ -70,7 +70,7 @@ class Desk:
         elif name == 'unit.yaml':
             shutil.copy(self._make('unit42.yaml'), path)
         elif name in ('unit01.yaml', 'unit02.yaml', 'unit03.yaml'):
-            # The paper's model is small: the population of three responses takes ten seconds.
+            # The paper's model is small; a prior from three larger models would take ten seconds.
             bags = sorted(self._make('bags/unit42').iterdir())
             given = ('--gravity', '9.8154', '--model', 'golovach', '--serial', path.stem)
             self._cli('fit', *bags, *given, '-o', path, '-q')
@@ -78,7 +78,7 @@ class Desk:
             to = ('--to', _EXPORTS[name])
             self._cli('export', self._make('unit42.yaml'), *to, '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
-            # A short bag, as some examples play it in real time.
+            # The bag is short, because some examples play it in real time.
             self._cli('simulate', '--profile', '20 1s', '-o', path, '-q')
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
@@ -163,7 +163,7 @@ class Desk:
             arguments += sorted(str(path.relative_to(here)) for path in paths) or [word]
         if arguments[0] == 'play':
             pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-            # There is no subscriber to wait for.
+            # No node subscribes in this test, so do not wait for subscribers.
             arguments[1:1] = ['--wait', '0.5']
         if arguments[:2] == ['record', '--positions']:
             return self._interrupted(arguments, here)

@@ -4,7 +4,7 @@
 Owns the fault bench: it sends messages over DDS to the real node process and collects the output.
 
 Messages are sent at full speed in lots of some hundred; after each lot the bench waits until the
-node's diagnostics account for every sample. Because the bench waits, no message is lost by
+node's diagnostics account for every sample. Because of these waits, no message is lost by
 accident, a fault shows in at least one report, and the result does not depend on the machine.
 """
 
@@ -32,8 +32,8 @@ from thermo_comp.ros.waitloop import WaitLoop
 
 #: Longest wait for any event [s]; reached only if the bench is broken.
 TIMEOUT_S = 60.0
-#: A lot covers this part of the bag [s], with at most this number of messages: the shared memory
-#: of Fast DDS holds 512, and further messages are repeated seconds later, out of order.
+#: Length of bag [s] and largest number of messages in one lot: the shared memory of Fast DDS holds
+#: 512, and further messages are repeated seconds later, out of order.
 LOT_S, LOT_SIZE = 10.0, 400
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 FRAME = b'sensor\0'
@@ -78,7 +78,7 @@ class Bench:
     def __init__(self, node, context):
         self.process = node
         self.node = rclpy.create_node('fault_bench', context=context)
-        # The wait loop does not serve clients.
+        # The wait loop of the package does not serve service clients.
         self._operator = Peer()
         self._client = self._operator.node.create_client(
             SetParameters, 'thermo_comp/set_parameters'
@@ -155,7 +155,8 @@ class Bench:
     def set_parameters(self, **values):
         future = self.ask(**values)
         pause = threading.Event()
-        # A callback of the future would wait for the executor, which waits for the next answer.
+        # Poll the future: its callback would wait for the executor, which waits for the next
+        # answer.
         while not future.done():
             pause.wait(0.001)
             assert self.process.is_alive, self.process.said

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns rests of a unit with any calibration, for tests: what its node would have logged."""
+"""Owns rests of a unit with any calibration, for tests, as its node would have logged them."""
 
 import numpy as np
 

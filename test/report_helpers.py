@@ -42,7 +42,7 @@ def fitted():
         number = position + 1
         keys = {'sha256': f'{number:064x}', 'serial': 'thermostatted-0001'}
         sources.append(source_of(*arrays_of(record), name=f'{number:02d}.mcap', **keys))
-    # Without products the bank of columns is a third as large.
+    # Without the group `product` the bank of columns is a third as large.
     groups = ('curve', 'set', 'gradient', 'board')
     return fitting.fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))
 

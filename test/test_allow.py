@@ -14,7 +14,7 @@ from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.options import REFUSALS
 from thermo_comp.simulation.campaign import positions
 
-# The model does not matter here; golovach is the fastest to fit.
+# Refusals do not depend on the model; golovach is the fastest to fit.
 COUNTS = FitOptions(gravity=GRAVITY, model='golovach')
 FORCE = replace(COUNTS, input='m/s^2')
 
@@ -56,7 +56,7 @@ def swapped(source, rest):
         ('units', as_it_is, COUNTS, 1),
         ('jump', jumped, FORCE, 1),
         ('jump', jumped, FORCE, 7),
-        # Ten minutes are too short to determine which thermometer leads.
+        # Bags of ten minutes do not determine which thermometer leads.
         ('swapped', as_it_is, FORCE, 7),
         ('compensated', compensated, FORCE, 12),
     ],

@@ -29,7 +29,7 @@ from thermo_comp.unit.provenance import GroupEvidence
 REPOSITORY = Path(__file__).parents[1]
 # A bias must be within twice the full scale of 32767.
 number = st.floats(-6.5e4, 6.5e4)
-# With these coefficients the fourth power of 15 K is far from making a scale function 0.
+# A scale function with coefficients up to 1e-6 stays far from 0 over 15 K.
 small = st.floats(-1e-6, 1e-6)
 RICH = rich_calibration()
 

@@ -105,7 +105,7 @@ def on_a_terminal(*arguments, no_color=False):
     while True:
         try:
             part = os.read(leader, 65536)
-        except OSError:  # the process has ended and closed the other end
+        except OSError:  # the command has ended and closed its terminal
             break
         if not part:
             break

@@ -67,13 +67,12 @@ def test_round_trip_through_the_bag(tmp_path):
     np.testing.assert_allclose(
         np.degrees(block.imu.angular_velocity),
         np.column_stack([columns[k] for k in ['wx', 'wy', 'wz']]),
-        rtol=1e-14,  # one rounding in each direction
+        rtol=1e-14,  # deg/s to rad/s and back round once each
     )
-    # The missing orientation is marked; the rate has an unknown covariance.
+    # The Imu marks the missing orientation by -1, and the unknown covariance of the rate by 0.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
     assert not block.imu.angular_velocity_covariance.any()
-    # A held value is one message: 4 levels of the case, 10 of the board, at the time of each
-    # change.
+    # A temperature becomes a message when it changes: 4 levels of the case, 10 of the board.
     case, board = block.temperatures['case'], block.temperatures['board']
     assert case.celsius.tolist() == [20.0, 20.5, 21.0, 21.5]
     assert case.stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
@@ -191,7 +190,7 @@ def test_every_odd_row_is_accounted_for(tmp_path):
     assert (report.findings['backwards'].count, report.findings['backwards'].lines) == (1, (43,))
     assert (report.findings['repeated'].count, report.findings['repeated'].lines) == (1, (52,))
     assert len(block) == report.messages['accel'] == 397
-    # The clipped row and the wrong order stay in the bag for the node to judge.
+    # A clipped row and rows in wrong order stay in the bag, because the node rejects them.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
     # The log time keeps the order of the file where stamps do not.
@@ -230,7 +229,7 @@ def test_temperature_units(tmp_path, unit, celsius):
     board = {'column': 'board', 'unit': unit, **raw}
     write_log(table_log(path, column_map(board=board)), tmp_path / 'bag')
     first = float(read_recording(tmp_path / 'bag').columns.temperatures['board'].celsius[0])
-    # 300 K, the boiling point of water, 160 steps of 1/16 K above 20 degC.
+    # Expected: 300 K, 212 degF (boiling water), and 160 steps of 1/16 K above 20 degC.
     assert first == pytest.approx({'K': 26.85, 'degF': 100.0, 'raw': 30.0, 'degC': 30.0}[unit])
 
 

@@ -88,7 +88,7 @@ def test_new_instances(tmp_path, rng, imu, baro):
         bag.accel_stamp_ns, (2_000_000 + np.arange(N) * STEP_US + imu) * 1000
     )
     np.testing.assert_array_equal(bag.accel, force[imu])
-    # The tolerance is the rounding of 0.3 to float32.
+    # The log stores the rate 0.3 as float32, which rounds it by up to 1e-7.
     np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
     # The chip's temperature is constant for ten samples; only its changes are messages.
     np.testing.assert_array_equal(
@@ -149,8 +149,8 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
     [
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log of ArduPilot's learning was refused, because ArduPilot sets 1 after the
-        # learning.
+        # WHY: a log of ArduPilot's temperature learning was refused, because its parameter ends at
+        # 1.
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )

@@ -35,10 +35,10 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
     [
         ('2026-03-29T01:30:00Z', 0),
         ('2026-03-29T01:30:00.123456789Z', 0.123456789),
-        ('2026-03-29 01:30:00', 0),  # without a zone: UTC
+        ('2026-03-29 01:30:00', 0),  # UTC if no zone is given
         ('2026-03-29T03:30:00.5+02:00', 0.5),
-        ('2026-03-29T03:30:00+0200', 0),  # GGIR
-        ('2026-03-29 03:30:00.250+0200 [Europe/Paris]', 0.25),  # actipy
+        ('2026-03-29T03:30:00+0200', 0),  # format of GGIR
+        ('2026-03-29 03:30:00.250+0200 [Europe/Paris]', 0.25),  # format of actipy
         ('2026-03-28 20:00:00-05:30', 0),
         ('2026-03-29 01:30', 0),
     ],
@@ -104,7 +104,7 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
 
 @pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])
 def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
-    # WHY: Parquet once needed a column map, although it contains more information than text.
+    # WHY: a Parquet table needed a column map, although its headings name the columns.
     pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
     import pyarrow.parquet as pq
 
@@ -352,7 +352,7 @@ def test_a_guessed_map_is_printed_once(tmp_path, rng, cli):
 def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
     rest = Rest(rng, level=(0.0, 0.0, one_g), sd=0.002 * one_g)
     rest.accel[:] = np.rint(rest.accel)
-    rest.accel[100] = 2.0**bits - 1.0  # a valid one
+    rest.accel[100] = 2.0**bits - 1.0  # largest valid word
     bag = reduce_source(rest.source(), full_scale=32767.0)
     assert (bag.n_saturated, len(bag.intervals)) == (1, 1)
 
@@ -393,7 +393,8 @@ def test_the_unit_of_times_is_that_of_a_sample_rate(tmp_path, rng, step, unit, r
 
 
 def test_a_second_is_told_from_a_millisecond_by_how_fast_a_hand_turns(tmp_path, rng):
-    # WHY: samples at 1 Hz were taken for 1 kHz. Half a turn takes 1 s or 0.8 s.
+    # WHY: samples at 1 Hz were taken for 1 kHz. The two tables turn by half a turn in 1 s and in
+    # 0.8 s.
     angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
     ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
     for turned, unit in ((angle, 's'), (ramp, 'ms')):

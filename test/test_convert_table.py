@@ -67,7 +67,7 @@ def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path, separator):
 
 
 def test_a_column_may_begin_late(tmp_path):
-    # WHY: a thermometer that reports later than the accelerometer is the last column.
+    # WHY: a table was not read if its last column, a thermometer, begins some rows late.
     rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
     path = write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows]))
     table = read_text(path, ['t', 'celsius'], ROWS_ALONE)

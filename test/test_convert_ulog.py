@@ -90,11 +90,12 @@ def test_log_arrives_in_the_bag(flight, tmp_path, imu):
     recording = read_recording(tmp_path / 'bag.mcap')
     bag = recording.columns
     assert report.messages['accel'] == N
-    # The time of the sample is used, not that of its publication, separately for each IMU.
+    # The stamp is the time of the sample, not of its publication, separately for each IMU.
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # The chip's temperature changes with every sample; the barometer is the slower thermometer.
+    # The board temperature is the chip's, at every sample; the case temperature is the
+    # barometer's.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
@@ -104,7 +105,7 @@ def test_gyro_of_the_same_instance_travels_along(flight, tmp_path):
     path, _ = flight
     write_log(read_autopilot(path, imu=0), tmp_path / 'bag.mcap')
     rate = read_recording(tmp_path / 'bag.mcap').columns.imu.angular_velocity
-    # Both sensors have the same stamps here; values are rounded to float32.
+    # Gyroscope and accelerometer have the same stamps here; the log rounds values to float32.
     np.testing.assert_allclose(rate[:, 0], 0.001 * np.arange(N), atol=1e-6)
     assert read_autopilot(path, imu=1).gyro is None
 

@@ -90,7 +90,7 @@ def test_the_next_direction_lowers_the_mean_variance(n, rng):
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
     others = [before - mean_variance(np.vstack([up, unit]), at) for unit in units(rng, 300)]
-    # An easily held face is chosen even with half the benefit of the best direction.
+    # A face, which is easy to hold, is chosen even with half the benefit of the best direction.
     assert gain > 0.45 * max(others)
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 

@@ -74,7 +74,7 @@ def test_a_conversion_on_a_full_disk_leaves_no_draft(small_disk, tmp_path, cli):
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
 def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
-    # About 700 KB of noise, which compresses to not less than half.
+    # The recording is 700 KB of noise, which compresses to more than the disk of 300 KB holds.
     n = 20000
     stamps = np.arange(n) * 10**8
     samples = np.random.default_rng(1).normal((0.0, 0.0, 2942.0), 3.0, (n, 3))
@@ -104,7 +104,7 @@ def test_a_folder_that_is_read_only(folder, cli, name):
         locked = folder / 'locked'
         locked.mkdir(mode=0o500)
     else:
-        locked = Path('/proc')  # not writable for root either
+        locked = Path('/proc')  # even root cannot write here
     before, _ = COMMANDS[name]
     finished = cli(*before, locked / name, code=1, cwd=folder)
     (line,) = finished.stderr.strip().splitlines()[-1:]
@@ -157,10 +157,10 @@ def test_a_killed_command_leaves_the_old_file(folder, name, point):
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert output.read_bytes() == old
     (rest,) = set(folder.iterdir()) - listed
-    # The file that remains has another name, which no tool takes for the output.
+    # The file that a killed command leaves has a hidden name, which no tool takes for an output.
     assert rest.name.startswith('.')
     if point == 'before':
-        # The hidden file was complete already.
+        # Killed just before the rename, the hidden file is complete.
         if name == 'unit.yaml':
             assert load_calibration(rest).unit.serial
         elif name == 'bag.mcap':

@@ -54,7 +54,7 @@ def jump_of(size, day):
 
 
 def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
-    # Every column and both sets, on a ramp; the second route is a difference of two evaluations.
+    # A ramp excites every column and both sets; the expected derivatives are finite differences.
     unit = rich_calibration()
     logged = rests(unit, any_way, no_error, days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
@@ -63,12 +63,12 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Blocks have odd lengths, so that every kind of parameter comes on one axis at least.
+    # Every second parameter: blocks have odd lengths, so each kind is tested on some axis.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
         if k in levels:
-            continue  # checked below: both levels of a scale move together, as K does
+            continue  # tested below with K, which moves both levels
         if k in {block.static for block in layout.bias}:
             continue
         moved[k] += step
@@ -82,7 +82,7 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
         by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
         assert np.allclose(slope, by_level, atol=1e-4)
         both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
-        # A level of the scale is relative to K, and so are the other parameters, within a percent.
+        # A change of K equals a change of both scale levels, within a percent.
         assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
 
 
@@ -93,7 +93,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
     series = series_of(history.rests, unit)
     best = field_units.BestFilter(process)
     for k in range(len(series)):
-        # The filter takes the rests of the series, one by one.
+        # Give the Kalman filter the rests of the series, one by one.
         first = int(series.n_windows[:k].sum())
         windows = [r for _, r in history.rests[first : first + int(series.n_windows[k])]]
         mean = np.mean([window.mean for window in windows], axis=0) / field_units.K
@@ -115,8 +115,8 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # The series has six sums of each start at its mean time instead of all its rests: the
-        # error is below a fifth of the sd.
+        # The series combines the rests of a start into sums at one time, which costs less than a
+        # fifth of the sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
@@ -166,8 +166,7 @@ def test_axes_that_no_rest_shows_keep_their_bits():
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
-    # Upright rests give only the sum of bias and scale of z: 300 ug, to 15 ug with a turn-on of 20
-    # ug.
+    # Upright rests show a change of 300 ug in bias plus scale of z; turn-ons of 20 ug leave 15 ug.
     assert updated.moved[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
     old_sd, new_sd = (
@@ -230,8 +229,8 @@ def test_too_few_starts_are_refused():
 
 
 def test_the_first_passage_is_that_of_the_reflection_principle():
-    # The probability to be inside (-c, c) is the sum over k of
-    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = rate t.
+    # A random walk of rate r stays within (-c, c) up to t with the probability: sum over k of
+    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t.
     rate, bound = 4.0, 50.0
     for probability, days in zip((0.1, 0.5, 0.9), passage(0.0, 0.0, rate, bound), strict=True):
         s, k = np.sqrt(rate * days), np.arange(-40, 41)

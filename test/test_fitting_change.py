@@ -66,7 +66,7 @@ def test_what_a_change_does_is_found_about_rest(rng):
     kept = {column.group for column in about_rest.calibration.response}
     assert 'gradient_even_about_rest' in kept
     assert 'gradient_even' not in kept
-    # Means of a minute; columns even about 0 leave a part of the effect.
+    # In means of a minute, columns that are even about 0 leave a part of the effect.
     floor = NOISE / np.sqrt(30.0)
     assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor

@@ -52,7 +52,7 @@ def weight(record, closes):
     [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],
 )
 def test_evidence_says_when_the_regime_closes(closes, options):
-    # Readings come every four seconds, in which the case changes by 0.1 K.
+    # A reading every four seconds suffices: the case changes by at most 0.1 K in 4 s.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
     plan = [Position(PROGRAM, up) for up in FACES]
@@ -61,7 +61,7 @@ def test_evidence_says_when_the_regime_closes(closes, options):
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.closes == closes
-    # Sets of the fit start and end at slightly other times, as it estimates the sensor settings.
+    # The fit estimates the sensor settings, so its regimes switch at slightly other times.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
 

@@ -173,7 +173,7 @@ def test_what_the_fit_left_is_said():
     ('given', 'name', 'message'),
     [
         ((500.0, 400.0, 300.0, 500.0), 'misfit', 'temperature does not explain'),
-        # Temperatures an hour late by another clock.
+        # The temperatures are stamped an hour late, as by another clock.
         ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw error'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
         ((100.0, 1.0, 0.2, 1.5), 'units', 'expected near 1'),

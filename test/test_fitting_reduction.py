@@ -62,7 +62,7 @@ def test_chunks_do_not_matter(rng):
         other = reduced(split(whole, n_parts))
         for a, b in zip(at_once.intervals, other.intervals, strict=True):
             np.testing.assert_array_equal(a.count, b.count)
-            # The order of addition differs, and therefore the rounding of the sums.
+            # Blocks change the order in which samples are added, and so the rounding of the sums.
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
         np.testing.assert_array_equal(at_once.board.value, other.board.value)
@@ -70,7 +70,7 @@ def test_chunks_do_not_matter(rng):
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng, rest_s):
-    # WHY: at 1 Hz a cell was half a minute, and the mean over all attitudes was 0.07 m/s^2 long.
+    # WHY: at 1 Hz a cell took half a minute and averaged several attitudes to 0.07 m/s^2.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
@@ -80,7 +80,7 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
         size = np.linalg.norm(interval.mean, axis=1)
         # The noise is 5 ug per sample, in windows of ten samples and shorter ones at the end.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
-    # A long rest has cells of the same length as before.
+    # Without short rests the cells of slow samples stay half a minute long.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])
     assert reduced([alone], full_scale=None).window_s == 30.0
 
@@ -90,7 +90,7 @@ def test_windows_are_means_of_their_samples(rng):
     (interval,) = reduced([block(samples)]).intervals
     assert interval.count.sum() == len(samples)
     assert len(interval.time) == 6
-    # Half-second cells of 50 samples: a window is 20 cells.
+    # A window of 10 s is 20 cells of half a second, 50 samples each.
     np.testing.assert_allclose(interval.mean[2], samples[2000:3000].mean(axis=0), atol=1e-10)
     assert interval.time[2] == pytest.approx(24.995, abs=1e-9)
     np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)

@@ -85,7 +85,8 @@ class Dense:
             state.offset.ravel() / prior.offset_sd,
             state.tilt.ravel() / prior.tilt_sd,
             state.start.ravel() / np.sqrt(prior.start_share),
-            # The mean of the starts of all bags has a tenth of the sd of one start.
+            # The mean of the initial lag states of all bags has a tenth of the sd of one bag's
+            # state.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_share)),
         ]
         for weights, sd in zip(state.weights, prior.column_sd, strict=True):
@@ -106,7 +107,7 @@ class Dense:
 @pytest.fixture(scope='module', params=[1, 4], ids=['a position per bag', 'up to 4'])
 def solved(request):
     rng = np.random.default_rng(5)
-    # The table draws a start for each position, but those of one bag have a common start: 0.
+    # The table draws an initial state per position; positions of one bag share one state, here 0.
     truth = Truth(
         start_sd=0.5 if request.param == 1 else 0.0, noise=Noise(4.0, 2000.0),
         offset_sd=2.0 * MICRO, tilt_sd=5e-6,
@@ -155,8 +156,7 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # The bound on the mean of all starts, a tenth of the sd of a start, depends on the number of
-    # bags: allow for this difference.
+    # The prior of the mean initial lag state depends on the number of bags: allow for this.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
@@ -182,8 +182,8 @@ def test_truth_comes_out_without_noise(rng):
 
 def test_claimed_sd_is_the_scatter():
     # Under the true priors the inverse Hessian is the Cramer-Rao bound: errors over claimed sd
-    # have an RMS of 1. 36 units of 3 x 2 + 3 + 24 numbers, some of them correlated: the RMS of
-    # each kind is determined to 13 % or better.
+    # have an RMS of 1. 36 units with 33 partly correlated numbers each determine the RMS of each
+    # kind of error to 13 % or better.
     rng = np.random.default_rng(11)
     truth = Truth(noise=Noise(0.5, 1000.0), offset_sd=MICRO, start_sd=0.3)
     errors = []
@@ -212,9 +212,8 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: With LINEAR groups the problem is linear in everything except directions, which are determined
-#: to some urad: the result is exact except for rounding. With PRODUCTS a score lacks the product
-#: of the changes of start and weight, as scores of positions are linear, and scores of sections
-#: are two linear steps.
+#: to some urad: the result is exact except for rounding. With PRODUCTS the scores, which are one
+#: or two linear steps, neglect the product of the changes of initial state and weight.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -265,7 +264,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
         size = np.sqrt(np.mean(expected**2))
         assert score.sections.square[section] == pytest.approx(size**2, rel=2.0 * tolerance)
     assert score.sections.rms == pytest.approx(np.sqrt(score.sections.square.mean()))
-    # One position cannot be left out: the drift is that of the sections.
+    # A single position cannot be left out: the score is the drift of the sections.
     alone, state = begin(rows_of(windows, np.arange(24)), up[:1])
     alone_score = score_of(alone, alone.solve(state, prior))
     assert np.isnan(alone_score.positions.rms)
@@ -283,7 +282,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift needs neither bias nor scale; M keeps its value and its uncertainty.
+    # The score of the drift needs neither bias nor scale; M keeps its value and its sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
     places = mode.layout.misalignment
@@ -292,7 +291,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
 def test_no_step_goes_uphill(seed):
-    # Bags that started far from rest, with little data: the product of start and weight matters.
+    # Bags with few data start far from rest, so the product of initial state and weight matters.
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
     windows, up = table_of(truth, 4, rng, n_windows=12, step_s=400.0)
@@ -309,7 +308,7 @@ def test_no_step_goes_uphill(seed):
 def test_what_takes_no_part_any_more_is_gone(solved):
     regression, prior, mode = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
-    # The result is that of a state to which no step has been applied.
+    # Excluded columns get zero weight even without a step of the solver.
     state = regression.solve(mode.state, narrow, n_steps=0).state
     assert not state.weights[0, :, 2:4].any()
     np.testing.assert_array_equal(state.weights[1], mode.state.weights[1])

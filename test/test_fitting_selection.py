@@ -88,7 +88,7 @@ def test_what_explains_nothing_is_not_chosen(calm):
 def test_models_that_were_looked_at_show_their_left_out_errors(calm):
     _, selected, truth = calm
     rms = {trial.groups: trial.score.rms for trial in selected.trials}
-    # The trials contain the constants, then the curve; the error is the size of the missing
+    # The first trials are constants, then the curve; their error is the size of the missing
     # effect.
     assert [*rms][:2] == [(), ('curve',)]
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
@@ -110,8 +110,8 @@ def test_what_is_forced_stays(calm):
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
 def test_a_group_must_explain_more_than_an_accident(where, is_chosen):
-    # WHY: a column may fit one recording, or one part of the program that all bags share. WHAT:
-    # the evidence favours the group in each case; data left out of the fit decide.
+    # WHY: a column may fit a single bag, or one part of the program that all bags share. WHAT: the
+    # evidence favours the group in all three cases; left-out data reject it in these two.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -146,10 +146,10 @@ def test_noises_come_out(noisy):
     assert {'curve', 'board'} <= chosen_groups(chosen)
     # 1080 windows per axis determine the white noise to 3 %, slightly worse with the slow noise.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
-    # Positions last six correlation times, and curves absorb a part of the slow noise.
+    # Positions last only six correlation times of the slow noise, and curves absorb a part of it.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
-    # Of 18 x 3 readings directions, scale, bias and M use 36 + 9: the others give the sd to 24 %.
+    # 54 readings less 45 unknowns (directions, scale, bias, M) give the mounting sd to 24 %.
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
 
 
@@ -160,8 +160,9 @@ def test_white_noise_is_not_taken_for_slow_noise(calm):
 
 
 def test_prior_sds_are_those_of_the_weights(calm):
-    # The fixed point: sd^2 = sum of squares / effective parameters, three if all are determined;
-    # the hyperprior of a factor of ten shifts it by 1 / (2 x 3 x 5.3) of the distance.
+    # At the fixed point sd^2 = sum of squared weights / effective parameters, three per column if
+    # all are determined; the hyperprior (sd of a factor of ten) shifts log sd by 1 / (2 x 3 x 5.3)
+    # of the distance.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -224,7 +225,7 @@ def test_what_a_group_explains_is_what_it_adds(calm):
     evidence = group_evidence(regression, chosen.posterior)
     explains = {(group.part, group.group): group.explains_m_s2 for group in evidence}
     expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
-    # The effect is about 100 ug, the noise 2 ug.
+    # The group's effect is about 100 ug, the noise of a window 2 ug.
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
@@ -237,8 +238,8 @@ def test_outliers_do_not_pull(calm):
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
     _, other = selected_of(truth, dirty, calm[1].posterior.state.up)
     sd = np.sqrt(one.posterior.variance[one.posterior.layout.bias])
-    # 2 % of the windows, each limited to 3 sd, shift the result by about one sd; without limit
-    # each counts 100 sd, and hides the curve.
+    # 2 % outliers, each down-weighted to 3 sd, shift the result by less than one sd; at full
+    # weight each counts 100 sd.
     assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     used, used_with_outliers = (
@@ -248,7 +249,7 @@ def test_outliers_do_not_pull(calm):
 
 
 def test_means_of_few_values_are_no_knocks():
-    # A converter that carries its remainder: most means are equal, others differ by a count.
+    # With a converter that carries its remainder most means are equal, others differ by a count.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
     prior = prior_of(Truth(), (), offset_sd=1e-9)
@@ -291,8 +292,8 @@ def test_how_bags_begin_is_learnt(start_sd, lower, upper):
 
 @pytest.mark.parametrize('away', [0.0, 30.0])
 def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
-    # WHY: siblings, or the last calibration of a unit, may be nearer to this unit than they seem,
-    # or farther. WHAT: of a narrow and a wide prior the evidence selects the true one.
+    # WHY: siblings or an old calibration may be nearer to the unit than their claimed sd, or
+    # farther. WHAT: of a narrow and a wide prior the evidence selects the true one.
     _, one, truth = calm
     state = one.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -359,11 +360,11 @@ def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting():
     for n in (9, 24):
         claim, fitted = claimed(n)
         assert np.linalg.eigvalsh(claim).min() > 0.0
-        # The bias of each axis follows its kappa.
+        # The claim's parameters are, per axis, kappa (relative scale) and then the bias.
         k = (len(claim) - 3) // 3
         at = 1 + k * np.arange(3)
         ratios.append(np.sqrt(np.diag(claim)[at].mean() / np.diag(fitted)[at].mean()))
-    # Nine positions leave no degree of freedom: a mounting of tens of ug is as likely as none.
+    # Nine positions leave no degree of freedom: mounting offsets of tens of ug cannot be excluded.
     assert ratios[0] > 3.0 * ratios[1]
     assert 0.8 < ratios[1] < 1.5
 

@@ -76,12 +76,12 @@ def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng):
             bank_.step(stamp, float(gradient[k]))
         row = memory.at(stamp, float(board[k]), [float(g[k]) for g in gradients])
         if k % 100 == 99:
-            # The results differ by rounding only, as both add the same terms in another order.
+            # Grid and stream add the same terms in different orders, so they differ by rounding.
             np.testing.assert_allclose(on_grid[k], row, atol=1e-9)
 
 
 def test_columns_are_those_of_the_tracker(bags):
-    # The second route is a tracker with full memory that gets readings and samples as online.
+    # The expected columns come from a tracker that gets readings and samples as online.
     windows = windows_of(bags)
     spec = memory_of(bank())
     table = ColumnTable(bank(), spec, 20.0)
@@ -109,8 +109,8 @@ def test_columns_are_those_of_the_tracker(bags):
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # The lags here follow the tracker's estimates, those of the fit its readings, so that plays
-    # turn up to a part of a window apart.
+    # The tracker's lags follow its estimates, the fit's lags the readings, so plays may reverse a
+    # part of a window apart.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
@@ -140,8 +140,8 @@ def test_sets_and_start_states_by_hand(bags):
 @pytest.mark.parametrize('name', ['board', 'case'])
 @pytest.mark.parametrize('is_stuck', [False, True])
 def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
-    # The thermometer falls silent in the first ramp, or repeats its value, and comes back late in
-    # the second.
+    # The thermometer is silent, or repeats its value, from the first ramp until late in the
+    # second.
     bag, start, stop = bags[0], 900.0, 2200.0
     readings = bag.temperatures[name]
     age = (readings.stamp_ns - bag.start_ns) * 1e-9
@@ -165,7 +165,7 @@ def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
 
 
 def test_the_lag_of_a_column_moves_it_as_its_slope_says():
-    # The second route shifts the lags by a microkelvin, and evaluates the columns again.
+    # The expected derivatives are differences of columns with lags shifted by a microkelvin.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
     layout, table = Layout(spec), ColumnTable(columns, spec, 20.0)

@@ -92,14 +92,14 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(client, fl
     assert again.rows == result.rows
     assert contents(out / 'units') == before
 
-    # Changed bags under the same names are another test.
+    # A test whose bags have changed under the same names is fitted again.
     os.utime(fleet / 'A/good/01.mcap', ns=(0, 0))
     touched = fit_fleet(str(fleet), out, OPTIONS, client=client)
     assert touched.n_done == 1
     after = contents(out / 'units')
     assert {Path(name).parts[1] for name in before if before[name] != after[name]} == {'good'}
 
-    # An edited result is not accepted.
+    # A result whose calibration file was edited counts as missing.
     (out / 'units/B/exchanged').rename(out / 'units/B/other')
     (out / 'units/A/torn/calibration.yaml').write_text('edited')
     results = Results(out)
@@ -157,7 +157,7 @@ def test_an_interrupted_run_goes_on_where_it_was(client, tmp_path):
         fit_fleet(str(fleet), out, OPTIONS, client=client, tell=stop)
     assert not (out / 'fleet.csv').exists()
     assert len(list(out.rglob('result.json'))) == 1
-    # A unit whose files were being written at a power failure.
+    # The files of this unit were cut off as by a power failure.
     (out / 'units/A/u0').mkdir(parents=True, exist_ok=True)
     (out / 'units/A/u0/result.json').write_text('{"format": 1,')
     result = fit_fleet(str(fleet), out, OPTIONS, client=client)
@@ -180,7 +180,7 @@ def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
         stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
     pause = threading.Event()
-    # The first worker is a child of the fork server.
+    # Wait for the first worker, a child of the fork server.
     while not any(map(children_of, children_of(process.pid))):
         assert process.poll() is None
         pause.wait(0.01)

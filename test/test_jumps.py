@@ -28,7 +28,7 @@ def test_jump_along_gravity(rng, with_gyro):
     rest = Rest(rng)
     rest.add((2.0 * MG, 0.0, 20.0 * MG), from_s=301.0)
     (event,) = look(rest, with_gyro=with_gyro)
-    # The jump is located by the single sample between the levels.
+    # The jump happens within one sample interval, which `find_jumps` locates.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
     # Samples of 3 mg for 10 s at 25 Hz on each side of the step determine the step, with a free
@@ -121,8 +121,8 @@ def behind_a_low_pass(rng, rest, tau_s, sd):
 
 @pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0, 3.0])
 def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
-    # WHY: phones filter their samples; a rest of ten minutes became 8 .. 37, many with a supposed
-    # jump, because the variance of a mean was computed for independent samples.
+    # WHY: phones filter their samples; a rest of ten minutes was cut into 8 .. 37 rests, many with
+    # a supposed jump, as the variance of a mean was computed for independent samples.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
     bag = reduce_source(rest.source(), full_scale=None)
@@ -134,7 +134,8 @@ def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
 def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
-    # WHY: in such noise means over 10 s determine a level to 3 mg, so jumps of 20 mg were missed.
+    # WHY: with coloured noise of 3 mg means over 10 s are no better than 3 mg: jumps of 20 mg were
+    # missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)

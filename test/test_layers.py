@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
 # One line per room (a folder, or a module in the package's root). A room that is missing here
 # fails the test, so that its layer must be decided.
 LAYERS = {
-    '__init__': 0,  # public names, for type checkers
+    '__init__': 0,  # public names, imported for type checkers
     'errors': 0,
     'typing': 0,
     'files': 0,
@@ -43,7 +43,7 @@ LAYERS = {
     '__main__': 6,
 }
 
-# Rooms that may import a library. Any room may import a library that is missing here.
+# Rooms that may import a library; a library that is missing here may be imported anywhere.
 ROS = ['rclpy', 'rcl_interfaces', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs']
 HOMES = {
     **{name: {'ros'} for name in ROS}, 'rosgraph_msgs': {'ros'}, 'builtin_interfaces': {'ros'},

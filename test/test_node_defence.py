@@ -128,7 +128,7 @@ def test_questions_of_any_length_are_answered(peer, unit, kind, field):
 
 
 def test_a_callback_that_fails_is_logged_counted_and_survived(peer, unit):
-    # WHY: the class of fault: unexpected failures in a service, a call or the relay itself.
+    # WHY: an unexpected exception in a service, a timer or the relay must not end the node.
     with node_in_thread(*node_arguments(unit)) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)

@@ -92,7 +92,7 @@ def test_an_environment_that_ros_cannot_use(name, value, text, unit, monkeypatch
 
 
 def test_closed_streams_are_no_signal(unit):
-    # WHY: the signals' pipe got the descriptor of stderr, and the first letter of the log was
+    # WHY: with stderr closed, the pipe for signals got its descriptor, and a letter of the log was
     # taken for a signal.
     peer = Peer()
     shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
@@ -117,7 +117,7 @@ ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 
 
 
 def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path, monkeypatch):
-    # The interpreters of the node and of its child processes import this first.
+    # Python imports sitecustomize first, in the node and in its child processes.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
         'class Absent:\n'
@@ -144,7 +144,7 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path,
             return bool(heard)
 
         peer.poll(is_heard, 'a sample')
-        # The file is read by another process.
+        # A child process of the node reads the calibration.
         (result,) = peer.set_parameters(calibration_file=str(unit))
         assert result.successful, result.reason
         del heard[:]
@@ -183,7 +183,7 @@ def test_misspelt_parameters_are_said(unit, capfd):
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_during_start_up_ends_it_cleanly(unit, number):
-    # A signal during the construction of the node, once the middleware has a thread.
+    # Send the signal while the node is built: once the middleware has started a thread.
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         tasks = Path(f'/proc/{node.process.pid}/task')
         deadline = time.monotonic() + TIMEOUT

@@ -60,7 +60,7 @@ def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declar
     bias, scale = constants(result)
     np.testing.assert_allclose(bias - offset, constants(plain)[0], atol=0.02)
     np.testing.assert_allclose(scale, constants(plain)[1], rtol=1e-6)
-    # Tolerance: noise of 14 means of 2000 samples of 12 counts.
+    # Tolerance: 14 means of 2000 samples with a noise of 12 counts.
     np.testing.assert_allclose(bias - offset, BIAS, atol=1.0)
     np.testing.assert_allclose(scale, K, rtol=3e-4)
     np.testing.assert_allclose(result.calibration.misalignment, M, atol=3e-4)
@@ -70,7 +70,7 @@ def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declar
 
 
 def test_a_bag_for_each_position_needs_none_of_the_others(rng):
-    # All axes down, all up, or mixed: only some 16-bit words show that they are unsigned.
+    # Bags differ in the signs of their axes: only some show that 16-bit words are unsigned.
     ups = positions(10, 3)
     ups[0] = -np.full(3, 3.0**-0.5)
     bags = [source(words_of([up], rng) + 32768.0, f'bag{k}') for k, up in enumerate(ups)]

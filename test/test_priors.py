@@ -26,12 +26,12 @@ from thermo_comp.unit.posterior import Posterior
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: Only the groups of the unit's physics, a third of all columns, take half of the time.
+#: Only the groups of the unit's physics, a third of all columns, which halves the time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
 def source(record):
-    # Readings every eight seconds are enough for ramps of 1 K/min, and take an eighth of the time.
+    # A reading every eight seconds suffices for ramps of 1 K/min, and saves most of the time.
     arrays = arrays_of(record, 8)
     later = [array + 10**18 if array.dtype == np.int64 else array for array in arrays]
     return source_of(*later)
@@ -79,7 +79,8 @@ def test_population_is_the_mean_unit_and_its_scatter():
     variance = np.diag(prior.posterior.covariance())
     at = parameter_layout(prior).bias[0].static + 1
     sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
-    # Scatter of three units and of their mean, and parameters that are not determined in any.
+    # Variance of the prior: scatter of three units times 4/3 (their mean), plus their own
+    # variance.
     scatter = []
     for unit in siblings():
         variance = np.diag(unit.posterior.covariance())
@@ -91,8 +92,8 @@ def test_population_is_the_mean_unit_and_its_scatter():
 
 def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch):
     # WHY: a fit started with the narrow prior of three units attributed 190 ug of their
-    # differences to the mounting offset and stayed there: 271 ug held out instead of 0.9. WHAT: no
-    # prior is wider anywhere than the prior of the start.
+    # differences to the mounting offset and stayed there: 271 ug held out instead of 0.9. WHAT: in
+    # no direction is another prior wider than the prior of the start.
     seen = []
 
     def fitted_with(*given):
@@ -172,8 +173,8 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
         for calibration, changed in ((old, lambda record: record), (old, aged), (new, aged))
     ]
     assert left[1] > 10.0 * left[0]
-    # Parts with a lag of an hour started at an unknown temperature, which ten minutes do not
-    # separate from a bias: the claimed sd includes some ug for this error.
+    # Parts that lag by an hour start at an unknown temperature, and rests of ten minutes do not
+    # separate this from a bias: the claimed sd includes some ug for this error.
     sd = float(sd_of_levels(new).max())
     assert sd < 10e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
@@ -241,7 +242,7 @@ def test_another_units_calibration_is_no_prior():
     messages = [finding.message for finding in allowed.findings if finding.name == 'prior']
     assert any('allowed: ' in text for text in messages)
     assert any('bags contradict the prior' in text for text in messages)
-    # A model without regimes does not determine the two curves of a prior.
+    # A prior has a curve for each regime, so there is no residual of one set.
     assert not allowed.residuals[-1].one_set.n
 
 
