@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what all tests share: a DDS domain per test process, seeds, and the command line's fixtures.
-"""
+"""Owns what all tests share: a DDS domain per process, seeds, the command line's fixtures."""
 
 import fcntl
 import gc
@@ -72,9 +70,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """
-    Exclude imported objects from garbage collection, which would otherwise scan them repeatedly.
-    """
+    """Exclude imported objects from garbage collection, which would scan them repeatedly."""
     gc.freeze()
 
 
@@ -163,9 +159,7 @@ def _caught(name, descriptor):
 
 @contextmanager
 def _as_a_process(cwd):
-    """
-    Give a command the state of a new process, and restore the state of this process afterwards.
-    """
+    """Give a command the state of a new process; restore the state of this process afterwards."""
     folder, environment = Path.cwd(), dict(os.environ)
     log = logging.getLogger()
     handlers, log.handlers = log.handlers, []  # pytest's handlers keep log messages from stderr
@@ -189,10 +183,7 @@ def _as_a_process(cwd):
 
 @pytest.fixture(scope='session')
 def cli(program):
-    """
-    Return a function that runs the command line in this process, or in a new process with
-    variables.
-    """
+    """Return a function that runs a command here, or with variables in a new process."""
     from thermo_comp.cli.app import run as run_command
 
     def run(*args, code=0, cwd=None, **env):

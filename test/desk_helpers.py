@@ -28,9 +28,7 @@ _EXPORTS = {'autopilot.params': 'px4', 'xsens_acc.calib': 'imu_tk',
 
 
 def write_fit_of_the_readme(path, cli):
-    """
-    Write the calibration of the sample bags, and the output of the README's command beside it.
-    """
+    """Write the calibration of the sample bags, and the README command's output beside it."""
     words, _ = shown()['fit']
     bags = ROOT / 'bags' / 'fit'
     assert words[1] == 'bags/fit/*.mcap'
@@ -170,9 +168,7 @@ class Desk:
         return (cli or self._cli)(*arguments, cwd=here)
 
     def _interrupted(self, arguments, here):
-        """
-        Start a command that runs until Ctrl-C, and send Ctrl-C once it has printed its first line.
-        """
+        """Start a command that runs until Ctrl-C; send Ctrl-C once it has printed a line."""
         process = subprocess.Popen(
             [sys.executable, '-m', 'thermo_comp', *arguments], cwd=here,
             env={**os.environ, 'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE,

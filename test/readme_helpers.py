@@ -24,9 +24,7 @@ _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
 def shown():
-    """
-    Return the console examples of the page: sub-command -> (words of the command line, output).
-    """
+    """Return the page's console examples: sub-command -> (words of the command, output)."""
     collected = {}
     for kind, text in FENCE.findall(SESSION.read_text(encoding='utf-8')):
         if kind == 'console':

@@ -49,10 +49,7 @@ def fitted():
 
 @cache
 def evidence():
-    """
-    Gather the evidence of the fit, with assumed left-out residuals of 1, 2, ... ug for all
-    positions but the last.
-    """
+    """Gather the evidence of the fit, with assumed left-out residuals of all positions but one."""
     *others, last = fitted().positions
     left_out = [
         replace(other, left_out_rms=rms) for other, rms in zip(others, LEFT_OUT_RMS, strict=True)

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The command line: help with examples, tables that fit and pipe, JSON that parses, quick starts.
-"""
+"""The command line: help with examples, tables that fit and pipe, valid JSON, quick starts."""
 
 import json
 import os

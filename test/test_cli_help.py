@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The output on a terminal is right: examples run, JSON parses, --quiet prints nothing, lines fit.
-"""
+"""The output on a terminal: examples run, JSON parses, --quiet prints nothing, lines fit."""
 
 import re
 

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The compensator against hand calculations and Monte Carlo; single samples equal blocks of any cut.
-"""
+"""The compensator against hand calculations and Monte Carlo; samples equal blocks of any cut."""
 
 import math
 import random
@@ -103,9 +101,7 @@ STRANGE = (math.nan, math.inf, -math.inf, 32767.0, -32768.0, 0.0, -0.0, 5e-324)
 
 
 def event_list(seed):
-    """
-    Make messages in any order: late, repeated, jumping back, not finite, saturated, in two clocks.
-    """
+    """Make messages in any order: late, repeated, jumping back, not finite, saturated."""
     rng = random.Random(seed)
     events = []
     stamp = rng.choice([0, rng.randrange(2**60)])

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Corrections with all columns: single samples equal blocks bit for bit, axes are independent, the
-claimed sd equals the scatter of random calibrations.
-"""
+"""Corrections with all columns: same bits in blocks, axes independent, claimed sd = scatter."""
 
 import math
 from dataclasses import replace
@@ -180,10 +177,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
 
 
 def drawn(unit, layout, d):
-    """
-    Change every parameter of a unit except the levels of the scale, which a curve of 1 does not
-    have.
-    """
+    """Change all parameters but the scale levels, which a curve of 1 does not have."""
 
     def moved_by(values, start):
         return tuple(value + d[start + k] for k, value in enumerate(values))

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A temperature in a message of any type: the values of many messages at once equal those of
-`rosbags`.
-"""
+"""A temperature in a message of any type: values of many messages equal those of rosbags."""
 
 import numpy as np
 import pytest

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A board warmer than its case by self-heating: effects of temperature changes are even about the
-gradient at rest.
-"""
+"""Self-heating makes a board warmer than its case: effects are even about the rest gradient."""
 
 from itertools import pairwise
 

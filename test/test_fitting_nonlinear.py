@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Fits beyond 1 g: derivatives, terms that stay or leave, radius, statements of |f|, whole runs.
-"""
+"""Fits beyond 1 g: derivatives, choice of terms, radius, statements of |f|, whole runs."""
 
 import math
 from dataclasses import replace

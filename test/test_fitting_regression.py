@@ -32,10 +32,7 @@ from thermo_comp.fitting.unknowns import Noise, State, inverse_misalignment, tan
 
 
 class Dense:
-    """
-    The posterior of a `Regression` by a slow second route: all unknowns in one vector, dense
-    covariances, numerical derivatives.
-    """
+    """The posterior of a `Regression` by dense linear algebra and numerical derivatives."""
 
     def __init__(self, regression, prior, at):
         self.windows, self.prior, self.at = regression.windows, prior, at

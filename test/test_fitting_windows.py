@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Windows, curves and the conversion to a file: the fit uses the corrections of the compensator.
-"""
+"""Windows, curves and the conversion to a file: the fit corrects as the compensator does."""
 
 from dataclasses import replace
 from importlib import import_module

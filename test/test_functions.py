@@ -121,9 +121,7 @@ def test_what_is_not_finite_is_no_curve_of_a_set(bad):
 
 
 def slope_and_lag(variances):
-    """
-    Make a unit with a slope and a lag of 600 s, and variances of some parameters of its x axis.
-    """
+    """Make a unit with a slope and a lag of 600 s; `variances` of parameters of its x axis."""
     unit = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),

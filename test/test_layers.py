@@ -136,9 +136,7 @@ def own_file(name):
 
 
 def circle(uses):
-    """
-    Remove the leaves of a graph repeatedly; return the rest, which is empty without a circle.
-    """
+    """Remove the leaves of a graph repeatedly; return the rest, empty if there is no circle."""
     while True:
         leaves = {file for file, targets in uses.items() if not targets & uses.keys()}
         if not leaves:

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The node as a process: its calibration is changed through the real services while samples flow.
-"""
+"""The node as a process: its calibration changes through ROS services while samples flow."""
 
 import sys
 import threading
@@ -157,10 +155,7 @@ class _Stop(BaseException):
 
 
 def raising_at(number, call):
-    """
-    Call a function and raise at the n-th executed line of this package; return whether it was
-    reached.
-    """
+    """Call a function and raise at its n-th executed line; return whether the line was reached."""
     n_lines = 0
 
     def trace(frame, event, _):

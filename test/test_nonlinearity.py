@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Nonlinear axes in the correction: closed forms of the inverse, bits of stream and batch, variance.
-"""
+"""Nonlinear axes: closed forms of the inverse, bits of stream and batch, variance."""
 
 from dataclasses import replace
 

@@ -67,8 +67,8 @@ def judged(calibration, study):
 
 def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
     unit, study, calibration = parts
-    # A lag of 10 K that is wrong by 1 % moves a bias of 10 ug/K by 1 ug, twice its noise of a
-    # minute; some hundred minutes of ramps determine a lag better than 1 %.
+    # A time constant wrong by 1 % moves a bias of 10 ug/K, lagging by 10 K, by 1 ug, which is
+    # twice the noise of a minute; hundreds of minutes of ramps determine it better than 1 %.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # 0.65 ug is the noise of a mean of a minute.
     assert judged(calibration, study).norm < 2.0
@@ -81,7 +81,7 @@ def test_a_part_between_board_and_case():
     parts = {one.part for one in calibration.response if one.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares = np.array(sorted(parts)).T
-    # Ramps determine a lag to 1 %, and therefore the share of the case to 0.01.
+    # Ramps determine a time constant to 1 %, and therefore the share of the case to 0.01.
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert judged(calibration, study).norm < 2.0
@@ -149,11 +149,12 @@ def test_a_unit_without_lags_gets_none():
 
 
 def test_a_bump_is_no_disturbance_and_no_motion():
-    # At 0.5 Hz a cell of 30 samples is a minute, and the bump passes within two of them.
+    # At 0.5 Hz a cell of 30 samples takes a minute, and the unit passes the bump within two cells.
     bump = np.array([450.0, -400.0, 500.0])
     _, study = study_of('bump', bump=bump, bump_c=17.0)
     judgement = judged(strangers.fitted(study), study)
-    # The bends are a polygon with corners every 0.5 K in a bell of 0.85 K sd.
+    # The fit approximates the bump, a bell with an sd of 0.85 K, by lines between knees every 0.5
+    # K.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 
@@ -176,7 +177,7 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     least, _ = second_simulator.floor_of(tests)
     assert errors(result.specific_force, result.sd, tests).norm < 2.0 * least
     stages = {(one.tau_s, one.second_tau_s) for one in result.calibration.response if one.tau_s}
-    # The network is integrated in steps of 2 s, which adds a second to a time constant.
+    # The simulator's steps of 2 s add a second to each time constant.
     near = pytest.approx(2.0 * unit.head_s[0], rel=0.01)
     assert any(tau + second == near for tau, second in stages)
     for head, pendulum in zip(unit.head_s[1:], unit.pendulum_s[1:], strict=True):
@@ -197,7 +198,7 @@ def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
     score = judged(strangers.fitted(study), study)
     means = [minutes(bag) for bag in held]
     forces = [strangers.by_hand(study)['constants'](mean) for mean in means]
-    # A part of the error remains: the ramps of the held-out bags have lags that soaks do not show.
+    # A part of the error remains, because soaks do not show the lags of the held-out ramps.
     assert score.norm < 0.5 * strangers.error_of(forces, means, is_drift=False).norm
     assert score.ratio < 1.5
 
@@ -228,9 +229,8 @@ def test_a_curve_between_two_soaks_is_claimed():
 
 
 def test_a_curve_that_the_soaks_do_not_show_is_claimed():
-    # Each axis is vertical at a temperature of its own: the constants explain all norms, whatever
-    # the curve. WHY: the curve was claimed to be zero, and the error was
-    # fifteen times the claim.
+    # Each axis is vertical at another temperature: constants explain all norms, whatever the
+    # curve. WHY: the slope was claimed to be zero, and the error was fifteen times the claimed sd.
     rng = rng_of('confounded soaks')
     unit = navigation(rng)
     faces = np.vstack((np.eye(3), -np.eye(3), np.eye(3)))
@@ -277,7 +277,7 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
     (bags,) = study.tests.values()
     for bag in bags:
         off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
-        # The lags of 10 K at 20 ug/K differ by some percent from one unit to the next.
+        # The units' lags, 10 K at 20 ug/K, differ by up to 7 % from their mean.
         assert np.sqrt(np.mean(off**2)) < 5.0 * UG
 
 

@@ -225,9 +225,7 @@ configs = st.builds(
 
 
 def largest(axis, regime, of):
-    """
-    Bound the change of an axis' bias, and the relative change of its scale.
-    """
+    """Bound the change of an axis' bias, and the relative change of its scale."""
     edges = (*of.static.temperature_range_c, *of.dynamic.temperature_range_c)
     # Curves continue along their tangents for up to a quarter of both ranges together.
     t = max(abs(edge - of.reference_temperature_c) for edge in edges)

@@ -93,9 +93,7 @@ def test_cut_at_every_byte_of_the_last_chunk(tmp_path):
 
 
 def test_most_of_a_large_torn_chunk_is_saved(tmp_path):
-    """
-    A streaming decompressor gives the content before the cut: a block is lost, not the chunk.
-    """
+    """Content before a cut is decompressed: a block is lost, not the chunk."""
     n = 60_000
     stamps = np.arange(n) * 2_500_000
     xyz = np.random.default_rng(3).integers(-30_000, 30_000, (n, 3))
@@ -107,8 +105,8 @@ def test_most_of_a_large_torn_chunk_is_saved(tmp_path):
         ((position, length),) = chunk_places(path)
         path.write_bytes(content[: position + length // 2])
         columns = read(path).columns
-        # Incompressible numbers: half of the bytes contain nearly half of the messages. A block of
-        # zstd has 128 KiB of content, 1700 messages.
+        # The numbers are incompressible, so half of the bytes hold nearly half of the messages; a
+        # lost block of zstd (128 KiB) has 1700 messages.
         assert 0.4 * n < len(columns) < 0.6 * n
         assert (columns.accel == xyz[: len(columns)]).all()
 
@@ -253,7 +251,7 @@ def test_claims_are_not_believed(tmp_path, record, reason):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(RecordingError, match=reason):
         read(path)
-    # In KiB: whatever length is stated, the reader takes no more than a usual chunk (64 MiB).
+    # Whatever length the record states, the reader takes no more than a chunk of 64 MiB [KiB].
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 
@@ -266,7 +264,7 @@ def test_a_damaged_compressed_end_is_left_out(tmp_path):
     recording = read(path)
     assert str(recording.info.truncated).endswith('; its last chunk is damaged and left out')
     assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
-    # A truncated chunk gives its content before the damage.
+    # If the damaged chunk is also cut off, the message names the cut.
     path.write_bytes(damaged[:-5])
     assert 'ends inside a chunk' in str(read(path).info.truncated)
 
@@ -276,7 +274,7 @@ def test_a_summary_that_is_nonsense(tmp_path):
     path = tmp_path / 'bag.mcap'
     footer = len(content) - 37
     (summary,) = struct.unpack_from('<Q', content, footer + 9)
-    for at in (summary, summary + 9):  # opcode of the first record; number and name of its schema
+    for at in (summary, summary + 9):  # opcode, then schema, of the summary's first record
         changed = bytearray(content)
         changed[at : at + 8] = b'\xff' * 8
         path.write_bytes(changed)

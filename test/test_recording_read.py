@@ -39,9 +39,7 @@ WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}
 
 @st.composite
 def bags(draw, accel=ACCEL, lowest=-3):
-    """
-    Messages in order of writing, with equal and decreasing log times, mixed frames and orders.
-    """
+    """Messages in order of writing: equal and falling log times, mixed frames and byte orders."""
     frames = draw(st.lists(st.text('abcxyz_/é', max_size=24), min_size=1, max_size=3))
     topics = (accel, BOARD, CASE, OTHER)
     messages = []
@@ -96,9 +94,8 @@ def test_any_file_gives_its_messages_in_order_of_log_time(messages, **options):
             and options['index_types'] == IndexType.ALL
             and options['repeat']
         ):
-            # The second route to the order is the order of rosbags for the same file. The versions
-            # of rosbags differ for equal log times in different chunks, so that these may be in
-            # either order.
+            # The second route to the order is the order of rosbags for the same file. Versions of
+            # rosbags order equal log times in different chunks differently.
             order = [(log_ns, topic) for topic, log_ns, _ in read_with_rosbags(path)]
             wanted = [(m.log_ns, m.topic) for m in in_reading_order(messages)]
             assert [log_ns for log_ns, _ in order] == [log_ns for log_ns, _ in wanted]
@@ -187,7 +184,7 @@ def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path):
     assert [frame for block in blocks for frame in [block.frame_id] * len(block)] == frames
     before, n_accel = 0, 0
     for block in blocks:
-        # The place of each reading counts within its block, so that it never exceeds the block.
+        # `after`, the place of a reading among the samples, counts within the block.
         after = block.temperatures['board'].after
         assert ((after >= 0) & (after <= len(block))).all()
         before += len(after)
@@ -208,7 +205,7 @@ def test_overlapping_chunks_of_single_topics_are_merged(tmp_path):
         messages, key=lambda m: ((m.log_ns - START_NS) // 100_000_000, ALL_TOPICS.index(m.topic))
     )
     write_mcap(tmp_path / 'bag.mcap', by_topic, chunk_size=400)
-    # For equal log times the order of the file counts, so here the counts come first.
+    # Messages with equal log times keep the order of the file: here counts before temperatures.
     assert_columns(read(tmp_path / 'bag.mcap').columns, in_reading_order(by_topic))
 
 
@@ -343,7 +340,7 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
             '/imu/ticks, its only Vector3Stamped, is taken for counts; '
             '/imu/die, its only Temperature, is taken for board'
         )
-    # No topic is chosen if the user named another, if there are two, or for a case as the board.
+    # No board is chosen if the user names another, among two topics, or from a topic of the case.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):
@@ -369,7 +366,7 @@ def test_reading_twice_gives_the_same(tmp_path, monkeypatch):
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:
-        first = next(iter(reader.blocks()))  # the reading is abandoned before its end
+        first = next(iter(reader.blocks()))  # reading stops after one block
         again = next(iter(reader.blocks()))
     assert first.accel.tobytes() == again.accel.tobytes()
 

@@ -46,9 +46,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """
-    Run n ramps; return the switches after the start of each, and the number of static starts.
-    """
+    """Run n ramps; return the switches after each start, and the number of static starts."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -80,9 +78,8 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # Two edges must be crossed: with the second at 62.5 to 125 mK from the start the median is
-        # at least the time in which the case changes by 94 mK, 146 s; the median of 12 runs
-        # scatters by 6 s.
+        # A coarse sensor must cross two edges of its quantum, the second 62.5 to 125 mK from the
+        # start: a median of at least 146 s (94 mK), which scatters by 6 s in 12 runs.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -124,7 +121,7 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
         (0.01, 0.0, 0.5, 900.0, 0.1, 900.0),
         (0.001, 0.0625, 0.2, 1200.0, 1.0, 3600.0),
         (0.01, 0.0625, 3.0, 300.0, 10.0, 3600.0),
-        (0.01, 0.0625, 0.2, 180.0, 10.0, 2400.0),  # slower than the baseline could follow
+        (0.01, 0.0625, 0.2, 180.0, 10.0, 2400.0),  # the baseline could not follow faster ramps
         (0.01, 1.0, 0.2, 900.0, 10.0, 7200.0),
         (0.01, 1.0, 3.0, 180.0, 1.0, 2400.0),
     ],
@@ -164,9 +161,8 @@ def test_soaks_stay_static(sensor):
 
 def test_false_alarms_keep_to_the_setting():
     # The signal is noise without ripple, and 20 alarms an hour are permitted. Rice's formula
-    # counts crossings; those of one filter come in groups and coincide with those of the other, so
-    # that the formula is an upper bound: at most 2000 separate departures in 100 h. A lower limit
-    # checks that the test is not inactive.
+    # counts crossings, which come in groups and coincide between the filters, so it is an upper
+    # bound of separate alarms: 2000 in 100 h. The lower limit checks that the detector is active.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -187,9 +183,9 @@ def test_false_alarms_keep_to_the_setting():
 
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_threshold_is_that_of_the_filters_noise(dt):
-    # The second route: gain by the Riccati equation, noise and correlation by the impulse
-    # response, alarms by Rice's formula. The closed forms are first order in the pace, which is at
-    # most 0.3 here: within 4 %.
+    # Expected: filter gain by the Riccati equation, noise and correlation by the impulse response,
+    # alarms by Rice's formula. The detector's closed forms are first order in its pace: within 4
+    # %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -209,7 +205,7 @@ def test_threshold_is_that_of_the_filters_noise(dt):
         noise = 1e-4 * np.sum(response**2)
         correlation = np.sum(response[1:] * response[:-1]) / np.sum(response**2)
         per_reading = math.acos(correlation) / (2.0 * math.pi)
-        allowed = 0.02 / 3600.0 / 4.0 * dt  # per reading, two filters, two signs
+        allowed = 0.02 / 3600.0 / 4.0 * dt  # alarms per reading, filter and sign
         squared = 2.0 * math.log(per_reading / allowed)
         assert threshold * covariance[1, 1] == pytest.approx(squared * noise, rel=0.04)
 
@@ -227,9 +223,7 @@ def test_unknown_until_the_windows_are_filled():
 
 
 def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=8000.0, **parts):
-    """
-    Run once; `parts` may replace the readings of case or board by a function of (t, reading).
-    """
+    """Run once; `parts` may change the readings of case or board: functions of (t, reading)."""
     rng = np.random.default_rng(8)
     t = np.arange(begin, end)
     truths = dict(zip(('case', 'board'), case_and_board(t, corners, lag), strict=True))
@@ -293,7 +287,8 @@ def test_it_closes_with_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # The same bits as without a board; if the case is lost, the board decides.
+    # `closes: case` gives the bits of a run without a board; if the case is lost, the board
+    # decides.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
@@ -383,7 +378,7 @@ def test_cooling_is_heating_upside_down(quantum):
 
 
 def test_switches_do_not_depend_on_the_origin_of_time():
-    # Whole nanoseconds in both cases, so the bits are the same.
+    # A shift of the stamps by whole nanoseconds must not change a bit.
     rng = np.random.default_rng(8)
     t = np.arange(0.0, 3000.0)
     settings = detector_settings(0.001)

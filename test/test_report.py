@@ -89,7 +89,7 @@ def page():
 
 
 def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
-    assert not page.open  # every tag is closed
+    assert not page.open  # the page closes every tag
     for fact in (
         'Unit thermostatted-0001',
         evidence().calibration.provenance.created,
@@ -191,7 +191,7 @@ def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
 
 
 def test_hours_of_bag_stay_a_small_page():
-    # A day of readings at 2 Hz, and of windows at rest: hundreds of them per pixel.
+    # The bag has a day of readings at 2 Hz and of windows: hundreds of points per pixel.
     shown, windows = evidence().shown, evidence().windows
     time = np.arange(0.0, 86400.0, 0.5)
     value = 20.0 + 15.0 * np.sin(time / 9000.0) + np.random.default_rng(1).normal(size=len(time))
@@ -231,7 +231,7 @@ def test_calibration_alone_makes_a_page_and_its_figures_as_png(tmp_path):
     assert 'no recording was judged' in page.text
     assert '01.mcap' in page.text
     assert f'{1:064x}' in page.text
-    # Figures that need no bags; all others are drawn for the page.
+    # Without bags, only the figures of the calibration are drawn.
     names = [figure.name for figure in figures_of(evidence())]
     without_bags = [name for name in names if name in ('functions', 'step', 'hysteresis')]
     files = sorted(folder.iterdir())

@@ -49,7 +49,7 @@ def test_blocks_are_the_whole_bit_for_bit(name, block_size):
         np.testing.assert_array_equal(
             _joined(blocks, column, is_truth=True), getattr(whole.truth, column)
         )
-    # A reading is in the block that contains the cycle of its time.
+    # A block has the readings up to the end of its last cycle.
     for block in blocks[:-1]:
         assert block.board_stamp_ns[-1] <= block.accel_stamp_ns[-1]
 
@@ -74,9 +74,7 @@ def test_stamps_are_the_ends_of_the_cycles(unit):
 
 
 def test_an_error_source_more_leaves_the_others_numbers(unit):
-    """
-    Noise of the thermometer does not change the rest; a drifting bias is added to the same noise.
-    """
+    """Thermometer noise changes nothing else; a drifting bias is added to the same noise."""
     plain = simulate(unit, SHORT, UP)
     noisy = simulate(replace(unit, board=replace(unit.board, noise_sd=0.05)), SHORT, UP)
     assert np.all(noisy.board != plain.board)
@@ -87,14 +85,12 @@ def test_an_error_source_more_leaves_the_others_numbers(unit):
         plain.truth.scale - 1.0
     ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
-    # Two converters with the same starting phase: each is within one count of its integral.
+    # Either converter is within one count of its integral, and both start with the same phase.
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
 def test_counts_follow_the_truth(unit):
-    """
-    Without noise the running sum of the counts equals that of ``bias + K scale inverse(M) f``.
-    """
+    """Without noise the sum of the counts equals that of ``bias + K scale inverse(M) f``."""
     run = simulate(noiseless(unit), DEMO, UP, rate_hz=50.0)
     truth = run.truth
     s = truth.specific_force @ np.linalg.inv(unit.M).T
@@ -105,10 +101,7 @@ def test_counts_follow_the_truth(unit):
 
 
 def test_white_noise_has_its_density(unit):
-    """
-    Second route: Welch's spectrum is flat at ``2 density^2`` (one-sided), and the scatter of
-    60 s means is ``density / sqrt(60)``.
-    """
+    """Welch's spectrum is ``2 density^2``; 60 s means scatter by ``density / sqrt(60)``."""
     still = replace(unit, drift=())
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
@@ -145,8 +138,8 @@ def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
         (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, of_part(run.truth, 'case')
     )
     error = run.case - true
-    # At least 540 readings of 5 mK: the mean is good to 0.2 mK, the deviation to 3 %; the limits
-    # are five times as large.
+    # 540 or more readings with 5 mK of noise determine the mean to 0.2 mK, the sd to 3 %; the
+    # limits are 5 sd.
     assert error.mean() == pytest.approx(0.0, abs=1.1e-3)
     assert error.std() == pytest.approx(0.005, rel=0.16)
 
@@ -180,7 +173,7 @@ def test_run_refuses_what_cannot_be(unit):
         simulate(unit, SHORT, UP, gravity=float('nan'))
 
 
-# The two solutions are closed forms, so only rounding differs; temperatures are tens of degrees.
+# Both solutions of a thermal network are closed forms: they differ by rounding of tens of degC.
 ROUNDING = 1e-9
 
 
@@ -230,7 +223,7 @@ def test_presets_agree_with_a_numerical_integrator(name):
         (0.0, program.duration_s), states[0], method='LSODA', t_eval=time, rtol=1e-10, atol=1e-10,
         max_step=60.0,
     )  # fmt: skip
-    # The integrator steps over the corners of the program, which is its error.
+    # The numerical integrator errs by 2e-5 K, as it steps over the corners of the program.
     np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
 
 
@@ -240,7 +233,7 @@ def test_creep_relaxes_towards_its_part():
     step[0] = 0.0
     history = PartHistory(('case',), step, np.zeros(1), 1.0)
     bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
-    # The step takes 1 s, 1.4e-4 of the time constant.
+    # The step lasts one interval of 1 s, 1.4e-4 of the time constant.
     np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)
     np.testing.assert_array_equal(scale, 0.0)
 

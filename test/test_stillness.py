@@ -36,10 +36,7 @@ def ground(rng, seconds):
 
 
 def hover(rng, seconds, vibration):
-    """
-    Make a flight: thrust of about g, a slow sway by some degrees at some deg/s, and propeller
-    vibration.
-    """
+    """Make a flight: thrust of about g, a slow sway by some degrees, propeller vibration."""
     time = time_of(seconds)
     tilt = np.radians(3.0) * np.sin(2.0 * np.pi * time[:, None] / np.array((5.0, 7.0)))
     thrust = GRAVITY * (1.0 + 0.03 * np.sin(2.0 * np.pi * time / 11.0))
@@ -116,14 +113,14 @@ def test_each_short_rest_is_found(rng, rest_s, shaky):
     result = fit([source(accel)], OPTIONS)
     assert len(result.positions) == 10
     axes = result.calibration.axes
-    # 350 samples of 3 to 12 mg give a mean of 0.2 to 0.6 mg in each of ten rests.
+    # The mean of a rest, 350 samples with 3 to 12 mg of noise, is good to 0.2 to 0.6 mg.
     np.testing.assert_allclose([axes.x.bias, axes.y.bias, axes.z.bias], (0.3, -0.2, 0.1),
                                atol=1.5 * MG)  # fmt: skip
     assert result.residuals[-1].fitted.rms < 2.0 * MG
 
 
 def test_motion_does_not_pass_for_a_rest_in_the_scan(rng):
-    # Two more stretches with the noise of the shaky rests, in which the unit is pushed.
+    # At the end the unit is pushed for 10 s, with the noise of a shaky rest but 1.04 g.
     accel = by_hand(rng, 14, 6.0, (3,), misalignment=5e-3)
     time = time_of(10.0)
     push = GRAVITY * np.array((0.0, 0.6, 0.8)) * 1.04 + 0.0 * time[:, None]
