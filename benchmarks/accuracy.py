@@ -35,7 +35,7 @@ from thermo_comp.unit.calibration import Calibration, parameter_layout
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
-N_SIBLINGS = 10  # units whose calibrations make the prior
+N_SIBLINGS = 10  # number of siblings that make the prior
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ GOALS = {
     'slow-noise': Goal(1.15, 1.15, is_relative=True),
     'plain': Goal(1.05, 1.05, is_relative=True, plan='chamber-9'),
 }
-# Tests with little time in the chamber: alone, and with the prior of siblings.
+# Limits for tests with little time in the chamber: without a prior, with that of siblings.
 PLAN_GOALS = {
     'chamber-9': (None, None),
     'tumble-3': (Goal(1.5, 2.5), Goal(1.2, 2.1)),
@@ -135,7 +135,8 @@ def fit_and_correct(
         columns = np.column_stack((corrected.specific_force, corrected.covariance[:, [0, 4, 8]]))
         size = np.diff(first, append=len(slots))
         mean = np.add.reduceat(columns, first, axis=0)[size == size.max()] / size.max()
-        # White noise and rounding average out, the other parts of the published variance do not.
+        # In means of 60 s white noise and rounding average out, the rest of the published variance
+        # does not.
         white = np.array(compensator.thermal.correction.noise)
         forces.append(mean[:, :3])
         sds.append(np.sqrt(np.maximum(mean[:, 3:] - white, 0.0) + density**2 / WINDOW_S))

@@ -74,7 +74,7 @@ def errors_of(series: Series, calibrated: Calibration, force: Floats) -> Floats:
 
 
 def root_mean(values: Floats) -> float:
-    """Return the RMS."""
+    """Return the root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 

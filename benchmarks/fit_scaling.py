@@ -87,7 +87,7 @@ def run_task(task: str, paths: list[Path]) -> dict[str, float]:
 
 
 def main() -> int:
-    """Write, read, fit, print."""
+    """Simulate bags, read and fit them, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

@@ -90,7 +90,7 @@ def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
 @dataclass(frozen=True)
 class Measured:
     """
-    One run.
+    Figures of one run of a fleet.
 
     Parameters
     ----------
@@ -312,7 +312,7 @@ def loads() -> str:
 
 
 def main() -> int:
-    """Run one part."""
+    """Run one part of the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

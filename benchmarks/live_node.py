@@ -160,7 +160,7 @@ def through_the_node(
     ):
 
         def is_joined() -> bool:
-            """Whether every topic has discovered both ends."""
+            """Whether publishers and subscribers of all topics have discovered each other."""
             heard = {subscription.topic_name for subscription in node.node.subscriptions}
             sent = {publisher.topic_name for publisher in player.node.publishers}
             results = {f'{namespace}/{topic.name}' for topic in OUTPUTS}

@@ -37,7 +37,7 @@ Matrix = list[tuple[Scene, Outcome]]
 
 
 def quantiles(delays: list[float]) -> tuple[float, float]:
-    """Median and 95 %; infinite if empty."""
+    """Median and 95 % quantile; infinite if empty."""
     if not delays:
         return np.inf, np.inf
     return float(np.median(delays)), float(np.percentile(delays, 95))
@@ -209,7 +209,7 @@ def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_cost(_pool: Pool, _arguments: argparse.Namespace) -> Tables:
-    """Time a reading."""
+    """Measure the time that a reading takes."""
     yield 'Cost', cost_table()
 
 

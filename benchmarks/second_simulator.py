@@ -239,7 +239,7 @@ def runs_of(
             for celsius in (board, case)
             for sd in [READING_SD * draw.standard_normal(len(read))]
         ]
-        # A sample is stamped at its end.
+        # A sample has the stamp of the end of its cycle.
         stamps, read_ns = (np.rint(1e9 * (time + 0.5 * SAMPLE_S)).astype(np.int64)
                            for time in (middle, read))  # fmt: skip
         result.append(

@@ -179,7 +179,7 @@ class Soak:
             time.sleep(2.0 * REPORT_S)
         self.n_sent_before, self.n_in_before = self.n_sent, n_in
         self.n_out_before, self.n_heard_before = int(self.account['samples out']), self.n_heard
-        # A pause of the wall clock, not of the stamps.
+        # Drop the latencies of the samples before discovery.
         self.latencies.clear()
 
     def reload(self, path: str) -> None:

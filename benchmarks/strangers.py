@@ -42,7 +42,8 @@ from thermo_comp.fitting import FitOptions
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.posterior import Posterior
 
-#: Options of the models by the package: the fit, and two baselines beside constants and cubic.
+#: Options of the three models that the package fits: the fit itself, and two of the four
+#: baselines.
 PACKAGE: dict[str, dict[str, Any]] = {
     'fit': {},
     'golovach': {'model': 'golovach'},
@@ -217,8 +218,9 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     """
     Return a calibration whose covariance has no constants: bias, scale and misalignment.
 
-    One pose determines the constants to 50 mg only. They cancel in its drift, but not in a
-    difference of two variances: ``a^2`` times the variance of a scale factor has the noise of `a`.
+    One pose determines the constants to 50 mg only. The constants cancel in the drift of one pose,
+    but not in a difference of two variances: ``a^2`` times the variance of a scale factor has the
+    noise of `a`.
     """
     if calibration.posterior is None:
         return calibration
