@@ -44,7 +44,7 @@ def part(of: Columns, begin: float, end: float) -> Columns:
 
 
 def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple[Start, Rest]]:
-    """Return what a node that starts with a part would have logged of it."""
+    """Return the rest log that a node would write if it started at the beginning of a part."""
     compensator = Compensator(calibration)
     correction = compensator.thermal.correction
     start = Start(

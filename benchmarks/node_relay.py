@@ -178,7 +178,7 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _ratio(runs: list[dict[str, Any]], naive: list[dict[str, Any]]) -> float:
     """
-    Divide each run's CPU time by that of the naive relay just before it; return the median ratio.
+    Divide each run's CPU time by the naive relay's in the run before; return the median ratio.
 
     The speed of a machine changes over minutes by more than the differences to be measured.
     """
@@ -207,8 +207,7 @@ def _expect(process: subprocess.Popen[str], word: str) -> None:
 @contextmanager
 def _cores_kept_awake(may_sleep: bool) -> Iterator[bool]:
     """
-    Request from the system that cores do not sleep while this is open; return whether it is
-    possible.
+    Keep the cores awake as long as the context is open; yield whether the system allows it.
     """
     with ExitStack() as stack:
         asked = False

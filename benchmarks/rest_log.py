@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Measures the cost of the rest log: CPU time per sample and latency of the node with and without it.
+Measures the cost of the rest log: CPU time per sample and latency of the node with and without the
+log.
 
     python benchmarks/rest_log.py [--rates 400 1000 10000] [--seconds 60]
 
@@ -60,7 +61,7 @@ def cost(
 
 
 def tail_latencies(file: Path) -> tuple[Floats, Floats]:
-    """Return the p99 latency [ms] of each even second, with the log, and of each odd one."""
+    """Return the p99 latency [ms] of each even second (log on) and odd second (log off)."""
     stamp_ns, latency_ns = np.load(file)
     second = stamp_ns // 1_000_000_000
     # Exclude the first and the last second, which are incomplete.

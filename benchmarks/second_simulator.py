@@ -88,7 +88,7 @@ def unit_of(kind: str, seed: int) -> SimpleNamespace:
     def signed(low: float, high: float) -> Floats:
         return np.asarray(draw.uniform(low, high, 3) * draw.choice([-1, 1], 3))
 
-    # The order of the draws must not change, as it defines the units.
+    # The order of the random draws defines the units, so it must not change.
     unit = SimpleNamespace(
         scale_factor=4e5 * (1.0 + 0.01 * draw.standard_normal(3)),
         constant=normal(1500.0),

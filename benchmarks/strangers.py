@@ -82,7 +82,7 @@ def fitted(
     study: Study, prior: thermo_comp.Calibration | None = None, **model: Any
 ) -> thermo_comp.Calibration:
     """Fit a study's bags; `model` holds further options."""
-    # The option `gravity_sd` of a study is left out for a version of the package without it.
+    # Leave out the option `gravity_sd` for versions of the package that lack this option.
     known = {option.name for option in fields(FitOptions)}
     options = {name: value for name, value in study.options.items() if name in known}
     if prior is not None:

@@ -86,7 +86,7 @@ def part(bag: Bag, rows: slice, name: str) -> Bag:
 
 
 def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
-    """Cut a recording, or a rest of it, into blocks by the clock."""
+    """Cut a recording, or one rest of a recording, into blocks by the clock."""
     number = (bag.time_s // BLOCK_S).astype(int)
     edges = np.flatnonzero(np.diff(number, prepend=-1, append=-1)).tolist()
     return {

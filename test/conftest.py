@@ -26,7 +26,7 @@ from hypothesis import settings
 ROOT = Path(__file__).resolve().parent.parent
 
 # One BLAS thread, as several threads for many small matrices wait for each other on a busy
-# machine. The variable is set before numpy is imported, which reads it.
+# machine. Set the variable before the import of numpy, which reads it.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
@@ -38,20 +38,21 @@ os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WO
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.pop('ROS_STATIC_PEERS', None)
 
-# A shell starts background processes with SIGINT ignored, and their children inherit this.
+# A shell starts background processes with SIGINT ignored, which their children inherit: restore
+# it.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# No deadline, as the duration of an example depends on the machine.
+# Examples of hypothesis have no deadline, because their duration depends on the machine.
 settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
-# For `make nightly`; a test that states its number of examples keeps it.
+# Profile of `make nightly`; tests with a stated number of examples keep this number.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
-#: The longest files first: parallel workers begin with them, so that no worker is left with a long
-#: file at the end (`make test` keeps this order).
+#: The longest test files, in order of duration: `make test` begins with these files, so that no
+#: worker runs a long file at the end.
 _LONG = (
     *('fleet_run', 'cli_help', 'real_data', 'fitting', 'record', 'faults', 'fitting_selection'),
     *('priors', 'regime', 'docs', 'degenerate', 'gyroscope', 'cli_demo', 'few_positions'),

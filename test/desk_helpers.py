@@ -136,14 +136,14 @@ class Desk:
 
     def run(self, command, cli=None):
         """
-        Run one example as written, with a shorter wait; it must succeed. Each example has a new
-        folder, except that fleets share one.
+        Run one example as written, with a shorter wait for subscribers; the example must succeed.
+        Each example has a new folder, except that fleets share one.
         """
         words = shlex.split(command, comments=True)
         assert words.pop(0) == 'thermo_comp'
         outputs = {after for word, after in itertools.pairwise(words) if word == '-o'}
         self._n += 1
-        # A fleet is continued in its folder; a second run reports the existing results.
+        # A second `fleet fit` in the same folder reports the existing results.
         here = self._folder / ('fleet' if words[0] == 'fleet' else f'run{self._n}')
         (here / 'bags').mkdir(parents=True, exist_ok=True)
         for word in words:

@@ -4,7 +4,7 @@
 Owns the fault bench: it sends messages over DDS to the real node process and collects the output.
 
 Messages are sent at full speed in lots of some hundred; after each lot the bench waits until the
-node's diagnostics account for every sample. Because of these waits, no message is lost by
+node's diagnostics account for every sample. Because the bench waits, no message is lost by
 accident, a fault shows in at least one report, and the result does not depend on the machine.
 """
 
@@ -116,7 +116,7 @@ class Bench:
             while not publisher.get_subscription_count():
                 pause.wait(0.01)
                 assert self.process.is_alive, self.process.said
-        # The node's reader knows the new writer once it has acknowledged that nothing is missing.
+        # The node's readers need a moment to discover the new publishers completely.
         pause.wait(0.5)
 
     def close(self):
@@ -176,19 +176,19 @@ class Bench:
         return n
 
     def meet(self):
-        """Send samples with later stamps until the first of them comes back."""
+        """Send samples with later stamps until the node returns the first of them."""
         pause = threading.Event()
         standing = _STANDING.copy()
         for k in range(1000):
             stamp_ns = START_NS + (100_000 + k) * 1_000_000_000
-            # A unit at rest at constant temperature: even a long wait gives the node's checks
-            # nothing to reject, and its thermometers nothing to learn.
+            # Send a unit at rest at constant temperature, which the node's checks accept for any
+            # time.
             standing[2] += 1.0
             self.send([('board', stamp_ns, _REST[0]), ('counts', stamp_ns, tuple(standing))])
             pause.wait(0.02)
             if self._frames:
                 break
-        # Messages sent before discovery are lost; count from here.
+        # Messages sent before discovery are lost: start the counts anew.
         last_ns = stamp_ns + 1_000_000_000
         standing[2] += 1.0
         self.send([('counts', last_ns, tuple(standing))])

@@ -27,7 +27,7 @@ START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5
 READINGS_HZ = 2.5
 DURATION_S = 320.0
-#: The platform turns until this time and is at rest afterwards.
+#: Time until which the platform turns; afterwards it is at rest [s].
 STANDS_S = 40.0
 RAMP_S = (60.0, 120.0)
 RAMP_K_S = 0.1

@@ -60,7 +60,7 @@ def evidence():
 
 @cache
 def certificate():
-    """Render the page of the fit once, as drawing takes seconds."""
+    """Render the page of the fit once, because drawing takes seconds."""
     return render_report(evidence())
 
 

@@ -109,7 +109,7 @@ class Peer:
         )
 
     def call(self, kind, name, request):
-        # Clients are kept, as discovering a service takes longer than its answer.
+        # Keep service clients, because discovering a service takes longer than a call.
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]

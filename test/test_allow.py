@@ -122,7 +122,8 @@ def in_kelvins(rest):
     ],
 )
 def test_what_gives_no_numbers_is_a_sentence(rng, spoil, text):
-    # WHY: each of these faults once ended in a traceback, or readings were dropped silently.
+    # WHY: temperatures of another clock or in mK, and a dead axis, ended in a traceback or were
+    # not reported.
     with pytest.raises(FitError, match=text):
         fit(spoilt(rng, spoil), FORCE)
 

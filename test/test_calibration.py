@@ -205,7 +205,7 @@ def test_refusals_name_key_value_and_rule(old, new, key, message):
 def test_bytes_that_are_no_calibration(content, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
-    # Peers without access to the file get the same message without quotations from it.
+    # `rule` is the message for peers without access to the file: it quotes nothing of the file.
     rule, whole = caught.value.rule or str(caught.value), str(caught.value)
     quotes = whole.startswith('not valid YAML: ')
     assert re.fullmatch(r'not valid YAML( \(line \d+\))?', rule) if quotes else rule == whole

@@ -29,7 +29,7 @@ EXAMPLES = [
     for name, command in COMMANDS.items()
     for line in re.findall(r'^ +(thermo_comp .*)$', command.help or '', re.MULTILINE)
 ]
-# This example runs in a separate process, all others in this one.
+# Example that runs in a separate process; all other examples run in the process of the tests.
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
 # One example of each command that prints figures and ends by itself; `play`, `report` and `fit`
 # are tested in test_cli, test_cli_errors and test_docs.

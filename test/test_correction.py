@@ -155,7 +155,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
     slow = SlowUncertainty(judged, Correction(judged))
     nobody = [0.0] * len(Correction(unit).memory.lags)
     draws = rng.multivariate_normal(np.zeros(n), posterior.covariance(), size=300)
-    # The same state in the static regime, and during the transition of the sets.
+    # Evaluate one state in the static regime (weight 0) and during the transition (weight 0.3).
     weights = np.array([0.0, 0.3])
     pair = np.repeat(np.array([states[-1][1]]), 2, axis=0).T
     pair[3] = weights
@@ -391,7 +391,7 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Beyond a range the difference of the sets is that at the last temperature within both ranges.
+    # Outside both ranges the sets differ as at the last temperature within both ranges.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)

@@ -54,7 +54,7 @@ def test_columns_are_the_derivatives_of_the_measured_force(rng):
 def test_without_positions_the_prior_is_left():
     covariance = constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
-    # With one axis vertical the variances of bias and scale of this axis add.
+    # If an axis is vertical, the variance of |f| is the sum of those of its bias and its scale.
     assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
 
 

@@ -68,7 +68,7 @@ def test_completion_is_a_script_that_bash_takes():
     bash = shutil.which('bash')
     if bash is None:
         pytest.skip('no bash')
-    # The program looks for the shell that started it; the `:` keeps that shell waiting.
+    # thermo_comp looks for the shell that started it; the `:` keeps this shell running.
     words = f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'
     finished = ran(bash, '-c', words)
     assert (finished.returncode, finished.stderr) == (0, '')
@@ -120,7 +120,7 @@ def test_refusals_are_quoted_as_they_are_said():
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10
     sources = ''.join(path.read_text() for path in (ROOT / 'thermo_comp').rglob('*.py'))
-    # Adjacent literals form one sentence.
+    # Join adjacent string literals, which form one message.
     spoken = re.sub(r"'\s+f?'", '', sources)
     for sentence in quoted:
         # Numbers and the text after them are only known at run time.

@@ -123,7 +123,7 @@ def bag(request, tmp_path, store):
             force += NOISE * noise.standard_normal(3)
             for link, kind in links.values():
                 if kind == IMU or row % RATE == 0:
-                    # A barometer lags.
+                    # The barometer is 2 K colder than the board.
                     celsius = 20.0 + warmer - (2.0 if 'baro' in link.topic else 0.0)
                     sent = message(store, kind, stamp_ns, celsius, force)
                     writer.write(link, stamp_ns + 1, store.serialize_cdr(sent, kind))
@@ -173,7 +173,7 @@ def test_every_command_works_on_the_drivers_bag(path, bag, tmp_path, cli):
     cli('replay', bag, '-c', fitted, '-o', tmp_path / 'out.csv', *topics)
     with (tmp_path / 'out.csv').open() as file:
         rows = list(csv.DictReader(file))
-    # A sample with the stamp of the first reading is before it, and does not wait for it.
+    # The first sample arrives before the first reading, and is published without waiting for it.
     assert len(rows) >= SECONDS * RATE - 1
     if not has_board:
         command = 'replay', bag, '-c', tmp_path / 'warm.yaml', '-o', tmp_path / 'o.csv'

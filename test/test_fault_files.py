@@ -22,7 +22,7 @@ from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
-#: Two bags that are fitted in half a second; they are in the working folder.
+#: Bags of a fit that takes half a second, in the working folder.
 FIT = ('bags/01.mcap', 'bags/02.mcap')
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
 GRAVITY = ('--gravity', '9.80665', '--model', 'golovach')

@@ -112,8 +112,8 @@ def test_positions_in_one_bag_are_told_apart(rng):
 
 def test_a_chamber_whose_compressor_cycles_has_one_position(rng):
     # WHY: half of the recording was left out, and each pause of the compressor was a position: 18
-    # bags had 1135, and their fit took ten minutes. WHAT: twelve shakes of three times the noise
-    # belong to the rest, and a turn by 300 urad between two of them is still detected.
+    # bags had 1135 positions, and their fit took ten minutes. WHAT: twelve shakes of three times
+    # the noise belong to the rest, and a turn by 300 urad between two of them is still detected.
     accel = still(rng, 720.0, (0.0, 0.0, 3000.0))
     for start in range(3000, 72000, 6000):
         accel[start : start + 3000] += 0.9 * rng.standard_normal((3000, 3))
@@ -207,7 +207,7 @@ def test_fast_readings_are_averaged(rng):
 
 @pytest.mark.parametrize(
     ('latitude', 'height', 'expected'),
-    # These values of gravity are published for WGS 84 at the equator, the pole and 45 degrees.
+    # Expected: gravity by WGS 84 at the equator, the pole and 45 degrees, as published.
     [(0.0, 0.0, 9.7803253359), (90.0, 0.0, 9.8321849379), (45.0, 0.0, 9.8061977694)],
 )
 def test_normal_gravity_of_the_tables(latitude, height, expected):

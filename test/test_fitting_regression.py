@@ -215,7 +215,7 @@ LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
 def scored(groups, n, rng, *, n_windows, step_s, **changes):
-    """Fit a unit whose errors are of these groups; return its windows, ups and fit."""
+    """Fit a unit whose errors are of the given groups; return windows, directions and fit."""
     used = np.isin(GROUPS, groups)
     truth = Truth(on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used, start_sd=0.3,
                   **changes)  # fmt: skip
@@ -270,7 +270,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
 
 
 def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
-    # Without one of six faces the bias of the axis is not separated from the scale.
+    # Five of the six faces do not separate bias and scale of the axis whose face is left out.
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
     regression, state = begin(windows, up)
@@ -345,7 +345,8 @@ def test_published_huygens_coefficients_come_back(rng):
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
         printed = [f'{got[0]:.5e}', f'{got[1]:.5e}', f'{got[2]:.5e}']
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
-        # The bias is in counts, sf times offset: the offset in g is their ratio.
+        # The fit's bias is sf times offset, in counts: divided by sf it is the published offset
+        # [g].
         bias = K0 * polynomial.polyval(
             t[:40], np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
         )
@@ -383,7 +384,7 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise):
     gain = max(gains) - posterior.log_evidence
     assert gain > 100.0
     assert inactive.gain(wide, asked) == pytest.approx(gain, rel=0.01)
-    # The columns that the data contain are chosen one after another, no other column, none twice.
+    # Exactly the columns that the data contain are chosen, one after the other.
     chosen = inactive.chosen(wide, asked, 4.0, 9)
     assert np.array(GROUPS)[chosen].tolist() == ['board'] * (np.array(GROUPS) == 'board').sum()
     assert inactive.chosen(wide, asked, 4.0, 1).sum() == 1

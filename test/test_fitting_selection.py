@@ -172,7 +172,7 @@ def test_prior_sds_are_those_of_the_weights(calm):
 
 
 def test_no_weight_is_believed_steeper_than_a_data_sheet():
-    # A unit with ten times the steepest slope per kelvin: its prior stays at the limit.
+    # For a unit with ten times the steepest plausible slope the prior sd stays at its limit.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
     regression, state = begin(windows, up)
@@ -189,8 +189,8 @@ def test_truth_lies_within_the_claimed_sd(noisy):
     errors = truth.errors(regression, chosen.posterior)
     # Pruned weights have no sd; the true weights of the idle columns are 0.
     every = np.concatenate([*errors.values()])
-    # About thirty numbers determine their RMS to 13 %, which is slightly less with estimated prior
-    # sd.
+    # Thirty errors determine the RMS of error over claimed sd to 13 %; estimated prior sd lower it
+    # a little.
     assert len(every) > 20
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
     assert np.abs(every).max() < 4.0
@@ -312,7 +312,7 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
     chosen = fit_all(regression, state, prior, fixed, priors)
     assert chosen.posterior.prior.informative is priors[int(away > 0.0)]
     curve = unit_of(chosen.posterior.state, layout)[places]
-    # Both fits have the same data, so their results differ by less than their uncertainties.
+    # With the right prior the fitted curve agrees with the curve of the first fit.
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()
 
 

@@ -200,8 +200,8 @@ def test_curves(bags, options, static, dynamic, is_shared):
     weight = np.linspace(0.0, 1.0, 9)
     columns = sets.columns(t, weight)
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    # Columns are 0 at the reference temperature, and those of the dynamic set in the static
-    # regime.
+    # At the reference temperature only the level of the dynamic set is not 0; in the static regime
+    # all columns of this set are 0.
     nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):
         expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0
@@ -297,7 +297,7 @@ def test_sections_and_kelvins_by_hand(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # The kelvins of column t are its RMS; those of t^2 are its RMS over the largest slope, 2 t.
+    # `kelvins` of a column is its RMS over its largest slope: 1 for t, 2 t for t^2.
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

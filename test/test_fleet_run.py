@@ -171,7 +171,7 @@ def children_of(pid):
 
 
 def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
-    # WHY: each starting worker, and then Dask, printed a traceback.
+    # WHY: on Ctrl-C each starting worker, and then Dask, printed a traceback.
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
     words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
     process = subprocess.Popen(
@@ -189,7 +189,7 @@ def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
     printed, _ = process.communicate(timeout=60)
     assert process.returncode == 130
     printed = printed.splitlines()
-    # Whether Dask had started a worker is random.
+    # Ctrl-C may come before or after the first test has begun.
     assert printed in (
         [f'thermo_comp: interrupted: {state}, kept in out; the same command continues']
         for state in ('no test has begun', '0 of 1 test done')
@@ -220,7 +220,7 @@ class TestScheduler:
         refused = str(fleet / 'B')
         result = fit_fleet(refused, tmp_path / 'out', OPTIONS, scheduler=address)
         assert [row['verdict'] for row in result.rows] == ['refused']
-        # A worker of another version could give another fit under the same key.
+        # A worker with another version of thermo_comp could give another result for the same test.
         monkeypatch.setattr('thermo_comp.fleet.work.__version__', '9.9')
         with pytest.raises(ThermoCompError, match=r'runs thermo_comp \d+\.\d+\.\d+, not 9\.9'):
             fit_fleet(refused, tmp_path / 'other', OPTIONS, scheduler=address)

@@ -138,7 +138,8 @@ class TestDiscovery:
         assert {one.name: list(one.bags) for one in units} == {
             'mems-0001': ['a.mcap', 'd.mcap'],
             'mems-0002': ['b.mcap', 'c.mcap'],
-            # The serial follows from the folder only; one bag cannot be opened at all.
+            # Without a serial in its bags, a unit is named by its folder; one bag cannot be opened
+            # at all.
             tmp_path.name: ['e.mcap'],
             'f.mcap': ['f.mcap'],
         }

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The gravity check: a good calibration passes, an aged one is reported, motion is neither."""
+"""The gravity check: a good calibration passes, an aged one is reported, motion is ignored."""
 
 import math
 
@@ -33,7 +33,7 @@ def test_residual_of_a_good_calibration_is_within_its_sd(rng):
     # The mean of a window of 99 samples has a noise of 0.2 mm/s^2, of 30 windows 0.04 mm/s^2.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
-    assert result.n_windows == 59  # there is no earlier window to compare the first one with
+    assert result.n_windows == 59  # the first of 60 windows has no predecessor
     assert result.is_still
 
 

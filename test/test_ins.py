@@ -24,7 +24,7 @@ def test_a_bias_makes_schuler_s_oscillation(axis):
         if k % 1200 == 0:
             angle = omega * k * dt
             expected = bias / omega**2 * (1.0 - np.cos(angle))
-            # One integration step; the amplitude is 130 m.
+            # Tolerance: the change of the position in an integration step; the amplitude is 130 m.
             assert navigator.position[axis] == pytest.approx(expected, abs=0.1)
             speed = bias / omega * np.sin(angle)
             assert navigator.velocity[axis] == pytest.approx(speed, abs=1e-4)

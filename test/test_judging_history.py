@@ -118,7 +118,7 @@ def test_evaluate_and_report_agree(cli, folder, options):
         assert ours[name] == theirs[name], name
     assert printed.returncode == other.returncode == (0 if ours['is_valid'] else 1)
     assert ours['window_s'] == float(options[3] if options else 60)
-    # The page shows the same figures, with the same length of windows.
+    # The report's page shows the figures of `evaluate`, for windows of the same length.
     text = page.read_text(encoding='utf-8')
     assert f'means over {ours["window_s"]:g} s' in text
     assert ours['verdict'].replace(' ug', ' µg') in text

@@ -113,7 +113,7 @@ def test_drift_with_temperature_is_no_step(rng):
 
 
 def behind_a_low_pass(rng, rest, tau_s, sd):
-    """Replace the noise by first-order noise with this time constant and standard deviation."""
+    """Replace the noise by first-order noise with time constant `tau_s` and sd `sd`."""
     r = np.exp(-1.0 / (rest.rate_hz * tau_s))
     white = sd * np.sqrt(1.0 - r * r) * rng.standard_normal(rest.accel.shape)
     rest.accel[:] = np.array(rest.level) + lfilter([1.0], [1.0, -r], white, axis=0)

@@ -182,7 +182,7 @@ def test_diagnostics_name_what_is_wrong(peer, saved):
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
         driver.counts(stamp_ns + CYCLE_NS, 1.0, 2.0, 3.0)
-        # A stamp that is more than a second older is a jump of time; one slightly older is out of
+        # A stamp older by more than a second is a jump of time, a slightly older stamp is out of
         # order.
         driver.counts(stamp_ns - 5, 1.0, 2.0, 3.0)
         _, status, _ = wait(lambda s, _: 'out of order' in s.message)
@@ -314,7 +314,8 @@ def test_namespace_and_remapping(peer, saved):
         assert '/accel/counts' not in topics
         names = {name for name, _ in node.node.get_service_names_and_types()}
         assert '/imu0/thermo_comp/set_parameters' in names
-        # Two units have two entries, both in the aggregator's group.
+        # Two nodes give two diagnostic entries, both in the group of the aggregator's
+        # configuration.
         _, status, _ = diagnosis(peer)(lambda *_: True)
         assert status.name == '/imu0/thermo_comp: compensation'
         config = ROOT / 'config' / 'diagnostic_aggregator.yaml'

@@ -84,7 +84,7 @@ def test_a_bag_for_each_position_needs_none_of_the_others(rng):
 def test_one_attitude_of_16_bits_has_the_right_scale(rng):
     result = fit([source(words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0)], OPTIONS)
     bias, scale = constants(result)
-    # Norm of one reading with the bias at its prior: 1 m/s^2, about 400 counts.
+    # One attitude leaves scale and bias at their priors, 5 % and 1 m/s^2 (some 400 counts).
     np.testing.assert_allclose(scale, 4200.0 / GRAVITY, rtol=0.05)
     np.testing.assert_allclose(bias, 32768.0, atol=400.0)
     assert result.calibration.unit.full_scale == 65535.0

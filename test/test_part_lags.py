@@ -101,8 +101,8 @@ def test_a_noisy_sensor_in_one_warm_up():
 
 
 def test_bags_of_one_warm_up_predict_another():
-    # Every bag is the same thaw from a freezer, in which the board's temperature determines its
-    # lags.
+    # All bags have the same thaw from a freezer, in which the lags are a function of the board's
+    # temperature.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
     rng = rng_of('thaw')
     unit = navigation(rng, part_s=PARTS_S / 4.0)

@@ -135,7 +135,7 @@ def test_what_no_reader_would_read_is_not_written():
         dump_calibration(whole_bank(('case', 'frame', 'window')))
 
 
-#: The repeatability of the mounting is given, as six faces do not determine it.
+#: The sd of mountings is given, because six faces do not determine it.
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), mounting_sd=1e-6)
 FACES = np.vstack((np.eye(3), -np.eye(3)))
 

@@ -60,7 +60,7 @@ def small_bag(compression, use_chunking=True):
 
 
 def every_cut(content, position, length):
-    """Every byte of the last chunk, and every 17th of the indexes and the summary after it."""
+    """List cuts: at every byte of the last chunk, at every 17th byte after the chunk."""
     end = position + length
     return [*range(position, end), *range(end, len(content), 17), len(content) - 1]
 
@@ -68,7 +68,7 @@ def every_cut(content, position, length):
 def test_cut_at_every_byte_of_the_last_chunk(tmp_path):
     content, position, length = small_bag('none')
     messages = regular_messages(24)
-    # The end of each message in the file, computed by hand from the layout of a chunk.
+    # `last`: the end of each message of the last chunk, by hand from the layout of a chunk.
     at = position + 9 + 40
     last = []
     while at < position + length:

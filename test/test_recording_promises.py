@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The stated and the actual content of a bag; the cost of opening one."""
+"""A bag that contains less than it states is reported; opening a bag costs little."""
 
 import os
 import sqlite3

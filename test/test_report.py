@@ -221,7 +221,7 @@ def test_bag_is_read_in_bounded_memory(tmp_path):
     finally:
         tracemalloc.stop()
     assert opened.n_samples == n_times * len(one.counts)
-    # All columns of this bag would take 32 bytes a sample and more; a block takes a part of it.
+    # All samples and stamps in memory would take more than 32 bytes a sample, a block takes less.
     assert peak < 64 * opened.n_samples
 
 

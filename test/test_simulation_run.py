@@ -193,7 +193,7 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand():
     trace, determinant = -(g0 + g1) / c0 - g1 / c1, g0 * g1 / (c0 * c1)
     root = math.sqrt(trace * trace - 4.0 * determinant)
     modes = np.array([(trace + root) / 2.0, (trace - root) / 2.0])
-    # In a ramp the path to the air heats both capacities, the inner path the board's.
+    # In a ramp the link to the air carries the heat of case and board, the inner link the board's.
     lag = np.array([(c0 + c1) / g0, (c0 + c1) / g0 + c1 / g1])
     shapes = np.array([modes + g1 / c1, [g1 / c1, g1 / c1]])
     amplitude = np.linalg.solve(shapes, lag)
@@ -228,7 +228,7 @@ def test_presets_agree_with_a_numerical_integrator(name):
 
 
 def test_creep_relaxes_towards_its_part():
-    """The creep after a step of a part lags it by its time constant."""
+    """After a step of the part's temperature the creep decays with its time constant."""
     step = np.full((7201, 1), 10.0)
     step[0] = 0.0
     history = PartHistory(('case',), step, np.zeros(1), 1.0)

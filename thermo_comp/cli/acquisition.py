@@ -162,14 +162,15 @@ class Acquisition:
         return cells.part(slice(int(np.searchsorted(cells.time, begin_s)), None))
 
     def _turn(self, cells: Cells) -> int | None:
-        """Find where the sensor first rests in another direction than before [ns]."""
+        """Find the stamp at which the sensor first rests in another direction [ns]."""
         # Search only the new cells and the last `_LOOKED_BACK` earlier cells.
         n_looked, self._n_looked = self._n_looked, len(cells.count)
         cells = cells.part(slice(max(n_looked - _LOOKED_BACK, 0), None))
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # After a quiet position, judge the rest of a noisier position by its own noise.
+        # Search the cells after the last rest alone: a noisier rest is still relative to its own
+        # noise.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [

@@ -103,7 +103,7 @@ def run(arguments: list[str]) -> int:
         output.error(f'this command needs {failure.name}: pip install thermo_comp')
         return 1
     except BrokenPipeError:
-        # The reader closed the pipe (`... | head`): avoid the interpreter's message at its end.
+        # The reader has closed the pipe (`... | head`): avoid the interpreter's message at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as failure:

@@ -173,7 +173,7 @@ def _write_rate(writer: 'BagWriter', spin: 'Spin', duration_s: float) -> None:
 def _write(
     writer: 'BagWriter', runs: Iterator['SimulatedRun'], unit: 'UnitModel', is_imu: bool
 ) -> Iterator[dict[str, int]]:
-    """Write a run by blocks, from its first temperatures on; yield the numbers of messages."""
+    """Write a run block by block, temperatures first; yield the numbers of messages."""
     import numpy as np
 
     from ..recording.blocks import ImuColumns

@@ -42,7 +42,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while drift is corrected: its changes, and advice to the user."""
+    """A parameter that is 1 while the autopilot corrects drift; its changes; advice."""
 
     parameter: str
     since_ns: Sequence[int]
@@ -203,7 +203,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate the rate to the accelerometer's stamps; None if it was logged sparsely."""
+    """Interpolate the angular rate to the accelerometer's stamps; None if logged sparsely."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)

@@ -39,8 +39,8 @@ _TOLERANCE = 0.2
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12
-# Ratio of a cell's scatter to the quiet level, above which the unit is handled: the sd of 12
-# samples of noise stays within a factor of 2 of its mean.
+# Ratio of a cell's scatter to the quiet level, above which the unit is handled: the sd of a cell
+# of 12 noise samples stays within a factor of 2 of its mean.
 _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements
 

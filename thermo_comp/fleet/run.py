@@ -245,7 +245,8 @@ class Results:
             texts = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
             return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, texts)))})
         if outcome.calibration:
-            # Until the record is written, its hash differs from the file's: the unit is not done.
+            # Write the record last: before, its hash differs from the calibration's, and the unit
+            # counts as missing.
             content = outcome.calibration.encode()
             files.write_atomically(folder / CALIBRATION, content, files.CALIBRATION)
             (folder / CERTIFICATE).unlink(missing_ok=True)

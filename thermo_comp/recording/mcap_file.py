@@ -90,7 +90,7 @@ class McapFile(BagFile):
         return loaded
 
     def _load(self, channels: Collection[int], span: Span) -> Messages:
-        """Read a span; other records than messages were read when the file was opened."""
+        """Read the messages of a span; all other records were read when the file was opened."""
         return load(self._read_at, span, lambda *_: None).of_channels(channels).in_order()
 
     def _read_at(self, at: int, n_bytes: int) -> bytes:

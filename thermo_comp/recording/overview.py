@@ -123,7 +123,8 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         cells, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        # Readings are kept in memory: a thermal test has few readings compared with its samples.
+        # All temperature readings fit into memory, because a test has far fewer readings than
+        # samples.
         readings: dict[str, list[Readings]] = {}
         clock = _Clock()
         for block in reader.blocks():

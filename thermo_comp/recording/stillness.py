@@ -7,8 +7,8 @@ Two tests are relative to the quiet level of the bag: the variance inside a cell
 handling) and the step between adjacent cells (a turn, a knock). A step starts a new interval,
 because a tilt of one microradian is already one micro-g. Temperature tilts a unit at rest, too: a
 steady change over the cells around, slower than the Earth rotates, is a drift and not a step. Two
-tests are absolute, because a flight also has a quietest tenth: a sensor at rest scatters by no
-more than its noise, and does not rotate.
+tests have absolute limits, because the quietest tenth of a flight is no rest: a sensor at rest
+scatters by no more than its noise, and does not rotate.
 """
 
 from __future__ import annotations
@@ -344,7 +344,7 @@ def _one_g(cells: Cells) -> float:
 
 
 def is_under(cells: Cells, still_sd: float) -> Bools:
-    """Whether a cell scatters by no more than a sensor at rest, or by rounding."""
+    """Whether the scatter of a cell is at most that of a sensor at rest, or of rounding."""
     ceiling = np.maximum((still_sd * _one_g(cells)) ** 2, cells.quantum**2)
     return np.asarray((cells.variance <= ceiling).all(axis=1))
 

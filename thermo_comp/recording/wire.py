@@ -125,7 +125,7 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
         raise _misfit(kind)
     width = int(size[0]) if (size == size[0]).all() else HEAD_BYTES
     rows = gather(messages.data, messages.start, width)
-    # Usually all have the same length, byte order and frame length.
+    # Usually all messages have the same length, byte order and length of frame_id.
     for key in (size, number_at(rows, 0, 'u2'), number_at(rows, 12, 'u4')):
         if (key != key[0]).any():
             columns = np.empty(n, np.int64), np.empty((n, n_numbers)), np.empty(n, object)

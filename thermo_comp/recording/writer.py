@@ -28,7 +28,7 @@ from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
 from .serialized import Messages
 from .wire import encode_stamped
 
-STAMP_END_NS = 2**31 * 10**9  # ROS stamps are from 0 to below this [ns]
+STAMP_END_NS = 2**31 * 10**9  # upper limit of ROS stamps, exclusive [ns]
 _AUTO_FLUSH_BYTES = 1 << 26
 #: Format of a table by its suffix.
 TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}

@@ -194,7 +194,7 @@ class Evidence:
 
 
 def given(value: _T | None) -> _T:
-    """Return a value that is not None: a figure is drawn only if its data exist."""
+    """Return a value that is not None, because a figure is drawn only if its data exist."""
     if value is None:
         raise ValueError('`evidence` lacks the data of this figure')
     return value

@@ -20,7 +20,7 @@ from sensor_msgs.msg import Imu, Temperature
 
 #: Compensates a sample: stamp and three components in, force and covariance out; None = dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
-#: Corrects the angular rate of the same sample: stamp and rate in, rate and variances out.
+#: Corrects the angular rate of a sample: stamp and rate in, rate and variances out.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 
 #: Longest message read [bytes]; an Imu with the longest frame name is shorter.
@@ -149,7 +149,7 @@ def _plain(data: bytes, size: int, message_type: Any) -> tuple[bytes, int]:
     """Return a message in plain form, by rclpy if needed, and the offset of its values or 0."""
     start = _values_at(data, size)
     if not start and len(data) <= _LONGEST_MESSAGE:
-        # RuntimeError: rclpy cannot read it. ValueError: a name is not UTF-8.
+        # RuntimeError: rclpy cannot read the message. ValueError: a frame name is not UTF-8.
         with suppress(RuntimeError, ValueError):
             data = serialize_message(deserialize_message(data, message_type))
             start = _values_at(data, size)

@@ -122,7 +122,8 @@ class Reporter:
         self._publisher.publish(array)
         if message.level != self._level:
             self._level, log = message.level, self._node.get_logger()
-            # rclpy fixes the severity of a place of call, so each severity has its own call.
+            # rclpy allows one severity per call in the source, so each severity needs a separate
+            # call.
             if message.level == DiagnosticStatus.OK:
                 log.info(message.message)
             elif message.level == DiagnosticStatus.WARN:
@@ -158,7 +159,7 @@ class Reporter:
                 text = f'{n_publishers} publishers on {topic}'
                 yield _ERROR, f'{text}, the topic is not used until only one of them sends'
             elif n_publishers > 1:
-                # The middleware lists a killed publisher until its lease ends.
+                # The middleware lists a killed publisher until the lease of the publisher ends.
                 yield _WARN, f'{n_publishers} publishers on {topic}, of which one sends'
             elif not n_publishers and (mismatch := _mismatch(self._node, source.subscription)):
                 level = _ERROR if name in ('sample', 'board') else _WARN

@@ -147,7 +147,7 @@ def declare(node: Node) -> NodeConfig:
     if len(inputs) == 1:
         given['input'] = inputs[0]
     for name, entry in _TABLE.items():
-        # The value is checked here, because rclpy refuses an integer for a float.
+        # Check the value here and not in rclpy, which refuses an integer for a float.
         values[name] = _checked(name, given.get(name, entry.default))
         node.declare_parameter(name, values[name], descriptor(name), ignore_override=True)
     return NodeConfig(**values)

@@ -173,7 +173,7 @@ class Player:
 
     def _await_acknowledgement(self, role: Role) -> None:
         publisher = self._publishers[role]
-        # Polled: waiting inside rclpy would block this process's other threads.
+        # Poll for acknowledgements: waiting inside rclpy would block the other threads.
         is_done = partial(publisher.wait_for_all_acked, Duration())
         if not wait_until(is_done, PATIENCE, ACKNOWLEDGEMENT_NAP):
             name = publisher.topic_name

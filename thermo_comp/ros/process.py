@@ -4,8 +4,8 @@
 Owns the set-up of a process before its first node: handling of signals, Fast DDS profile.
 
 The middleware's signal handlers shut the context down while it is in use, which sometimes ends in
-a segmentation fault. With this module a thread asks the loop to stop, which shuts everything down
-in order.
+a segmentation fault. With this module a thread asks the loop to stop, and the loop shuts
+everything down in order.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class SignalWatch:
     If the process has not ended `ending_s` [s] after the call, it is ended.
     """
 
-    # The call comes from another thread: while the main thread waits in the middleware, the
-    # interpreter runs no signal handlers.
+    # Another thread makes the call: while the main thread waits in the middleware, the interpreter
+    # runs no signal handlers.
 
     def __init__(self, ending_s: float | None = None) -> None:
         self._ending_s = ending_s
@@ -67,7 +67,7 @@ class SignalWatch:
         os.close(self._reader)
 
     def on_signal(self, stop: Callable[[], None]) -> None:
-        """Set the function to call, once or twice; a past signal calls it at once."""
+        """Set the function that a signal calls; a signal that has arrived calls it at once."""
         self._stop = stop
         if self._is_over:
             stop()

@@ -3,8 +3,8 @@
 """
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
-Messages do not identify their publisher. While a topic has more than one publisher it is ignored,
-and so is the first batch afterwards, which may still be from the publisher that left
+Messages do not identify their publisher. A topic with more than one publisher is ignored, and so
+is the first batch afterwards, which may still be from the publisher that left
 (`waitloop.Sources`).
 """
 
@@ -147,7 +147,7 @@ class Relay:
         )
 
     def successor(self, loaded: LoadedCalibration, model: Model, config: NodeConfig) -> Running:
-        """Build the next `Running`; the present one does not change."""
+        """Build the next `Running`; the present `Running` does not change."""
         now, settings = self.running, config.compensator_config()
         compensator, converter, samples = now.compensator, now.converter, now.samples
         if model is not compensator.thermal.model or settings != compensator.config:
