@@ -179,7 +179,7 @@ def count_bytes() -> None:
 
 
 def bytes_written() -> int:
-    """Return the number counted by `count_bytes`."""
+    """Return the number of bytes counted by `count_bytes`."""
     from distributed.comm.tcp import TCP
 
     return int(TCP.n_written)

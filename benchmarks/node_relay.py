@@ -58,7 +58,7 @@ ROLES = ROOT / 'benchmarks' / 'relay_roles.py'
 # Wait for discovery [s]: the interval of DDS announcements, 3 s, and a third of a second for each
 # of three processes.
 MEETING_S = 4.0
-# Effective while open: the longest wake-up time in us, as a native 32-bit number.
+# File that limits the wake-up time of the cores while open: a native 32-bit number [us].
 LATENCY_REQUEST = Path('/dev/cpu_dma_latency')
 CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
 

@@ -113,7 +113,7 @@ def triad(kind: str, seed: int = 0) -> UnitModel:
 
 
 def unit_of(kind: str, seed: int = 0) -> UnitModel:
-    """Return a triad, or a specimen of a kind of the package."""
+    """Return a triad of this module, or a unit of a kind of the package."""
     return triad(kind, seed) if kind in TRIAD_NAMES else unit_preset(kind, seed)
 
 
@@ -128,7 +128,7 @@ def _tempcos(draw: Specimen, parts: list[str]) -> list[Effect]:
 
 
 def _slips(draw: Specimen) -> list[Effect]:
-    # Per axis a joint that slips abruptly and a joint that slips gradually.
+    # Each axis has a joint that slips abruptly and a joint that slips gradually.
     effects: list[Effect] = []
     for i in range(3):
         for is_gradual in (False, True):

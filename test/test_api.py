@@ -84,7 +84,7 @@ def test_readings_beside_the_samples_are_those_at_times_of_their_own(arrays):
         for here in [~np.isnan(arrays[name])]
     }
     again = unit.correct(arrays['time_s'], arrays['counts'], **pairs)
-    # Third: each reading is repeated up to the next, as in a merged table.
+    # In a merged table each reading is repeated up to the next reading.
     filled = {
         name: np.repeat(arrays[name][~np.isnan(arrays[name])], 10) for name in ('board', 'case')
     }

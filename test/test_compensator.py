@@ -214,7 +214,7 @@ def test_a_stamp_that_leaps_ahead_needs_a_second_one(run):
     for stamps, kept in (
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),  # a gap, confirmed twice
-        # Two separate damaged stamps; two damaged stamps in falling order.
+        # Cases: two separate damaged stamps, and two damaged stamps in falling order.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -247,8 +247,7 @@ def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
 @pytest.mark.parametrize('ahead_s', [0, 2])
 def test_readings_of_a_long_time_without_samples_all_count(n_before, ahead_s):
     """
-    WHY: of thermometers at 50 Hz that arrived 41 s before the samples, a block lost the newest
-    readings.
+    WHY: if readings at 50 Hz arrived 41 s before the samples, a block lost the newest readings.
 
     WHAT: readings of a silence of any length are applied in order, as in a node.
     """

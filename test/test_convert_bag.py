@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags by others: topics of any name, ROS 1 and 2, and units recognised at rest."""
+"""Bags of other programs: topics of any name, ROS 1 and 2, units recognised at rest."""
 
 import numpy as np
 import pytest

@@ -161,7 +161,7 @@ def test_what_was_corrected_is_left_out(tmp_path, rng, course, kept, share):
     np.testing.assert_array_equal(read.accel, force[0][kept])
     assert f'INS_TCAL1_ENABLE was 1 for {share} % of the samples' in read.chosen
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
-    # The temperatures continue, as the fit needs the thermal history.
+    # Temperatures of the dropped part stay, because the fit needs the thermal history.
     assert len(read.temperatures['board'].celsius) > 1
 
 
@@ -213,7 +213,8 @@ def test_damaged_formats_are_refused(tmp_path, rng, columns, message):
     log.write('IMU', 1000, 0, *np.zeros(6), 0, 0, 30.0, 1, 1, 1000, 1000)
     body = bytearray(log.body)
     if 'longer' in message:
-        # The length in the second FMT message, which follows the 89 bytes of the first.
+        # Position of the length in the second FMT message, which follows the 89 bytes of the
+        # first.
         body[89 + 4] -= 10
     path = tmp_path / 'damaged.BIN'
     path.write_bytes(body)

@@ -175,7 +175,7 @@ AIR = 'vehicle_air_data:uint64_t timestamp;uint64_t timestamp_sample;float baro_
 
 
 def write_combined(path, rng, later=None, **parameters):
-    """Write a log with PX4's default profile, from before it logged single sensors."""
+    """Write a log of a PX4 version that did not log single sensors by default."""
     log = UlogWriter(COMBINED, AIR)
     for name, value in parameters.items():
         log.message('P', parameter(name, value))
@@ -214,7 +214,7 @@ def test_the_combined_sensor_stands_in(tmp_path, rng, cli):
     np.testing.assert_array_equal(read.accel, force)
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
-    # The barometer's thermometer is the only one, so it must become the board's.
+    # The only thermometer in the log, the barometer's, must become the board's.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, 40.0 + np.arange(6))
     assert 'case' not in read.temperatures
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout

@@ -98,7 +98,7 @@ def test_who_follows_the_proposals_gets_a_good_test():
     for _ in range(18):
         covariance = constants_covariance(up, np.full(len(up), SD))
         up = np.vstack([up, next_direction(covariance, SD, up)])
-    # First the faces, starting upright; then directions that determine the misalignment.
+    # Recommended are first the faces, upright before all, then directions for the misalignment.
     assert up[0].tolist() == [0.0, 0.0, 1.0]
     assert {tuple(row) for row in up[:6]} == {tuple(face) for face in FACES}
     proposed = worst_sd(constants_covariance(up, np.full(18, SD)))

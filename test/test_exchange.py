@@ -89,7 +89,7 @@ def test_px4_formula_gives_our_bias(cubic):
         for celsius in (5.0, 20.0, 33.0, 45.0):
             d = celsius - p['TC_A2_TREF']
             offset = sum(p[f'TC_A2_X{power}_{axis}'] * d**power for power in range(4))
-            # Nine digits are written, as in a float32.
+            # PX4's file has nine digits, which determine a float32.
             assert offset == pytest.approx(bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9)
 
 

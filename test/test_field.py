@@ -63,7 +63,7 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Every second parameter: blocks have odd lengths, so each kind is tested on some axis.
+    # Test every second parameter: as blocks have odd lengths, each kind is tested on some axis.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()

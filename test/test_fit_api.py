@@ -46,7 +46,7 @@ def left_by(groups):
 def test_a_knee_of_the_bias_is_found():
     unit, left = left_by(('curve', 'bend'))
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
-    # Trial knees are a kelvin apart: the fit uses the two on either side of the true knee.
+    # Trial knees are a kelvin apart: the fit uses the trial knees on either side of the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
     # Between the two knees the fitted slope is a mean, wrong by at most 20 ug/K times a quarter
     # kelvin, in one of the 22 kelvins of the recording.

@@ -131,7 +131,7 @@ def test_few_and_badly_spread_positions_are_said(good):
 
 
 def test_geometry_is_the_scatter_of_the_parameters(rng):
-    # The second route is Monte Carlo: least squares of noise of the norm on the nine parameters.
+    # Expected by Monte Carlo: least-squares fits of the nine parameters to noise of the norm.
     up = positions(12, 5)
     x, y, z = up.T
     jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))

@@ -268,7 +268,7 @@ def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
     assert outside.sections['outside'].n == most.n
     rows = results(evidence_of_fit(result), CertificateInfo(), ())
     assert {'K2 x', 'K3 z'} < {row.quantity for row in rows}
-    # A tumble at 1 g later keeps what the centrifuge has shown.
+    # A later tumble at 1 g, with this calibration as the prior, keeps the nonlinear terms.
     still = [Position(program, position) for position in positions(6, 2)]
     later = arrays(unit, still, 9, rate_hz=2.0)
     tumble = [source(run, None, f'still{k}') for k, run in enumerate(later)]

@@ -170,8 +170,8 @@ def test_time_origin_does_not_matter(rng):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # Cells of half a second fill windows of 10 s; 30 samples at 4 Hz do not, and 30 at 1 Hz last
-    # longer.
+    # Cells of half a second fill a window of 10 s; cells of 30 samples do not at 4 Hz (7.5 s) and
+    # 1 Hz (30 s).
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
 def test_windows_are_as_long_as_stated(rate_hz, cell_s, window_s, rng):

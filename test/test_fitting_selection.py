@@ -37,7 +37,7 @@ IDLE = np.array(GROUPS) == 'idle'
 
 
 def constants(truth):
-    """No columns yet, and wrong noise parameters."""
+    """Return the prior of a fit without columns, with wrong noise parameters."""
     return prior_of(
         truth, (), offset_sd=MICRO, offset_scale=30.0 * MICRO, sigma=np.full(3, 5.0 * MICRO),
         noise=Noise(), misalignment_sd=1e-3,

@@ -59,7 +59,7 @@ def test_a_value_at_the_same_stamp_replaces_the_last_one():
 def test_what_is_not_known_of_a_lag():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
-    # 50 s without a reading are more than a tenth of 100 s, not of 1000 s.
+    # A gap of 50 s is more than a tenth of the time constant 100 s, but not of 1000 s.
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])

@@ -151,7 +151,7 @@ def test_reload_while_samples_flow(peer, tmp_path):
 
 
 class _Stop(BaseException):
-    """The exception raised at a line."""
+    """The exception that `raising_at` raises."""
 
 
 def raising_at(number, call):

@@ -3,7 +3,7 @@
 """
 Recordings by other people through `fit`, with the figures of docs/real_data.md.
 
-Skipped with a reason if the recordings are absent.
+The tests are skipped with a reason if the recordings are absent.
 """
 
 import re

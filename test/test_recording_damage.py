@@ -251,7 +251,7 @@ def test_claims_are_not_believed(tmp_path, record, reason):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(RecordingError, match=reason):
         read(path)
-    # Whatever length the record states, the reader takes no more than a chunk of 64 MiB [KiB].
+    # Whatever length a record states, the reader takes less than 100 MB (ru_maxrss is in KiB).
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 

@@ -198,7 +198,7 @@ def test_overlapping_chunks_of_single_topics_are_merged(tmp_path):
     WHY: a tool that writes a chunk per topic puts the temperatures after the samples that they
     belong to; in file order each would apply a chunk too late.
 
-    PROMISE: log-time order.
+    PROMISE: messages of such chunks are merged in log-time order.
     """
     messages = regular_messages(200)
     by_topic = sorted(

@@ -230,7 +230,7 @@ def driver_bag(path, *topics, metadata=None):
         ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
         ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
         ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),
-        # Two equivalent topics, and vectors that are not forces.
+        # No choice among two equivalent topics, nor among vectors that are not forces.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
         # A topic is the node's output if it has the regime topics beside it.

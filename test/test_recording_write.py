@@ -59,7 +59,7 @@ def test_rosbags_and_mcap_read_back_what_was_written(
                 bag.write_bool('regime/dynamic', log_ns, linear[:, 0] > 0)
                 bag.write_raw('diagnostics', 'std_msgs/msg/String', log_ns, raw)
                 bag.flush()
-                for name in 'ctibr':  # as called above
+                for name in 'ctibr':  # order of calls
                     written += [(group, time, name) for time in log_ns.tolist()]
                 expected = dict.fromkeys('cti', (stamp_ns, linear))
         file = path if is_file else path / 'bag_0.mcap'

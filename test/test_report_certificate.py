@@ -131,7 +131,7 @@ def test_a_mistake_in_the_statements_is_one_sentence(tmp_path, text, said):
 def test_the_example_is_accepted_and_is_what_the_page_shows():
     example = ROOT / 'config' / 'lab.example.yaml'
     info = load_certificate_info(example)
-    # All fields except the serial, which the calibration contains, and the remarks.
+    # The example file states all fields except the remarks and the serial of the unit.
     assert info.gravity.source == 'national gravity network'
     assert [instrument.name for instrument in info.instruments] == ['chamber', 'thermometers']
     page = (ROOT / 'docs' / 'recording.md').read_text(encoding='utf-8')

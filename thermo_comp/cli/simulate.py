@@ -34,7 +34,7 @@ def simulate(
         'Kind of unit: thermostatted, bare-quartz, mems, or demo (that of the sample bags).',
         'thermostatted',
     ),
-    unit_seed: int = option('Seed of the specimen of this kind of unit.', 1, min=0),
+    unit_seed: int = option('Seed of the specimen of the chosen kind of unit.', 1, min=0),
     plan: str | None = option(
         'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
         'tumble, tumble-3, tumble-1, held-out; on a rotation: centrifuge or rate-table.'

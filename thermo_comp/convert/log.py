@@ -80,7 +80,7 @@ class ForeignLog:
 
 @dataclass(frozen=True)
 class Stillness:
-    """Rests of a recording and the readings there, in its unit; NaN without a rest."""
+    """Rests of a log, and its samples at rest in the unit of the log; NaN without a rest."""
 
     magnitude: float  # median |a| of the quiet cells
     noise: float  # median sd per axis of the quiet cells

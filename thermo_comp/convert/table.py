@@ -285,7 +285,7 @@ def _iso_ns(text: str) -> int:
     year, month, day, hour, minute, second = (int(part or 0) for part in moment)
     try:
         seconds = timegm(datetime(year, month, day, hour, minute, second).timetuple())
-    except ValueError:  # for example a thirteenth month
+    except ValueError:  # an invalid date, as in month 13
         return NO_STAMP
     east_s = 3600 * int(hours or 0) + 60 * int(minutes or 0)
     seconds += east_s if sign == '-' else -east_s

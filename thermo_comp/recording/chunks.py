@@ -247,7 +247,7 @@ def expand(packed: Path, target: Path) -> str | None:
 def inflate(
     compression: str, packed: Any, limit: int, step: int = _STEP_BYTES, *, is_torn: bool = False
 ) -> Bytes:
-    """Decompress bytes, of a torn piece the readable part; DamagedError beyond the limit."""
+    """Decompress bytes, or the readable part of a torn piece; DamagedError beyond the limit."""
     if not compression:
         return np.asarray(packed)
     pieces: list[bytes] = []

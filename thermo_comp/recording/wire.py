@@ -77,7 +77,7 @@ def decode_blocks(
         except RecordingError as error:
             raise RecordingError(error.message, key=shown(topics[role].name)) from error
         if role == 'accel':
-            # Fast test for a constant frame.
+            # Test quickly whether frame_id is constant.
             text = frame.tobytes()
             is_one = text == text[: frame.itemsize] * len(frame)
             changes = [] if is_one else rank[1:][frame[1:] != frame[:-1]].tolist()

@@ -131,7 +131,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         messages: Sequence[bytes] | Messages,
         definition: tuple[str, str] | None = None,
     ) -> None:
-        """Write serialized (CDR) messages; without a `definition` the type must be in Jazzy."""
+        """Write serialized (CDR) messages; a type that is not in Jazzy needs its `definition`."""
         times = _as_times('log_ns', log_ns, len(messages))
         if not isinstance(messages, Messages):
             messages = Messages.of(messages, np.zeros(len(messages)), times)

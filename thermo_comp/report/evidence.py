@@ -153,7 +153,7 @@ class Evidence:
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions, with the attitudes by the best correction of `forces`."""
+        """The still positions, with attitudes computed from the best correction of `forces`."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()

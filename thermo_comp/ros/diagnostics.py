@@ -132,7 +132,7 @@ class Reporter:
                 log.error(message.message)
 
     def _force_excess(self, calibration: Calibration) -> float:
-        """Return how far |f| of the last sample is above the fit's largest [m/s^2], or 0."""
+        """Return by how much the last sample's |f| exceeds the largest |f| of the fit [m/s^2]."""
         last = self._relay.running.converter.last_result
         if last is None or calibration.nonlinearity is None:
             return 0.0

@@ -123,7 +123,7 @@ class CompensationNode:
         return self._relay.running.compensator
 
     def _prepare(self, changes: list[Parameter]) -> tuple[LoadedCalibration, Model] | None:
-        """Read, try and build the calibration of a change, in parallel to the samples."""
+        """Read, try and build the calibration of a parameter change, parallel to the samples."""
         names = [change.value for change in changes if change.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
@@ -133,7 +133,7 @@ class CompensationNode:
     def _set(
         self, changes: list[Parameter], new: tuple[LoadedCalibration, Model] | None
     ) -> SetParametersResult:
-        """Apply a change as a whole between two samples, or change nothing."""
+        """Apply a parameter change as a whole between two samples, or change nothing."""
         before = after = self._relay.running
         loaded, model = new or (before.loaded, before.compensator.thermal.model)
         config = parameters.updated(before.config, changes)

@@ -77,7 +77,7 @@ class SignalWatch:
             self._is_over = True
             self._stop()
             if not select.select([self._reader], [], [], self._ending_s)[0]:
-                # The orderly end has hung for `ending_s`.
+                # The process has not ended by itself within `ending_s`.
                 os._exit(0)
             number = os.read(self._reader, 1)
             if number:

@@ -81,7 +81,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
 
 
 def read_within(name: str, directory: str, limit_s: float = LIMIT_S) -> LoadedCalibration:
-    """Do `read` in a thread; CalibrationError if the file hangs."""
+    """Run `read` in a thread; CalibrationError if the file hangs."""
     answer: Future[LoadedCalibration] = Future()
 
     def run() -> None:
@@ -110,7 +110,7 @@ class Reader:
         self._process: subprocess.Popen[bytes] | None = None
 
     def read(self, name: str, directory: str) -> LoadedCalibration:
-        """Do the function `read` in the process, within the time limit."""
+        """Run the function `read` in the process, within the time limit."""
         try:
             if self._process is None:
                 self._begin()

@@ -132,7 +132,7 @@ class Relay:
 
     @property
     def inputs(self) -> dict[str, RawSubscription]:
-        """The samples, then the readings, by their names in the diagnostics."""
+        """Subscriptions by their names in the diagnostics: samples first, then thermometers."""
         return {'sample': self.samples, **self.thermometers}
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
@@ -197,7 +197,7 @@ class Relay:
         compensator = self.running.compensator
         last_ns = compensator.now_ns
         if last_ns is not None:
-            # No real stamp is later than the last sample by more than the silence.
+            # The clock went on for at most `silence_ns` since the last sample was stamped.
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:
@@ -223,7 +223,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay up to the last reading received before the last sample; return later samples."""
+        """Relay samples and readings by arrival; return the samples after the last reading."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))

@@ -28,7 +28,7 @@ from .reader import LoadedCalibration
 
 #: Messages that are summed at a time, unless a report comes first.
 BLOCK = 1024
-#: Largest size of the file of a day, and of the folder [bytes]: 10 MB a month at most.
+#: Largest size of the file of a day, and of the folder [bytes]; a month takes 10 MB at most.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 #: Files of a day that are not larger than this [bytes] are not thinned to bound the folder.
 _FLOOR = 16_000
@@ -57,7 +57,7 @@ class RestLog:
             raise OutputError('parameter `rest_log`: the folder is closed to the node', folder)
         self.n_rests = self.n_days = self.n_lost = 0
         self.reason = ''
-        self._is_torn = True  # the last line may be incomplete
+        self._is_torn = True  # the file's last line may be incomplete
         self._start = b''
         self._day = ''
         self._lines: Queue[tuple[str, bytes, bytes] | None] = Queue(_WAITING)
@@ -65,7 +65,7 @@ class RestLog:
         self._thread.start()
 
     def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
-        """Queue the line of a rest, and the line of the start of the node before it."""
+        """Queue the line of a rest, preceded by the line of the node's start if necessary."""
         day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
         try:
             self._lines.put_nowait((str(day), start, rest))
