@@ -123,7 +123,7 @@ def test_an_offset_is_taken_away(tmp_path):
 
 @pytest.mark.parametrize('unit', ['ms', 'us'])
 def test_a_counter_of_32_bits_continues_at_its_end(tmp_path, unit):
-    # WHY: Arduino's micros() begins again after 71.6 min; a fit read a part of such a log.
+    # WHY: Arduino's micros() begins again after 71.6 min; a fit read only a part of such a log.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     ticks = [(2**32 - 2000 + 10 * k) % 2**32 for k in range(400)]
@@ -135,7 +135,7 @@ def test_a_counter_of_32_bits_continues_at_its_end(tmp_path, unit):
     report = write_log(log, tmp_path / 'bag')
     assert (report.findings['continued'].count, report.findings['continued'].lines) == (1, (202,))
     assert report.findings['backwards'].count == 0
-    # A clock that is set back elsewhere is no end of a counter.
+    # A clock that is set back from a small value is not a counter that begins again.
     lines[200] = lines[200].replace(lines[200].partition(',')[0], '1000.0')
     path.write_text('\n'.join(lines))
     report = write_log(table_log(path, column_map()), tmp_path / 'other')
@@ -148,11 +148,11 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
     lines = path.read_text().splitlines()
     for k in range(201, 401):
         at, _, rest = lines[k].partition(',')
-        lines[k] = f'{float(at) - 2500.0},{rest}'  # by 2.5 s, in the middle of the log
+        lines[k] = f'{float(at) - 2500.0},{rest}'  # set back by 2.5 s
     path.write_text('\n'.join(lines))
     write_log(table_log(path, column_map()), tmp_path / 'bag')
     board = read_recording(tmp_path / 'bag').columns.temperatures['board']
-    # One change in 40 rows. A reading precedes the sample of its row.
+    # The temperature changes once in 40 rows. A reading precedes the sample of its row.
     assert board.after.tolist() == list(range(0, 400, 40))
 
 
@@ -165,7 +165,7 @@ def test_readings_that_are_no_temperatures_are_left_out(tmp_path):
         lines[k] = lines[k].rpartition(',')[0] + ',-127'
     path.write_text('\n'.join(lines))
     report = write_log(table_log(path, column_map()), tmp_path / 'bag')
-    assert report.findings['impossible'].count == 2  # held for two rows, it is one reading
+    assert report.findings['impossible'].count == 2  # a reading held for two rows counts once
     board = read_recording(tmp_path / 'bag').columns.temperatures['board']
     assert board.celsius.min() == 25.0
 

@@ -196,14 +196,14 @@ def test_a_slow_log_of_one_attitude_is_in_seconds(tmp_path, step, since):
 
 
 def test_some_repeated_rows_leave_a_time_a_time(tmp_path):
-    # WHY: a table in which one row in seven was written twice had `not a rising time`.
+    # WHY: a table in which one row in seven was written twice was refused as `not a rising time`.
     times = [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)]
     assert guess_columns(slow_table(tmp_path / 'log.csv', 'time', times)).stamp.unit == 's'
 
 
 def test_stamps_since_1970_state_their_unit(tmp_path):
-    # No temperature, one attitude: the size of the stamps alone decides. A count of us since
-    # power-up that has the size of a date in s has steps of hours then.
+    # Without a temperature, in one attitude, the size of the stamps alone shows their unit. If a
+    # count of us had the size of a date in s, its steps would be hours.
     for unit, since, step in (('s', START_NS // 10**9, 2), ('ms', START_NS // 10**6, 5000),
                               ('us', START_NS // 10**9, 10_000)):  # fmt: skip
         path = slow_table(tmp_path / f'{unit}.csv', 'time', [since + step * k for k in range(900)],
@@ -221,7 +221,7 @@ def test_stamps_since_1970_state_their_unit(tmp_path):
     ],
 )
 def test_times_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
-    # WHY: minutes were read as seconds; the other cases had one sentence, which did not apply.
+    # WHY: minutes were read as seconds; the message for other times did not apply to them.
     with pytest.raises(RecordingError, match=reason):
         guess_columns(slow_table(tmp_path / 'log.csv', heading, times))
 
@@ -262,14 +262,14 @@ def test_headings_in_a_comment_are_read(tmp_path, comment, sign):
     columns = guess_columns(path)
     assert columns.board.column == 'temp'
     assert len(table_log(path, columns).accel) == 900
-    # A comment of as many words is no heading.
+    # A comment with as many words as the table has columns is not a row of headings.
     path.write_text('\n'.join(['# one two three four five', *rows]) + '\n')
     with pytest.raises(RecordingError, match='5 columns without headings'):
         guess_columns(path)
 
 
 def test_two_columns_of_one_name_are_named_with_the_file(tmp_path):
-    # WHY: it was `Invalid value: column 'temp' is given twice`, a mistake of the command line.
+    # WHY: the message `column 'temp' is given twice` read as a mistake of the command line.
     path = slow_table(tmp_path / 'log.csv', 't', [k / 10 for k in range(900)])
     rows = [f'{row},20.0' for row in path.read_text().splitlines()[1:]]
     path.write_text('\n'.join(['t,ax,ay,az,temp,temp', *rows]) + '\n')

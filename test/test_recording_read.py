@@ -350,7 +350,7 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
 
 
 def test_two_thermometers_of_other_names_are_offered(tmp_path):
-    # WHY: `fit` read neither, and the only message was that no temperature was recorded.
+    # WHY: `fit` read neither thermometer, and said only that no temperature was recorded.
     path = written(tmp_path / 'two', 'imu/die', 'baro/air')
     with open_recording(path, require=('accel',)) as reader:
         assert 'board' not in reader.topics

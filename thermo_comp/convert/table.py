@@ -129,7 +129,8 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = lines[:-1] if len(lines) > 2 else lines
     candidates: list[tuple[int, str, int]] = []
-    # The comma is late: it may be the decimal sign of a table with another delimiter.
+    # The comma is tried late, because it may be the decimal sign of a table with another
+    # delimiter.
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])

@@ -185,7 +185,7 @@ class _Clock:
     n: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    newest_ns: int = 0  # since the last restart
+    newest_ns: int = 0  # newest stamp since the last restart of the clock
     step_ns: float = 0.0
     n_backwards: int = 0  # number of stamps that do not rise above all before
     n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`

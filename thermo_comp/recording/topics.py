@@ -285,7 +285,7 @@ def _said_corrected(name: str) -> str:
 
 
 def _said_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
-    """Note that several topics may be the board's thermometer, so none is read; '' if none is."""
+    """Say which topics may be the board's thermometer, none of which is read; '' without any."""
     names = [
         shown(name)
         for name, (kind, count) in present.items()
