@@ -157,11 +157,7 @@ def columns_from_events(events):
 
 
 def stream(compensator, events):
-    """
-    Run events one by one; return the rows and the indices of the published samples.
-
-    With a gyroscope a row also contains the rate, a thousandth of the sample.
-    """
+    """Run events one by one (rates: sample / 1000); return rows and published indices."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:

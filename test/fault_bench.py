@@ -155,8 +155,7 @@ class Bench:
     def set_parameters(self, **values):
         future = self.ask(**values)
         pause = threading.Event()
-        # Poll the future: its callback would wait for the executor, which waits for the next
-        # answer.
+        # Poll the future: a callback would wait for the executor, which waits for the answer.
         while not future.done():
             pause.wait(0.001)
             assert self.process.is_alive, self.process.said
@@ -181,8 +180,7 @@ class Bench:
         standing = _STANDING.copy()
         for k in range(1000):
             stamp_ns = START_NS + (100_000 + k) * 1_000_000_000
-            # Send a unit at rest at constant temperature, which the node's checks accept for any
-            # time.
+            # Send a unit at rest at constant temperature, which the node's checks always accept.
             standing[2] += 1.0
             self.send([('board', stamp_ns, _REST[0]), ('counts', stamp_ns, tuple(standing))])
             pause.wait(0.02)

@@ -177,11 +177,7 @@ def seconds_of(stamp_ns):
 
 
 def changed(topic, begin_s, end_s, change):
-    """
-    Change the messages of a topic within a span.
-
-    `change(event)` returns the events that replace it.
-    """
+    """Replace each message of a topic within a span by the events of `change(event)`."""
 
     def inject(events):
         result = []

@@ -43,10 +43,7 @@ def shown_of_demo():
 
 def is_alike(got, expected):
     """
-    Compare two outputs: words exactly, numbers within a third.
-
-    Figures may differ on another processor (last bits) or day (speed), but not in order of
-    magnitude.
+    Compare two outputs: words exactly, numbers within a third, as processors and speeds differ.
     """
     if _NUMBER.sub('#', got).split() != _NUMBER.sub('#', expected).split():
         return False

@@ -122,8 +122,7 @@ def in_kelvins(rest):
     ],
 )
 def test_what_gives_no_numbers_is_a_sentence(rng, spoil, text):
-    # WHY: temperatures of another clock or in mK, and a dead axis, ended in a traceback or were
-    # not reported.
+    # WHY: temperatures of another clock or in mK, or a dead axis, ended in a traceback.
     with pytest.raises(FitError, match=text):
         fit(spoilt(rng, spoil), FORCE)
 

@@ -124,8 +124,7 @@ def test_data_are_no_exceptions_but_rows_of_nan(arrays):
     counts[7, 1], counts[9, 2] = np.nan, 32767.0
     board = np.where(arrays['time_s'] < 0.55, np.nan, arrays['board'])
     out = thermal_calibration().correct(arrays['time_s'], counts, board=board, case=arrays['case'])
-    # The first board reading that is left is at the sample of 1 s, so 10 samples have no
-    # temperature.
+    # The first board reading left is at the sample of 1 s: 10 samples have no temperature.
     assert np.isnan(out.specific_force[:10]).all()
     assert np.isnan(out.covariance[:10]).all()
     assert np.isfinite(out.specific_force[10:]).all()

@@ -44,8 +44,7 @@ def test_their_commands_make_them(command, tmp_path, cli):
             before = shipped.columns.temperatures[name]
             np.testing.assert_array_equal(readings.stamp_ns, before.stamp_ns, err_msg=path.name)
             np.testing.assert_array_equal(readings.after, before.after, err_msg=path.name)
-            # The last bit of an exponential may differ on another processor, but not the rounded
-            # counts.
+            # Processors differ in the last bit of an exponential, but not in the rounded counts.
             np.testing.assert_allclose(readings.celsius, before.celsius, rtol=1e-12)
 
 

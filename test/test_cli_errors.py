@@ -181,8 +181,8 @@ class TestEvaluations:
             writer.write_counts(TOPICS.counts, stamps, level)
         finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
         assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-        # The second calibration adds 10 mg by a delta that its constants subtract; it has no
-        # covariance.
+        # The second calibration, without covariance, has a delta of 10 mg and -10 mg in its
+        # constants.
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
         axes = Axes(*[AxisReference(300.0, -30.0)] * 3)

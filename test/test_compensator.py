@@ -246,11 +246,7 @@ def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
 @pytest.mark.parametrize('n_before', [0, 3])
 @pytest.mark.parametrize('ahead_s', [0, 2])
 def test_readings_of_a_long_time_without_samples_all_count(n_before, ahead_s):
-    """
-    WHY: if readings at 50 Hz arrived 41 s before the samples, a block lost the newest readings.
-
-    WHAT: readings of a silence of any length are applied in order, as in a node.
-    """
+    """Temperatures at 50 Hz that arrive 41 s before the samples are applied in order."""
     first = [('accel', k * SECOND_NS // 100, (1.0, 2.0, 2930.0)) for k in range(1, 1 + n_before)]
     readings = [
         (name, k * SECOND_NS // 50, 20.0 + 1e-4 * k + 1e-3 * (k % 7))

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-ArduPilot logs: a converted DataFlash file gives the data of each sensor.
-
-The writer below follows the public description of the format and shares no code with the reader.
-"""
+"""ArduPilot logs: a file written by DataFlash's public description gives each sensor's data."""
 
 import struct
 
@@ -149,8 +145,7 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
     [
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log of ArduPilot's temperature learning was refused, because its parameter ends at
-        # 1.
+        # WHY: a log of ArduPilot's temperature learning, whose parameter ends at 1, was refused.
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )
@@ -213,8 +208,7 @@ def test_damaged_formats_are_refused(tmp_path, rng, columns, message):
     log.write('IMU', 1000, 0, *np.zeros(6), 0, 0, 30.0, 1, 1, 1000, 1000)
     body = bytearray(log.body)
     if 'longer' in message:
-        # Position of the length in the second FMT message, which follows the 89 bytes of the
-        # first.
+        # Position of the length in the second FMT message; the first FMT message has 89 bytes.
         body[89 + 4] -= 10
     path = tmp_path / 'damaged.BIN'
     path.write_bytes(body)

@@ -179,11 +179,7 @@ class TestParquet:
 @pytest.mark.parametrize('suffix', ['csv', 'parquet'])
 @pytest.mark.parametrize('unit', ['s', 'ns'])
 def test_stamps_that_ros_cannot_hold(tmp_path, suffix, unit):
-    """
-    WHY: an integer stamp of 2e10 s overflowed to 600 s, and 1e30 gave all rows one stamp.
-
-    WHAT: a row is in the bag with its stamp, or it is left out and counted.
-    """
+    """A row is in the bag with its stamp, or left out and counted; stamps of 2e10 s overflowed."""
     scale = 10**9 if unit == 's' else 1
     good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]
     bad = [-1, 2**31, 2 * 10**10, 2**62, 2**63] if unit == 's' else [-1, 2**31 * 10**9, 2**63]

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-PX4 logs: a converted ULog file gives the data of each sensor.
-
-The writer below follows the public description of the format and shares no code with the reader.
-"""
+"""PX4 logs: a file written by ULog's public description gives the data of each sensor."""
 
 import struct
 
@@ -94,8 +90,7 @@ def test_log_arrives_in_the_bag(flight, tmp_path, imu):
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # The board temperature is the chip's, at every sample; the case temperature is the
-    # barometer's.
+    # The board temperature is the chip's at every sample, the case temperature the barometer's.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'

@@ -47,8 +47,7 @@ def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
     """Draw a unit with all columns of two sensors."""
     terms = []
     for column in bank(SENSORS):
-        # Weights give some counts of bias and 1e-4 of scale at the edges of a column, whatever its
-        # power.
+        # Weights give some counts of bias and 1e-4 of scale at the edges of a column of any power.
         sd = 10.0**-column.power * size
         bias, scale = np.zeros(3), np.zeros(3)
         bias[list(axes)] = 0.05 * sd * rng.standard_normal(len(axes))
@@ -171,8 +170,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
         for axis, (a, b, c) in enumerate(np.reshape(slow.at(state, nobody), (3, 3))):
             for x in (-9.8, 0.0, 9.8):
                 variance = np.var(scatter[:, 0, axis, k] + scatter[:, 1, axis, k] * x)
-                # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %; the tolerance is
-                # 4 sd.
+                # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %; tolerance: 4 sd.
                 assert a + b * x + c * x * x == pytest.approx(variance, rel=0.33)
 
 
@@ -256,8 +254,7 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # Within 10 s the variance changes only by the thermometer's part: 30 counts/K times some
-        # mK.
+        # Within 10 s only the thermometer's part of the variance changes: 30 counts/K, some mK.
         part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - collected[0][0]) * 1e-9 + 1.0

@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Degenerate inputs through the real commands: inputs that once needed gigabytes, hung, or lost data
-silently.
-
-`benchmarks/degenerate.py` runs every command on every input.
-"""
+"""Inputs that needed gigabytes, hung or lost data; benchmarks/degenerate.py runs all commands."""
 
 import degenerate
 import pytest

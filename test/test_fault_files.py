@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Outputs that cannot be written, and writers that are killed: the old or the new file is complete,
-the error is one line, and the incomplete file of a killed writer can be read.
-"""
+"""Unwritable outputs, killed writers: old or new file complete, one-line errors, bags readable."""
 
 import os
 import re

@@ -186,15 +186,13 @@ def test_six_faces_leave_misalignment_at_its_prior():
     np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
     finding = next(finding for finding in result.findings if finding.name == 'misalignment')
     assert (finding.level, finding.message.startswith('6 positions')) == ('advice', True)
-    # Bias and scale are determined, except for the effect of M of 1 mrad on the faces: half its
-    # square.
+    # Bias and scale are determined, except for half the square of M (1 mrad) on the faces.
     assert scale_sd.max() < 2e-5
     assert np.abs(pulls(result, PLAIN)).max() < 4.0
 
 
 def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng):
-    # WHY: compensated samples, and samples of a triad without drift, were both fitted without a
-    # message.
+    # WHY: compensated samples, and a triad without drift, were fitted without a message.
     records = records_of(PLAIN, positions(9, 1), 4)
     bias, scale, M = PLAIN.bias_at_reference, PLAIN.scale_factor, np.array(PLAIN.M)
 
@@ -236,8 +234,7 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach):
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return corrected.specific_force
 
-    # The noise of the three outputs is equal and cancels: this gives the weight of the dynamic
-    # set.
+    # The equal noise of the three outputs cancels, which gives the weight of the dynamic set.
     output, static, dynamic = forces(None), forces(0.0), forces(1.0)
     gap = dynamic - static
     size = np.linalg.norm(gap, axis=1)

@@ -134,8 +134,7 @@ def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
 
 
 def test_a_time_that_no_position_holds_is_not_claimed(rng):
-    # Positions of twenty minutes do not show a correlation time of hours: the longest time tried
-    # is a fifth of them.
+    # Correlation times up to a fifth of the length of a position (20 min) are tried.
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
     alone = Whitener(np.arange(3), np.zeros(3))

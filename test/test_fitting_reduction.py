@@ -125,16 +125,14 @@ def test_a_chamber_whose_compressor_cycles_has_one_position(rng):
 
 
 def test_a_knock_starts_a_new_position(rng):
-    # The attitude shifts by 1 count of 3000 without any vibration: 300 urad, a step of 20 sd of
-    # a cell mean.
+    # Without vibration the attitude shifts by 1 count of 3000, 300 urad, or 20 sd of a cell mean.
     accel = still(rng, 60.0, (0.0, 0.0, 3000.0))
     accel[3000:] += (1.0, 0.0, 0.0)
     assert len(reduced([block(accel)]).intervals) == 2
 
 
 def test_a_drift_is_no_motion(rng):
-    # A drift of 100 ppm/K at 3 K/min is 0.015 counts per second, or 0.02 sd of a cell mean per
-    # cell.
+    # A drift of 100 ppm/K at 3 K/min is 0.015 counts/s, or 0.02 sd of a cell mean per cell.
     accel = still(rng, 300.0, (0.0, 0.0, 3000.0))
     accel[:, 2] += 0.015 * np.arange(len(accel)) / RATE_HZ
     assert len(reduced([block(accel)]).intervals) == 1
@@ -170,8 +168,7 @@ def test_time_origin_does_not_matter(rng):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # Cells of half a second fill a window of 10 s; cells of 30 samples do not at 4 Hz (7.5 s) and
-    # 1 Hz (30 s).
+    # Cells of 0.5 s fill a window of 10 s; cells of 30 samples do not at 4 Hz and 1 Hz.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
 def test_windows_are_as_long_as_stated(rate_hz, cell_s, window_s, rng):

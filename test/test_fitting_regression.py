@@ -82,8 +82,7 @@ class Dense:
             state.offset.ravel() / prior.offset_sd,
             state.tilt.ravel() / prior.tilt_sd,
             state.start.ravel() / np.sqrt(prior.start_share),
-            # The mean of the initial lag states of all bags has a tenth of the sd of one bag's
-            # state.
+            # The mean initial lag state of all bags has a tenth of the sd of one bag's state.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_share)),
         ]
         for weights, sd in zip(state.weights, prior.column_sd, strict=True):
@@ -147,8 +146,7 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
             mode.covariance / np.outer(sd[:n], sd[:n]), covariance, atol=1e-4
         )
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
-        # Laplace: -2 ln Z = misfit + ln det of noise, of prior and of Hessian; directions have no
-        # prior.
+        # Laplace: -2 ln Z = misfit + ln det of noise, prior, Hessian; directions have no prior.
         precision = regression.precision(wide, mode.layout)
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
@@ -345,8 +343,7 @@ def test_published_huygens_coefficients_come_back(rng):
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
         printed = [f'{got[0]:.5e}', f'{got[1]:.5e}', f'{got[2]:.5e}']
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
-        # The fit's bias is sf times offset, in counts: divided by sf it is the published offset
-        # [g].
+        # The fit's bias is in counts; divided by sf it is the published offset [g].
         bias = K0 * polynomial.polyval(
             t[:40], np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
         )

@@ -88,8 +88,7 @@ def test_what_explains_nothing_is_not_chosen(calm):
 def test_models_that_were_looked_at_show_their_left_out_errors(calm):
     _, selected, truth = calm
     rms = {trial.groups: trial.score.rms for trial in selected.trials}
-    # The first trials are constants, then the curve; their error is the size of the missing
-    # effect.
+    # Constants are tried before the curve; their error is the size of the missing effect.
     assert [*rms][:2] == [(), ('curve',)]
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
@@ -189,8 +188,7 @@ def test_truth_lies_within_the_claimed_sd(noisy):
     errors = truth.errors(regression, chosen.posterior)
     # Pruned weights have no sd; the true weights of the idle columns are 0.
     every = np.concatenate([*errors.values()])
-    # Thirty errors determine the RMS of error over claimed sd to 13 %; estimated prior sd lower it
-    # a little.
+    # 30 errors determine the RMS of error / sd to 13 %; estimated prior sd lower the RMS.
     assert len(every) > 20
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
     assert np.abs(every).max() < 4.0
@@ -329,8 +327,7 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
     chosen, left = drift_left(windows)
     # Tilts of 12 positions x 2 angles x 2 columns determine their sd to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
-    # A tilt of 5 urad changes any axis by 5 ug; the noise of 720 windows is 0.1 ug for each
-    # weight.
+    # A tilt of 5 urad changes an axis by 5 ug; 720 windows give 0.1 ug of noise per weight.
     assert left < 0.5 * MICRO
     assert drift_left(stiff)[1] > 1.0 * MICRO
 

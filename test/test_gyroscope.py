@@ -61,8 +61,7 @@ def rms(values):
 
 @pytest.fixture(scope='module')
 def unit():
-    # A reading every four seconds suffices for lags of minutes, and saves three quarters of the
-    # time.
+    # A temperature every 4 s suffices for lags of minutes, and saves 3/4 of the time.
     return unit_preset('mems', 2).with_thermometers(rate_hz=0.25)
 
 
@@ -258,8 +257,7 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     assert judged.exit_code == 0
     for name in ('static', 'dynamic', 'all'):
         section = rate.sections[name]
-        # The claimed sd is above the noise, and larger than necessary as lags have an unknown
-        # start.
+        # The claimed sd exceeds the noise, because the initial states of the lags are unknown.
         assert 0.7 < section.ratio < 1.2
         assert section.rms < 1.3 * FLOOR
         assert section.raw_rms > 50.0 * FLOOR

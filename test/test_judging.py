@@ -134,8 +134,7 @@ class TestWindows:
         for start_ns, mean in zip(windows.start_ns, windows.force, strict=True):
             inside = (stamps >= start_ns) & (stamps < start_ns + 60 * 10**9)
             assert inside.sum() == 600
-            # A window is corrected along lines of ten seconds, accurate to a thousandth of a
-            # micro-g.
+            # A window is corrected along lines of 10 s, accurate to a thousandth of a micro-g.
             np.testing.assert_allclose(mean, force[inside].mean(axis=0), atol=1e-8)
 
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
@@ -256,8 +255,7 @@ class TestVerdict:
         assert '100 ug tolerated' in judgement.reason
 
     def test_headline_of_seen_windows_is_what_was_left_out(self):
-        # WHY: a fit left 59 ug in sample, 61 ug held out in the same positions, 1091 ug in a new
-        # attitude.
+        # WHY: a fit left 59 ug in sample, 61 ug held out in its attitudes, 1091 ug in a new one.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -268,8 +266,7 @@ class TestVerdict:
         assert seen.reason.startswith(
             '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
         )
-        # The claim is compared with the error in sample, the tolerance with that of left-out
-        # positions.
+        # Claims refer to the error in sample, tolerances to the error of left-out positions.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
@@ -357,8 +354,7 @@ class TestShifts:
     @pytest.mark.parametrize('n', [6, 18])
     def test_what_moved_is_named(self, n):
         moved = around(n, (20.0 * MICRO_G, 0.0, 0.0), (0.0, 30e-6, 0.0), noise=0.5 * MICRO_G)
-        # Windows with 0.5 ug of noise, 12 per position, determine shifts far below 20 ug and 30
-        # ppm.
+        # 12 windows per position with 0.5 ug of noise determine shifts far below 20 ug and 30 ppm.
         judgement = judge(moved, corrected_by(SLOPE, 1e-5), None)
         assert judgement.n_positions >= min(n, 12)
         assert judgement.shifts[0].bias / MICRO_G == pytest.approx(20.0, abs=1.0)
@@ -389,12 +385,7 @@ class TestShifts:
 
 
 def test_thermometers_in_doubt_are_told_offline_too(root, tmp_path):
-    """
-    WHY: replay did not report exchanged thermometers, and evaluate called them valid.
-
-    WHAT: replay and evaluate print the node's message and give no verdict, nor outside the
-    calibrated range.
-    """
+    """Exchanged thermometers, or a temperature outside the calibrated range, give no verdict."""
     exchanged = Topics(board='temperature/case', case='temperature/board')
     for topics, text in ((Topics(), []), (exchanged, [SWAPPED])):
         bag = root / 'bags' / 'held_out.mcap'

@@ -137,8 +137,7 @@ def test_a_part_between_board_and_sensor(rng):
     # An error of the case's lag moves the part in the opposite direction.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
-    # If a part has two inputs, its unknown initial state begins with the later of their first
-    # values.
+    # The unknown initial state of a part of two inputs begins with the later first value.
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)
@@ -156,8 +155,7 @@ def test_the_unknown_start_of_a_lag_of_two_stages(rng):
         parts[:, 0] *= math.exp(-step / tau[0])
         parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
     P = start_covariance([TWO_STAGES])
-    # A variance from n draws has a relative sd of sqrt(2 / n) = 2.2 %; the step of 6 s is 4 % of
-    # 150 s.
+    # Variances from n draws scatter by sqrt(2 / n) = 2.2 %; the step of 6 s is 4 % of 150 s.
     assert np.mean(parts[:, 1] ** 2) == pytest.approx(P[0, 0], rel=0.11)
     for age in (150.0, 900.0, 2700.0):
         first = parts[:, 0] * math.exp(-age / tau[0])
@@ -234,8 +232,7 @@ def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
         e = np.exp(-step / tau)
         m = m * e + walk * (tau / step) * (1.0 - e)
     P = start_covariance([('board', t) for t in tau])
-    # A variance from n draws has a relative sd of sqrt(2 / n) = 2.2 %; the step of 6 s is a tenth
-    # of 60 s.
+    # Variances from n draws scatter by sqrt(2 / n) = 2.2 %; the step of 6 s is 10 % of 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
 
 

@@ -182,8 +182,7 @@ def test_diagnostics_name_what_is_wrong(peer, saved):
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
         driver.counts(stamp_ns + CYCLE_NS, 1.0, 2.0, 3.0)
-        # A stamp older by more than a second is a jump of time, a slightly older stamp is out of
-        # order.
+        # A stamp older by over 1 s is a jump of time, a less old stamp is out of order.
         driver.counts(stamp_ns - 5, 1.0, 2.0, 3.0)
         _, status, _ = wait(lambda s, _: 'out of order' in s.message)
         driver.counts(START_NS - 10 * SECOND_NS, 1.0, 2.0, 3.0)
@@ -214,8 +213,7 @@ def test_diagnostics_tell_noise_and_bias_apart(peer, saved):
             assert bias > 0.0
             of_rate = float(values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'])
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
-            # While the regime is unknown the bias sd contains the sets' difference, about 30
-            # urad/s.
+            # In an unknown regime the bias sd contains the sets' difference, about 30 urad/s.
             assert 1e-5 < float(values[f'bias sd of rate {axis} [rad/s]']) < 1e-3
 
 
@@ -314,8 +312,7 @@ def test_namespace_and_remapping(peer, saved):
         assert '/accel/counts' not in topics
         names = {name for name, _ in node.node.get_service_names_and_types()}
         assert '/imu0/thermo_comp/set_parameters' in names
-        # Two nodes give two diagnostic entries, both in the group of the aggregator's
-        # configuration.
+        # Two nodes give two diagnostic entries in the group of the aggregator's configuration.
         _, status, _ = diagnosis(peer)(lambda *_: True)
         assert status.name == '/imu0/thermo_comp: compensation'
         config = ROOT / 'config' / 'diagnostic_aggregator.yaml'

@@ -40,10 +40,7 @@ def _collected():
 
 def thermal_test(path, imu=False, has_case=True):
     """
-    Write a soak, a ramp and a soak with late readings; return the number of samples.
-
-    A late reading has an earlier stamp than the samples before it in the bag, so that only a node
-    that keeps the order of arrival gives the result of the replay.
+    Write a soak, a ramp, a soak with temperatures after samples of later stamps; count samples.
     """
     rng = np.random.default_rng(11)
     n = MINUTES * 60 * RATE_HZ

@@ -117,8 +117,7 @@ def test_reload_while_samples_flow(peer, tmp_path):
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 5.0
 
-        # A file of another serial is refused, and so is a serial that differs from the file in
-        # use.
+        # A file of another serial is refused, as is a serial that differs from the file in use.
         save_calibration(of_bias(4.0, unit=Unit('T-2', 'counts', 32767.0, 0.01)), third)
         (result,) = peer.set_parameters(serial='T-9')
         assert "unit.serial: must be 'T-9'" in result.reason
@@ -143,8 +142,7 @@ def test_reload_while_samples_flow(peer, tmp_path):
     # From the first output on no sample is lost, repeated or out of order.
     stamps = [stamp_of(message) for message in flow.heard]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
-    # The calibrations apply one after the other, each sample being corrected by exactly one
-    # calibration.
+    # The calibrations apply one after the other; exactly one corrects each sample.
     biases = [flow.bias(index) for index in range(len(stamps))]
     changes = [b for a, b in pairwise(biases) if a != b]
     assert (biases[0], changes) == (1.0, [2.0, 3.0])
@@ -181,8 +179,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
     # WHY: a calibration was refused, and its bias was applied all the same.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    # The new calibration has another detector, so the node must rebuild all parts of the
-    # correction.
+    # For another detector the node must rebuild all parts of the correction.
     save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
     context = Context()
     rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)
@@ -216,8 +213,8 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # The loop must have raised the failure at every executed line of the change, over 150
-        # lines.
+        # The loop must have raised the failure at each of the over 150 executed lines of the
+        # change.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
             change.name: change.value for change in changes

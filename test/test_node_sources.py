@@ -124,8 +124,7 @@ def driver_process(name):
 
 
 def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer, unit):
-    # WHY: after a driver was killed the node published nothing for 20 s, until its DDS lease
-    # ended.
+    # WHY: after a driver was killed the node was silent for 20 s, until the DDS lease ended.
     with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         heard = peer.listen(Imu, 'imu/data_raw')

@@ -85,8 +85,7 @@ def test_no_source_is_too_long_to_read():
 
 
 def test_the_manifest_asks_for_the_node_alone():
-    # The commands' other dependencies come from PyPI; test_node_startup.py runs the node without
-    # them.
+    # Other dependencies of the commands come from PyPI; test_node_startup.py does without.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     assert {key for key in keys if key and key.startswith('python3-')} == {
         'python3-numpy',

@@ -101,8 +101,7 @@ def test_a_noisy_sensor_in_one_warm_up():
 
 
 def test_bags_of_one_warm_up_predict_another():
-    # All bags have the same thaw from a freezer, in which the lags are a function of the board's
-    # temperature.
+    # In the thaw of all bags the lags are a function of the board's temperature.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
     rng = rng_of('thaw')
     unit = navigation(rng, part_s=PARTS_S / 4.0)
@@ -153,8 +152,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
     bump = np.array([450.0, -400.0, 500.0])
     _, study = study_of('bump', bump=bump, bump_c=17.0)
     judgement = judged(strangers.fitted(study), study)
-    # The fit approximates the bump, a bell with an sd of 0.85 K, by lines between knees every 0.5
-    # K.
+    # The fit approximates a bell with an sd of 0.85 K by lines between knees every 0.5 K.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 

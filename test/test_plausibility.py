@@ -44,11 +44,7 @@ def soak(tracker, celsius=20.0, seconds=60, start_s=0):
 
 
 def test_what_a_sensor_says_first_may_be_wrong():
-    """
-    WHY: a DS18B20 reads 85 degC before its first conversion.
-
-    WHAT: the correct readings after it are not taken for an impossible step.
-    """
+    """After the 85 degC of a DS18B20 without a conversion correct readings are accepted."""
     tracker = tracker_of()
     tracker.read('board', 0, 85.0)
     tracker.read('board', SECOND_NS, 85.0)
@@ -119,8 +115,7 @@ def test_a_standstill_within_the_quantum_is_no_fault():
 
 
 def test_readings_that_chance_may_repeat():
-    # With noise of half a quantum a reading repeats with 68 % probability, 54 times in a row with
-    # 1e-9.
+    # With noise of half a quantum a reading repeats with p = 0.68, 54 times with p = 1e-9.
     assert still_readings(ThermometerSettings(0.005, 0.01)) == 54
     assert still_readings(ThermometerSettings(0.005, 0.0)) == STILL_READINGS
 

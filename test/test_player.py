@@ -112,8 +112,7 @@ print(digest.hexdigest())
 
 
 def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng):
-    # More messages than the middleware holds (5000), sent faster than an rclpy callback takes
-    # them.
+    # More messages than the middleware holds (5000), faster than an rclpy callback takes them.
     with BagWriter(tmp_path / 'bag.mcap') as writer:
         stamps = START_NS + np.arange(7000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (7000, 3)), 'imu_link')

@@ -79,8 +79,7 @@ def test_population_is_the_mean_unit_and_its_scatter():
     variance = np.diag(prior.posterior.covariance())
     at = parameter_layout(prior).bias[0].static + 1
     sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
-    # Variance of the prior: scatter of three units times 4/3 (their mean), plus their own
-    # variance.
+    # Variance of the prior: scatter of three units times 4/3 (their mean), plus their variance.
     scatter = []
     for unit in siblings():
         variance = np.diag(unit.posterior.covariance())

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Properties: for any input the output is finite, valid, in order and within physical limits.
-
-The suite tries each property a few times; `make nightly` ten thousand times.
-"""
+"""For any input the output is finite, in order, physical; `make nightly` tries 10 000 inputs."""
 
 import base64
 import json

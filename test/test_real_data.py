@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Recordings by other people through `fit`, with the figures of docs/real_data.md.
-
-The tests are skipped with a reason if the recordings are absent.
-"""
+"""Other people's recordings through `fit`, with docs/real_data.md's figures; skipped if absent."""
 
 import re
 from contextlib import suppress
@@ -88,8 +84,7 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
 
 
 def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
-    # A plot of |a| shows jumps by +20 mg at 366 s and +17 mg at 468 s; a third jump is across
-    # gravity.
+    # |a| jumps by +20 mg at 366 s and +17 mg at 468 s; a third jump is across gravity.
     sources, _ = fit_sources([freezer_bag(real_data, work)])
     with pytest.raises(FitError, match='not a function of temperature') as refused:
         fit(sources, OPTIONS)

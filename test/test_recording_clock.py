@@ -78,8 +78,7 @@ def test_a_message_an_hour_is_no_recording(tmp_path):
 
 @pytest.mark.parametrize(('zone_s', 'n'), [(3600, 40000), (-3600, 1000), (1800, 1000), (20, 1000)])
 def test_thermometers_of_another_time_zone_are_named(tmp_path, zone_s, n):
-    # WHY: without a message about the clocks `replay` corrected samples with the temperatures of
-    # another hour.
+    # WHY: `replay` silently corrected samples with the temperatures of another hour.
     true_ns = START_NS + STEP_NS * np.arange(n)
     text = f'board is stamped {zone_s:+} s from the samples around it: two clocks?'
     with suppress(RecordingError):

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A damaged bag: a truncated one is read to its last complete message and reported; a corrupt one is
-one clear error; no crash, no hang, no memory beyond the file's content.
-"""
+"""A truncated bag is read to its last complete message; a corrupt bag is one clear error."""
 
 import resource
 import struct
@@ -129,11 +126,7 @@ def test_cut_anywhere(data, compression):
 
 
 def test_zeros_at_the_end_are_no_messages(tmp_path):
-    """
-    WHY: after a power failure a file may have its full length and zeros in its last pages.
-
-    PROMISE: no message with a zeroed part is returned.
-    """
+    """No message with a part zeroed by a power failure is returned from a file of full length."""
     messages = regular_messages(24)
     path = tmp_path / 'bag.mcap'
     for is_chunked in (True, False):

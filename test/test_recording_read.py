@@ -145,8 +145,7 @@ def test_directories_written_by_rosbags(messages, storage, compression):
 @settings(max_examples=10, deadline=None)
 @given(messages=bags(lowest=1))
 def test_ros_1_bags(messages):
-    # No equal log times: a ROS 1 bag has an index per topic, and no order between topics for equal
-    # times.
+    # Log times differ, because a ROS 1 bag has no order between topics for equal times.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.bag')
         write_rosbag1(path, messages)
@@ -194,12 +193,7 @@ def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path):
 
 
 def test_overlapping_chunks_of_single_topics_are_merged(tmp_path):
-    """
-    WHY: a tool that writes a chunk per topic puts the temperatures after the samples that they
-    belong to; in file order each would apply a chunk too late.
-
-    PROMISE: messages of such chunks are merged in log-time order.
-    """
+    """Chunks per topic, with temperatures after their samples, are merged in log-time order."""
     messages = regular_messages(200)
     by_topic = sorted(
         messages, key=lambda m: ((m.log_ns - START_NS) // 100_000_000, ALL_TOPICS.index(m.topic))

@@ -222,8 +222,7 @@ def driver_bag(path, *topics, metadata=None):
     [
         # The driver's topic of REP 145 is chosen; the vector of the magnetometer is not a force.
         ([('imu/data_raw', 'imu'), ('imu/mag', 'vector')], '/imu/data_raw'),
-        # The free acceleration and the angular rate of an Xsens are vectors, but no specific
-        # force.
+        # Free acceleration and angular rate of an Xsens are vectors, but no specific force.
         ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
         ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
         # Of a filter's input (imu/data_raw) and output (imu/data) the input is chosen.

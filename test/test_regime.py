@@ -287,8 +287,7 @@ def test_it_closes_with_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # `closes: case` gives the bits of a run without a board; if the case is lost, the board
-    # decides.
+    # `closes: case` gives the bits of a run without a board; without a case the board decides.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)

@@ -77,8 +77,7 @@ def test_metres_of_a_navigator_by_hand():
 def test_map_of_the_sphere_keeps_areas():
     assert of_bags.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert of_bags.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 degrees is 1 - sin 45 of a hemisphere; its map is this part of the unit
-    # disc.
+    # The cap above 45 degrees is 1 - sin 45 of a hemisphere, and maps to this part of the disc.
     x, y = of_bags.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
@@ -223,6 +222,5 @@ def test_no_printed_page_is_empty(tmp_path):
     assert 5 <= len(pages) <= 12
     for page in pages:
         drawn = re.search(rb'\n%s 0 obj.*?stream\r?\n' % page, printed, re.DOTALL)
-        # A page with content has over 200 lines of drawing commands, an empty page has only the
-        # margin.
+        # A page with content has over 200 lines of drawing commands; an empty page has few.
         assert zlib.decompressobj().decompress(printed[drawn.end() :]).count(b'\n') > 200

@@ -80,8 +80,7 @@ def finder():
 
 
 def test_windows_are_means_of_ten_seconds_at_rest():
-    # A rest of 25 s, 1 s of handling, and a rest of 21 s in another attitude give two windows
-    # each.
+    # Rests of 25 s and, in another attitude after 1 s of handling, 21 s give two windows each.
     first, second = standing(25 * RATE_HZ), standing(21 * RATE_HZ, 2)[:, [2, 1, 0]]
     handled = first[:RATE_HZ] + np.linspace(0.0, 900.0, RATE_HZ)[:, None]
     samples = np.concatenate((first, handled, second))
@@ -144,8 +143,7 @@ def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
     changed = bytearray(content)
     changed[place % len(content)] = value
     left = [one for _, one in decode(bytes(changed))[0]]
-    # A changed byte loses one rest, by a lost newline two, or all rests if it damages the start
-    # line.
+    # A changed byte loses one rest, two by a lost newline, or all by a damaged start line.
     assert all(one in [rest(k) for k in range(9)] for one in left)
     assert len(left) >= 7 or place % len(content) < len(encode(START))
 

@@ -128,8 +128,7 @@ def test_an_acceleration_at_another_rate_has_another_noise(rng):
         recording(8000, 400.0, lambda _: tuple(GRAVITY * u + rng.normal(0.0, 1e-3) for u in UP)),
     )
     assert len(rows) == 8000
-    # Four times as fast samples average over a quarter of the time, and have four times the
-    # variance.
+    # At four times the rate samples average over a quarter of the time: four times the variance.
     assert rows[-1][3] / rows[0][3] == pytest.approx(4.0, rel=1e-6)
 
 

@@ -53,8 +53,7 @@ def test_a_perfect_model_leaves_the_noise(kind):
         norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # The mean square of the walk over 7.3 h is 9 * 7.3 / 2 per axis; three runs scatter
-        # widely.
+        # The walk's mean square over 7.3 h is 9 * 7.3 / 2 per axis; three runs scatter widely.
         assert 4.0 < vector < 20.0
     else:
         # The RMS of 1311 means scatters by 2 % (norm) and 1.2 % (vector); the limits are 5 sd.
@@ -230,11 +229,7 @@ def test_sum_of_counts_is_the_integral_within_one_count(rng):
 
 
 def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing():
-    """
-    WHY: a float sum of 1e9 counts has no digits left for the fraction.
-
-    WHAT: integer and fraction are separate, so that a day ends at the exact count.
-    """
+    """A day ends at the exact count; a float sum of 1e9 counts has no digits for fractions."""
     charge = np.full((400_000, 1), 2978.0 + 1.0 / 3.0)
     remainder = np.zeros(1, dtype=np.int64)
     total, n_cycles = 0, 0

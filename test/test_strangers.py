@@ -109,8 +109,7 @@ def test_cold_start_is_as_cold_as_the_air_and_then_warms_up():
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
     for bag, heat in ((cold, 0.0), (warm, 2.0)):
         board, case = bag.temperatures['board'][1][0], bag.temperatures['case'][1][0]
-        # Tolerance: the chamber's ripple of 0.03 K, and 0.3 s of self-heating before the first
-        # reading.
+        # Tolerance: the chamber's ripple of 0.03 K, and self-heating for 0.3 s at the start.
         assert board - case == pytest.approx(heat, abs=0.1)
 
 

@@ -93,8 +93,7 @@ def test_one_direction_only(tmp_path):
 
 
 def test_a_quantum_is_no_ramp(tmp_path):
-    # Readings in whole degrees that alternate: a step of 1 K within a second is no ramp of 60
-    # K/min.
+    # Temperatures alternate between whole degrees: 1 K within 1 s is no ramp of 60 K/min.
     flips = 20.0 + (np.arange(3600) % 2)
     result = survey(tmp_path / 'bag', flips)
     board = result.thermometers['board']
