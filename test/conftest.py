@@ -25,8 +25,7 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# One BLAS thread, as several threads for many small matrices wait for each other on a busy
-# machine. Set the variable before the import of numpy, which reads it.
+# One BLAS thread: several wait for each other on a busy machine. numpy reads this at import.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
@@ -50,8 +49,7 @@ settings.load_profile('usual')
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
-#: The longest test files, in order of duration: `make test` begins with these files, so that no
-#: worker runs a long file at the end.
+#: The longest test files, in order of duration, with which `make test` begins.
 _LONG = (
     *('fleet_run', 'cli_help', 'real_data', 'fitting', 'record', 'faults', 'fitting_selection'),
     *('priors', 'regime', 'docs', 'degenerate', 'gyroscope', 'cli_demo', 'few_positions'),

@@ -136,8 +136,7 @@ class Desk:
 
     def run(self, command, cli=None):
         """
-        Run one example as written, with a shorter wait for subscribers; the example must succeed.
-        Each example has a new folder, except that fleets share one.
+        Run one example with a shorter wait for subscribers, in a new folder (fleets share one).
         """
         words = shlex.split(command, comments=True)
         assert words.pop(0) == 'thermo_comp'

@@ -47,8 +47,7 @@ class Row:
     silent: tuple[tuple[float, float], ...] = ()
     #: Span before the fault can be detected, in which the output may be wrong.
     blind: tuple[float, float] = (0.0, 0.0)
-    #: Time from which the output is within 1 ug of the output without the fault [s]; 0: always;
-    #: inf: never.
+    #: Time from which the output is within 1 ug of the fault-free output [s]; inf: never.
     recovered: float = 0.0
     #: Time from which stamps are ahead of the truth, and by how much [s].
     shift: tuple[float, float] = (math.inf, 0.0)

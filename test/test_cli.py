@@ -76,7 +76,6 @@ class TestOutput:
 
 def test_a_command_computes_in_one_thread():
     # WHY: on two busy cores a fit took 16 times as long, as BLAS threads waited for each other.
-    # WHAT: the number of threads is set before numpy is imported; a user's setting stays.
     code = (
         'import os, sys; from thermo_comp.cli import app; '
         "app.run = lambda _: print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS']); "

@@ -31,8 +31,7 @@ EXAMPLES = [
 ]
 # Example that runs in a separate process; all other examples run in the process of the tests.
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
-# One example of each command that prints figures and ends by itself; `play`, `report` and `fit`
-# are tested in test_cli, test_cli_errors and test_docs.
+# One example of each command that prints figures and ends; others are tested elsewhere.
 WITH_JSON = {
     example.split()[1]: example
     for example in EXAMPLES

@@ -109,8 +109,7 @@ def test_each_value_by_hand():
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = Layout(spec)
-    # State: board, variance, rate, weight, unknown regime; gradients of case and tip; two lags; a
-    # play.
+    # State: board, variance, rate, weight, unknown regime; case and tip gradients; 2 lags; a play.
     state = np.array(
         [[23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]]
     ).T

@@ -29,8 +29,7 @@ from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.correction import Correction
 
 UNIQUE = [0, 1, 2, 4, 5, 8]
-#: Variance of one message of the plain unit: density^2 / cycle, plus the rounding of a converter
-#: that carries its remainder on.
+#: Variance of one message: density^2 / cycle, plus the rounding with a carried remainder.
 NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
@@ -64,8 +63,7 @@ def assert_same(blocks, rows, index):
 
 
 def test_signed_counts_and_the_printed_equations():
-    # Signed counts of +g and -g: the offset is half their sum, the scale factor follows from half
-    # their difference. Eq. (3) and (4) as printed exchange sum and difference.
+    # Counts of +g, -g: offset = sum / 2, scale = difference / 2; (3), (4) of the paper swap them.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -137,8 +135,7 @@ def at_seconds(*events):
     ]
 
 
-# Examples: a reading from tomorrow, or one already applied, decides which waiting readings are of
-# another clock, also if a cut between blocks separates the readings.
+# A reading from tomorrow, or an applied one, tells which waiting readings are of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)

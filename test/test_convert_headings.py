@@ -237,8 +237,7 @@ def test_a_date_that_is_not_iso_is_shown(tmp_path, cell):
 
 
 def test_a_slower_thermometer_leaves_cells_blank(tmp_path, rng):
-    # WHY: a blank last cell in most rows was taken for the end of the row, so the row with the
-    # headings, which has one cell more, was no part of the table.
+    # WHY: blank last cells of most rows were not counted: the headings had a cell too many.
     accel = 9.8 * (UP + 0.002 * rng.standard_normal(UP.shape))
     rows = [
         f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f},{20 + k / 100 if k % 100 == 0 else ""}'

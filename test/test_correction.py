@@ -137,8 +137,7 @@ def states_of(unit, rng, n=5):
 
 
 def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_posterior(rng):
-    # Levels, curves and all weights are correlated: the corrections of random calibrations at a
-    # state must scatter as SlowUncertainty states, at any specific force.
+    # The corrections of random, correlated calibrations scatter as SlowUncertainty states.
     unit = replace(full_bank(rng), noise_density_m_s2_sqrt_hz=(1e-4,) * 3)
     layout = parameter_layout(unit)
     n = layout.n_parameters
@@ -331,8 +330,8 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
-    # The bias is 0.5 counts/K of the lagged temperature: the slopes of curve and lag cancel for an
-    # error of the thermometer, but not if all parts are 6 K outside the range.
+    # The slopes of curve and lag cancel for an error of the thermometer, but not outside the
+    # range.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bias), dynamic=regime_set(bias),

@@ -21,8 +21,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
-# test_readme runs the session of cli.md with its output; a bag that plays for minutes and a
-# growing bag have their own tests (test_player, test_record).
+# Tested elsewhere: the session of cli.md, a bag that plays for minutes, a growing bag.
 ELSEWHERE = (
     'thermo_comp play bags/held_out.mcap --rate 20',
     'thermo_comp record session --positions 18 --soak 45min -o bags/unit42',

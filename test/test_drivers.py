@@ -209,8 +209,7 @@ def test_the_node_works_as_the_file_says(path, tmp_path):
         topics = {topic.partition(':')[0] for name, topic in names.items() if name != 'output'}
         board, _, field = names['board'].partition(':')
         if field:
-            # The message package is not installed; an installed type is looked up when the driver
-            # sends.
+            # The package is not installed; an installed type is looked up when the driver sends.
             assert topics - {board} <= heard_topics
             with pytest.raises(ThermoCompError, match=f'{board}: its type .* is not installed'):
                 LiveField(board, layout[board], field)

@@ -108,8 +108,7 @@ def test_a_folder_that_is_read_only(folder, cli, name):
     assert line.startswith(f'thermo_comp: error: {locked / name}: ')
 
 
-#: Runs the command and kills itself when the temporary file has been opened, or just before it is
-#: renamed.
+#: Runs the command; kills itself when the temporary file is open, or before its renaming.
 KILLED = """
 import os, signal, sys
 point, target = sys.argv[1:3]

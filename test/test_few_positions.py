@@ -41,9 +41,8 @@ def left_by(pair, **options):
 
 @pytest.mark.parametrize('pair', [(1, 2), (3, 9)])
 def test_two_positions_tell_the_thermal_response(pair):
-    # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine their sd to 6 %, and a few
-    # superfluous columns may add a tenth. Half of all 36 pairs of positions reach this
-    # (docs/accuracy.md).
+    # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine the sd to 6 %, and superfluous
+    # columns may add 10 %. Half of 36 pairs of positions reach this (docs/accuracy.md).
     assert left_by(pair) == pytest.approx([1.2] * 3, rel=0.3)
 
 

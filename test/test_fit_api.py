@@ -48,8 +48,7 @@ def test_a_knee_of_the_bias_is_found():
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
     # Trial knees are a kelvin apart: the fit uses the trial knees on either side of the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # Between the two knees the fitted slope is a mean, wrong by at most 20 ug/K times a quarter
-    # kelvin, in one of the 22 kelvins of the recording.
+    # The mean slope between two knees is wrong by at most 20 ug/K * 0.25 K in 1 of 22 kelvins.
     assert left < 1.5
 
 

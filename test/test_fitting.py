@@ -156,8 +156,7 @@ def test_the_file_holds_the_fit(response, tmp_path):
 
 
 def test_the_compensator_does_what_the_fit_promised(response):
-    # In a new attitude the corrected samples have the noise of left-out positions, and the
-    # published variance covers their error.
+    # In a new attitude the error is that of left-out positions, and within the published sd.
     up = np.array([[0.48, -0.6, 0.64]])
     (record,) = records_of(OWN_LAGS, up, 77)
     compensator = Compensator(response.calibration)
@@ -222,8 +221,7 @@ def test_bags_with_and_without_temperature_contradict_themselves():
 
 
 def test_a_switch_of_the_sets_moves_the_output_gently(golovach):
-    # A switch of sets may change the output by 1 ug per second, or by the difference of the sets
-    # in 300 s, the longest transition (ten times the given 30 s).
+    # A switch of sets changes the output by 1 ug/s, or by the difference of the sets in 300 s.
     (record,) = records_of(PAPER, positions(1, 5), 905)
 
     def forces(weight):
@@ -290,8 +288,7 @@ def test_saturated_samples_are_refused(rng):
 
 
 def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mountings():
-    # Misalignments of some mrad explain the norms of nine positions. Mountings of 5 mg would also
-    # explain the norms, with constants wrong by 5 mg. The noise of a minute is 22 ug.
+    # Misalignments of some mrad explain the norms of nine positions, as would mountings of 5 mg.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
     calibration = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY)).calibration

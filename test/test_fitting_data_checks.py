@@ -74,8 +74,7 @@ def test_a_good_test_passes(good):
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
         ('directions', lambda w: {'rate': np.abs(w.rate)}, 'only heating was recorded'),
         ('soak', lambda w: {'weight': 0.0 * w.weight + 1.0}, 'only 0 % of the windows are static'),
-        # WHY: the static set was wrong by 800 ug at the other temperatures, with a claimed sd of
-        # 100 ug, as its soaks were static at one temperature.
+        # WHY: soaks at one temperature left 800 ug at others, with a claimed sd of 100 ug.
         ('soak', lambda w: {'weight': 1.0 * (np.abs(w.temperature - 20.0) > 3.0)},
          r'% of the windows are static, over [56]\.\d of \d\d\.\d K'),
         ('swapped', lambda w: {'gradient': -w.gradient}, r'are the two sensors exchanged\?'),

@@ -281,8 +281,7 @@ def test_a_slow_ramp_is_not_to_be_missed(rng):
 
 @pytest.mark.parametrize('step', [1.0, 16.0, 1.0 / 300.0])
 def test_a_coarse_sensor_rests_too(step, rng):
-    # An axis that is constant for long, or alternates between two values, is at rest whatever its
-    # quantum; a tenth of the cells has no variance at all.
+    # An axis that is constant, or alternates between two values, is at rest at any quantum.
     slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
     accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))
     bag = reduced([block(np.round(accel) * step)], full_scale=None)

@@ -140,8 +140,7 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
-        # Correlations of 0.999 lose three of the eight digits of the derivatives. The information
-        # of a bag about its own unknowns is computed without the bound on the mean of all bags.
+        # Correlations of 0.999 lose three of the eight digits of the derivatives.
         np.testing.assert_allclose(
             mode.covariance / np.outer(sd[:n], sd[:n]), covariance, atol=1e-4
         )
@@ -176,9 +175,8 @@ def test_truth_comes_out_without_noise(rng):
 
 
 def test_claimed_sd_is_the_scatter():
-    # Under the true priors the inverse Hessian is the Cramer-Rao bound: errors over claimed sd
-    # have an RMS of 1. 36 units with 33 partly correlated numbers each determine the RMS of each
-    # kind of error to 13 % or better.
+    # With true priors (the inverse Hessian is the Cramer-Rao bound) errors / sd have an RMS of 1,
+    # determined by 36 units with 33 partly correlated numbers to 13 % or better.
     rng = np.random.default_rng(11)
     truth = Truth(noise=Noise(0.5, 1000.0), offset_sd=MICRO, start_sd=0.3)
     errors = []

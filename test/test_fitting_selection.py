@@ -109,8 +109,7 @@ def test_what_is_forced_stays(calm):
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
 def test_a_group_must_explain_more_than_an_accident(where, is_chosen):
-    # WHY: a column may fit a single bag, or one part of the program that all bags share. WHAT: the
-    # evidence favours the group in all three cases; left-out data reject it in these two.
+    # The evidence favours the group in three cases; left-out data reject it in the last two.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -126,8 +125,7 @@ def test_a_group_must_explain_more_than_an_accident(where, is_chosen):
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
 def test_a_part_that_lags_is_found_although_no_curve_helps_alone(n_positions, step_s):
-    # WHY: the selection stopped at constants, 440 ug instead of 0.6, as a curve alone did not
-    # help. WHAT: a bias that follows only a lagged temperature is a curve and a lag that cancel.
+    # WHY: a bias that follows only a lagged temperature needs curve and lag together.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     truth = Truth(on_bias=on_bias, on_scale=np.zeros((3, 6)))
@@ -236,8 +234,7 @@ def test_outliers_do_not_pull(calm):
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
     _, other = selected_of(truth, dirty, calm[1].posterior.state.up)
     sd = np.sqrt(one.posterior.variance[one.posterior.layout.bias])
-    # 2 % outliers, each down-weighted to 3 sd, shift the result by less than one sd; at full
-    # weight each counts 100 sd.
+    # 2 % outliers of 100 sd, each down-weighted to 3 sd, shift the result by less than 1 sd.
     assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     used, used_with_outliers = (
@@ -290,8 +287,7 @@ def test_how_bags_begin_is_learnt(start_sd, lower, upper):
 
 @pytest.mark.parametrize('away', [0.0, 30.0])
 def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
-    # WHY: siblings or an old calibration may be nearer to the unit than their claimed sd, or
-    # farther. WHAT: of a narrow and a wide prior the evidence selects the true one.
+    # Siblings may differ by less or more than their sd: the evidence selects the true prior.
     _, one, truth = calm
     state = one.posterior.state
     regression, _ = begin(calm[0].windows, state.up)

@@ -150,8 +150,7 @@ def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     message = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([message])
-    # A silent thermometer is missing after the time-out of 60 s, five intervals of 4 s, and a
-    # window. A constant reading is detected when the other thermometer changes.
+    # A silent thermometer is missing after the time-out of 60 s, 5 intervals, and a window.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])
@@ -199,8 +198,7 @@ def test_curves(bags, options, static, dynamic, is_shared):
     weight = np.linspace(0.0, 1.0, 9)
     columns = sets.columns(t, weight)
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    # At the reference temperature only the level of the dynamic set is not 0; in the static regime
-    # all columns of this set are 0.
+    # At the reference temperature only the level of the dynamic set is not 0.
     nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):
         expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0
@@ -247,8 +245,7 @@ def states_of(windows, calibration):
 
 
 def test_the_file_corrects_as_the_regression(fitted):
-    # Curves, sets and linear columns of the fit give the correction by the calibration. Windows
-    # are means over a minute; powers of means differ from means of powers by some ppm at 1 K/min.
+    # Powers of means over a minute differ from means of powers by some ppm at 1 K/min.
     result, _ = fitted
     windows, calibration = result.fit.windows, result.calibration
     state, prior = result.fit.posterior.state, result.fit.posterior.prior

@@ -99,8 +99,8 @@ def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
         assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
         assert rms(changes) < 1.15 * FLOOR
         assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
-        # The mean rate contains a turn-on of 2 mdeg/s and the Earth's rate: it must be within
-        # three sd of claim and Earth's rate together.
+        # The mean rate (turn-on of 2 mdeg/s, Earth's rate) is within 3 sd of claim and Earth's
+        # rate.
         message = gyroscope.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
         claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
         assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
@@ -207,8 +207,7 @@ def test_a_file_is_refused_by_key():
 
 
 def test_the_rate_is_corrected_by_hand_numbers():
-    # At the reference temperature, without response, the correction of the rate is the constant
-    # bias; the force does not change.
+    # At the reference temperature the rate gets its constant bias, the force no correction.
     triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (triad, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))

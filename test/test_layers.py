@@ -14,8 +14,7 @@ from conftest import ran
 
 PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
 
-# One line per room (a folder, or a module in the package's root). A room that is missing here
-# fails the test, so that its layer must be decided.
+# One line per room: a folder, or a module in the package's root. Each room needs a line.
 LAYERS = {
     '__init__': 0,  # public names, imported for type checkers
     'errors': 0,
@@ -146,8 +145,7 @@ def circle(uses):
 
 @pytest.mark.parametrize('by', ['room', 'file'])
 def test_no_circle(by):
-    # Within a layer a room may use another, but not mutually, and no two files may use each other.
-    # Imports for type annotations do not count.
+    # Neither two rooms nor two files may import each other, except for type annotations.
     uses = {}
     for path in SOURCES:
         text = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)
@@ -167,8 +165,7 @@ def loaded_after(statement, *watched):
 
 
 def test_node_starts_without_the_offline_libraries():
-    # The node runs on the robot's computer for weeks: libraries for fits or plots would cost
-    # memory and start-up time.
+    # Libraries for fits or plots would cost the node memory and start-up time.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     offline = ('rosbags', 'mcap', 'matplotlib', 'scipy', 'scipy.optimize', 'typer', 'rich')
     assert loaded_after('import thermo_comp.ros.node', *offline) == []

@@ -24,8 +24,7 @@ TAUS = (60.0, 900.0, 7680.0)
 
 @pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
 def test_a_lag_of_a_ramp(step_s):
-    # A ramp u = r t from rest gives u - L = r tau (1 - exp(-t / tau)) for any reading interval, as
-    # the input is linear between readings.
+    # A ramp u = r t from rest gives u - L = r tau (1 - exp(-t / tau)) for any interval.
     rate, n = 0.01, 200
     bank = LagBank(TAUS)
     for k in range(n + 1):
@@ -179,8 +178,7 @@ def plays(*widths):
 
 
 def test_the_loop_of_a_play():
-    # A play of half-width 1 is v - 1 while v rises, v + 1 while v falls, and constant over 2 K
-    # after each reversal.
+    # A play of half-width 1 is v - 1 if v rises, v + 1 if v falls, constant for 2 K in between.
     memory = plays(1.0)
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []

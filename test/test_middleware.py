@@ -115,8 +115,7 @@ def wakes_per_sample(peer, drivers, node_arguments):
 
 
 def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, monkeypatch):
-    # The user's profile leaves Fast DDS at its default: a timed event is due with each sample, or
-    # with the first of several samples handled together.
+    # By the user's profile Fast DDS has a timed event with each sample, or group of samples.
     other = tmp_path / 'other.xml'
     other.write_text(OTHER)
     monkeypatch.setenv(VARIABLE, str(other))
@@ -128,8 +127,7 @@ def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, mo
 
 
 def test_what_is_lost_on_the_way_is_repeated(peer, node_arguments, monkeypatch):
-    # The receiver is stopped while twice as many samples are sent as its shared memory queue holds
-    # (512).
+    # The receiver is stopped during twice as many samples as its shared memory holds (512).
     monkeypatch.delenv(VARIABLE, raising=False)
     command = [sys.executable, '-c', RECEIVER]
     with (

@@ -213,8 +213,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # The loop must have raised the failure at each of the over 150 executed lines of the
-        # change.
+        # The loop must have raised the failure at each executed line (over 150) of the change.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
             change.name: change.value for change in changes

@@ -78,8 +78,7 @@ def test_samples_of_a_second_publisher_never_go_out(peer, unit):
         assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
 
 
-#: A driver as a separate process: 100 Hz from its first subscriber on, with its name in each
-#: sample.
+#: A driver process: 100 Hz from its first subscriber on, with its name in each sample.
 DRIVER = """
 import sys, time, rclpy
 from geometry_msgs.msg import Vector3Stamped

@@ -92,8 +92,7 @@ def test_an_environment_that_ros_cannot_use(name, value, text, unit, monkeypatch
 
 
 def test_closed_streams_are_no_signal(unit):
-    # WHY: with stderr closed, the pipe for signals got its descriptor, and a letter of the log was
-    # taken for a signal.
+    # WHY: if stderr was closed, the signal pipe got its descriptor, and log text was a signal.
     peer = Peer()
     shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
     words = [*shell, '-m', 'thermo_comp.ros.node', *arguments(f'calibration_file:={unit}')[1:]]

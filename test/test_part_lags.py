@@ -88,8 +88,7 @@ def test_a_part_between_board_and_case():
 
 
 def test_a_noisy_sensor_in_one_warm_up():
-    # WHY: a spline of 60 nodes over 50 K explained the drift with twice the time constant of an
-    # axis, and left 80 ug; a curve of few nodes determines the time constants.
+    # WHY: a spline of 60 nodes gave twice the time constant of an axis, and left 80 ug.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
     rng = rng_of('noisy thaw', 2)
     unit = navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
@@ -158,8 +157,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
 
 
 def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
-    # Another simulator: heads that lag the board, pendulums that lag the heads, and an error
-    # proportional to the stress between board and pendulum.
+    # Heads lag the board, pendulums lag the heads; the error is the stress board - pendulum.
     unit = second_simulator.unit_of('products', 2)
     # Two equal stages of the x axis are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
@@ -227,8 +225,7 @@ def test_a_curve_between_two_soaks_is_claimed():
 
 
 def test_a_curve_that_the_soaks_do_not_show_is_claimed():
-    # Each axis is vertical at another temperature: constants explain all norms, whatever the
-    # curve. WHY: the slope was claimed to be zero, and the error was fifteen times the claimed sd.
+    # WHY: with each axis vertical at another temperature the error was 15 claimed sd.
     rng = rng_of('confounded soaks')
     unit = navigation(rng)
     faces = np.vstack((np.eye(3), -np.eye(3), np.eye(3)))
@@ -239,8 +236,7 @@ def test_a_curve_that_the_soaks_do_not_show_is_claimed():
 
 
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
-    # WHY: bags of soaks do not show the lags, and their unchanged left-out drift refused the
-    # columns that the bag of ramps needs: 325 ug instead of 260 ug with the soaks alone.
+    # WHY: left-out soaks, which show no lags, refused the columns of the bag of ramps.
     rng = rng_of('soaks and a ramp')
     unit = navigation(rng)
     ramps = positions(unit, HALF, spread(1, rng), rng)

@@ -81,8 +81,7 @@ def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # At detection the frozen reading is wrong by what makes the other sensor's change significant:
-    # some quanta plus a kelvin. A frozen case is detected by the board, which lags by 10 K.
+    # A frozen board is wrong by some quanta + 1 K, a frozen case by the board's lag of 10 K.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead

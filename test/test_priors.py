@@ -114,8 +114,7 @@ def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch):
 
 
 def test_siblings_make_one_position_worth_more():
-    # WHY: one position in the chamber does not determine the scale over temperature. WHAT: with
-    # the prior of siblings the fit is better than alone, in positions that were left out.
+    # One position does not determine the scale over temperature, but the siblings' prior does.
     few = [source(record) for record in test_of(9, 0, 1)]
     options = replace(OPTIONS, serial='unit-9')
     alone = fit(few, options).calibration
@@ -139,8 +138,7 @@ def test_new_rests_make_an_old_calibration_better():
     later = [source(record) for record in test_of(9, 9, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5)
     new = fit(later, options).calibration
-    # Three positions measure three combinations of the six levels, which aged by 10 ug (bias) and
-    # 20 ug (scale): on average half of the variance due to ageing must be removed.
+    # Three positions measure three of six levels: half of the ageing variance is removed.
     grown = np.mean(sd_of_levels(old) ** 2 + options.ageing_bias**2)
     assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
     bias = [(a.bias - b.bias) / a.scale_factor for a, b in zip(new.axes, old.axes, strict=True)]
@@ -148,9 +146,8 @@ def test_new_rests_make_an_old_calibration_better():
 
 
 def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
-    # WHY: an update in the field has an hour at the temperature of the day, and no data sheet.
-    # WHAT: biases that changed by 200 ug are estimated although no change was stated; the
-    # calibration is valid where the old one was, with the same residual.
+    # An hour at one temperature, without data sheet, shows a change of biases by 200 ug; the
+    # calibration stays valid in its whole range, with the same residual.
     moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
     old = fitted(9).calibration
 

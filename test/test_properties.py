@@ -163,8 +163,7 @@ def whole_range(of):
 @settings(deadline=None, max_examples=max(120, settings.default.max_examples))
 @given(edited())
 def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree):
-    # WHY: a delta of 1e300, a lag of 1e-300 s and a weight of 1e160 were accepted; the output was
-    # not finite, or its covariance invalid.
+    # WHY: deltas of 1e300, lags of 1e-300 s or weights of 1e160 gave output that is not finite.
     content = yaml.dump(dict(tree), Dumper=yaml.CSafeDumper, allow_unicode=True).encode()
     try:
         of = parse_calibration(content, 'unit.yaml')

@@ -134,15 +134,13 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     assert len(raw) >= 17 * len(sets) // n_sets
     # Compare drifts about their mean, because one attitude does not determine the constants.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # White noise of 1.5 mg per root hertz leaves 0.19 mg in a minute; longer parts are
-    # interpolated over a wider range, and the first of five parts is extrapolated.
+    # 1.5 mg/sqrt(Hz) leaves 0.19 mg in a minute; the first of five parts is extrapolated.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 
 def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
     bag = freezer_bag(real_data, work)
-    # The parts are after the last jump; times count from the first sample, 1.5 s after the zero of
-    # the log. The freezer was knocked near 860 and 1134 s.
+    # The parts are after the last jump; the freezer was knocked near 860 and 1134 s.
     parts = [Part(518.5, 638.5), Part(860.5, 1130.5), Part(1134.5, 1938.5)]
     seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts]
     calibration = fit(seen, OPTIONS).calibration
@@ -154,8 +152,7 @@ def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
     assert section.raw_rms > 1.7 * floor
     assert section.rms < 1.3 * floor
     assert 0.3 < section.ratio < 2.0
-    # The datasheet of the MPU6050 states 5 mdeg/s/sqrt(Hz); 12.7 samples a second without a filter
-    # also contain the noise above 6 Hz.
+    # MPU6050 datasheet: 5 mdeg/s/sqrt(Hz); samples at 12.7 Hz without a filter have more noise.
     assert 30.0 < np.degrees(density) * 1e3 < 45.0
 
 

@@ -130,15 +130,13 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # The slowest detection is that of a ramp of 0.2 K/min by a thermometer with steps of 1 K
-        # behind a lag of 15 min: it needs two changes of the reading, 5 min apart.
+        # Slowest: 0.2 K/min in steps of 1 K behind a lag of 15 min, as two steps are needed.
         assert each[-1][0] < 0.5 * end_s
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_soaks_stay_static(sensor):
-    # The run is 15 h of ripple and self-heating. At the required 0.05 switches an hour 0.4
-    # openings are expected; more than 2 have a probability below 1 %.
+    # At the required 0.05 switches an hour more than 2 openings in 15 h have p < 0.01.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -242,8 +240,7 @@ RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
 def test_dynamic_ends_when_the_lag_has_died():
-    # The board's true rate falls below the relaxed 0.05 K/min about 50 min after the chamber's
-    # stop; the dwell adds 60 s, and the noise of the rate needs a margin of 10 %.
+    # The board relaxes to 0.05 K/min 50 min after the stop; dwell adds 60 s, noise 10 %.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
     t = np.arange(3600.0, 12000.0)
@@ -299,8 +296,7 @@ TRIANGLE = [(0.0, 0.5), (3600.0, -0.5), (7200.0, 0.5), (10800.0, 0.0)]
 @pytest.mark.parametrize('lost', [None, 'case', 'board'])
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
 def test_a_reversal_is_no_rest(lost, quantum):
-    # WHY: at the top of a triangle the rate is near zero for minutes, and a coarse reading is
-    # constant. WHAT: one dynamic state from the first onset to the last relaxation.
+    # At the top of a triangle a coarse reading is constant for minutes, but the state is dynamic.
     parts = {lost: gone} if lost else {}
     changes = run_once(TRIANGLE, quantum=quantum, end=16000.0, **parts)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
@@ -334,8 +330,7 @@ def test_direction_follows_a_reversal():
 
 
 def test_a_held_reading_does_not_turn_the_direction():
-    # WHY: a sensor that measures every 30 s and is published every second gives a staircase, whose
-    # constant parts and steps look like reversals.
+    # WHY: the staircase of measurements every 30 s published every second looks like reversals.
     rng = np.random.default_rng(1)
     t = np.arange(-2400.0, 6000.0)
     truths = case_and_board(t, [(0.0, 2.0), (3000.0, 0.0)], 300.0)

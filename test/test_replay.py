@@ -216,8 +216,7 @@ def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path):
 
 
 def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
-    # Small blocks, so that the short bag has many blocks, too; a cycle of 2 ms, so that 500 Hz are
-    # not too fast.
+    # Small blocks, so that the short bag has many; a cycle of 2 ms, so that 500 Hz are allowed.
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 12)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)

@@ -168,8 +168,7 @@ def test_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):
 
 
 def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
-    # WHY: a certificate is opened in a browser, and a bag may come from anybody. WHAT: names,
-    # serials, notes and hashes stay text.
+    # A browser shows names, serials, notes and hashes of a certificate as text, not as HTML.
     evil = '<script>alert("x")</script>'
     bag = write_bag(
         tmp_path / "a'b<img src=x onerror=alert(1)>$\\frac{.mcap", frame_id=evil, serial=evil

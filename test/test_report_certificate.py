@@ -205,8 +205,7 @@ def test_table_over_temperature(tmp_path):
             at = float(row.temperature.replace('−', '-'))
             bias, sd, scale, scale_sd = in_a_soak(calibration, at)
             numbers = [float(cell.replace('−', '-')) for cell in row[2:]]
-            # Tolerance: half a digit of each value, and the slope times the rounding of the
-            # temperature.
+            # Tolerance: half a digit of each value, and slope times rounding of the temperature.
             slack = 0.06 * abs(table.bias_slope) + 0.06 * numbers[1]
             assert numbers[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)
             assert numbers[1] == pytest.approx(2.0 * sd[k] / MICRO_G, rel=0.06)

@@ -121,8 +121,7 @@ def test_what_is_no_rest_is_not_kept(fault):
 
 
 def test_a_rest_that_lasts_a_day_is_kept_ever_more_rarely():
-    # A long rest keeps all 60 windows of the first ten minutes, then a window a minute up to the
-    # hour, then a window in five minutes.
+    # Of a rest are kept: 60 windows in 10 min, one a minute up to 1 h, then one in 5 min.
     kept, one = 0, finder()
     samples = standing(6 * 60)
     for minute in range(71):

@@ -137,8 +137,7 @@ def test_gravity_is_that_of_the_place_or_of_the_calibration(rng):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
         run(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
         gravity = compensator.status().gravity
-        # Tolerance: noise of 1.4 mm/s^2 (0.3 counts, rounding 0.29) over some 110 probes, plus
-        # rounding errors of 0.05 counts that this noise does not average.
+        # Tolerance: noise of 1.4 mm/s^2 over some 110 probes, plus rounding errors of 0.05 counts.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
 
 

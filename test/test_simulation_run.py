@@ -138,8 +138,7 @@ def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
         (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, of_part(run.truth, 'case')
     )
     error = run.case - true
-    # 540 or more readings with 5 mK of noise determine the mean to 0.2 mK, the sd to 3 %; the
-    # limits are 5 sd.
+    # 540 readings of 5 mK determine the mean to 0.2 mK and the sd to 3 %; limits: 5 sd.
     assert error.mean() == pytest.approx(0.0, abs=1.1e-3)
     assert error.std() == pytest.approx(0.005, rel=0.16)
 
@@ -148,10 +147,7 @@ def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
     ('n', 'least'), [(6, 0.0), (9, 0.4), (12, 0.6), (18, 0.7), (24, 0.8), (26, 1.2), (40, 2.0)]
 )
 def test_positions_tell_the_nine_terms_apart(n, least):
-    """
-    Six faces determine the products of axes only by their tilts of a few degrees; nine and more
-    positions determine all terms of a quadric (bias, scale, misalignment).
-    """
+    """Nine or more positions determine all terms of a quadric: bias, scale, misalignment."""
     up = positions(n, 5)
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0)
     x, y, z = up.T
@@ -182,10 +178,7 @@ def response_of(network, time, air):
 
 
 def test_two_parts_follow_a_ramp_as_solved_by_hand():
-    """
-    Air - case - board with heat flow back: eigenvalues from the quadratic formula, lags from the
-    heat balance of an endless ramp, amplitudes from the start at rest.
-    """
+    """Air - case - board with heat flow back: closed forms of eigenvalues, lags, amplitudes."""
     c0, c1, g0, g1, rate = 700.0, 300.0, 3.0, 0.4, 1.0 / 60.0
     network = ThermalNetwork(
         {'case': c0, 'board': c1}, (Link(AIR, 'case', g0), Link('case', 'board', g1))

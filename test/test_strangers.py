@@ -65,8 +65,7 @@ def test_the_integration_is_exact_on_the_way():
 
 
 def test_still_air_is_another_law_of_the_hidden_node():
-    # In still air the hidden node has another temperature between case and board than in the
-    # chamber, so that a prediction from chamber data is wrong in still air.
+    # In still air the hidden node has another temperature than chamber data predict.
     shares = []
     for environment in (units.CHAMBER, units.STILL_AIR):
         _, states = ramp(unit(), 0.01, 12, environment)

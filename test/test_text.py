@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Text from outside is shown and never interpreted; a serial is one printable line everywhere.
-
-WHY: serials, topics and metadata of a bag reached the terminal unchanged, with escape sequences
-and lines that looked like the program's; a Cyrillic serial ended a command on a latin-1 terminal.
-"""
+"""Text from outside (serials, topics, metadata) is printable, without escape sequences."""
 
 import io
 import json

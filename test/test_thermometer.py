@@ -80,8 +80,8 @@ PARTS = {
 def test_variances_are_honest(errors, sensor, part):
     # The mean squared error over the claimed variance is ideally 1. In soaks and ramps the claim
     # includes changes that might have begun, and is up to a few times too large; at the onset and
-    # the end the change is real and not yet detected. Coarse sensors have few independent errors
-    # in three runs: their mean scatters by a factor of 2.
+    # the end the change is real and not yet detected. The mean of the few independent errors of a
+    # coarse sensor scatters by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -101,8 +101,7 @@ def test_variances_are_honest(errors, sensor, part):
     ],
 )  # fmt: skip
 def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
-    # The limits are about 1.5 times the errors found: noise averaged over the filter's memory. A
-    # sensor with steps of 1 K crosses an edge every two minutes and determines the rate to 10 %.
+    # Limits: 1.5 times the errors found (averaged noise); steps of 1 K give the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
@@ -122,8 +121,7 @@ def test_a_crossed_edge_locates_the_temperature():
 
 
 def test_an_unchanged_coarse_reading_is_not_an_ever_better_one():
-    # WHY: a thousand equal readings only show that the temperature is within half a quantum. WHAT:
-    # the claimed sd stays that of a uniform distribution, 1 / sqrt(12) of a quantum.
+    # A thousand equal readings leave the sd of a uniform distribution, 1 / sqrt(12) quantum.
     thermometer = Thermometer(ThermometerSettings(0.001, 0.0625))
     for k in range(5000):
         thermometer.update(k * SECOND_NS, 20.0)
