@@ -64,7 +64,8 @@ GOALS = {
     'slow-noise': Goal(1.15, 1.15, is_relative=True),
     'plain': Goal(1.05, 1.05, is_relative=True, plan='chamber-9'),
 }
-# Limits for tests with little time in the chamber: without a prior, with that of siblings.
+# Limits for tests with little time in the chamber: without a prior, and with the prior of
+# siblings.
 PLAN_GOALS = {
     'chamber-9': (None, None),
     'tumble-3': (Goal(1.5, 2.5), Goal(1.2, 2.1)),
@@ -244,7 +245,7 @@ def part_kinds(options: argparse.Namespace) -> None:
 
 
 def part_plans(options: argparse.Namespace) -> None:
-    """Print the errors of short chamber tests, without a prior and with that of ten siblings."""
+    """Print the errors of short chamber tests, without a prior, and with one of ten siblings."""
     print('| test | unit | seed | floor | alone | with siblings | error / claimed sd, both |')
     print('|---|---|---|---|---|---|---|')
     for kind in options.kinds or ('own-lags', 'between', 'products'):

@@ -6,7 +6,7 @@ log.
 
     python benchmarks/rest_log.py [--rates 400 1000 10000] [--seconds 60]
 
-The node runs in this process, source and sink of samples in two others; the log is on in even
+The node runs in this process, source and sink of samples in two others; the rest log is on in even
 seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because a shared
 machine changes its pace. The latency runs from the source's publish call to the arrival in the
 sink's middleware. The wall time of one block of sums is the longest time for which the block can

@@ -200,7 +200,7 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
         key: (read_s, celsius + unit.reading_sd * rng.standard_normal(len(read_s)))
         for key, celsius in rest.items()
     }
-    # Switch off two checks of the node: these samples are constant, and |f| is not gravity.
+    # Switch off two checks of the node: the samples here are constant, and |f| is not gravity.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     out = corrected(calibration, Bag('zero', time_s, zero, temperatures), config)
     # The samples have no noise, so the white noise is subtracted from the claimed variance.
@@ -322,7 +322,7 @@ def run_case(
     path: Path | None,
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
-    """Run all studies of a case, or those with the label."""
+    """Run all studies of a case, or the studies with the label."""
     results = []
     for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
         done: dict[str, thermo_comp.Calibration] = {}

@@ -148,7 +148,7 @@ def test_every_command_works_on_the_drivers_bag(path, bag, tmp_path, cli):
     printed = cli('info', bag, *topics).stdout
     assert f'{SECONDS * RATE} samples of imu, {RATE} Hz' in printed
     assert f'{len(UPS)} still intervals' in printed
-    # The thermometers are those of the file only; other numbers of their messages are not used.
+    # Only the thermometers of the file are used, no other numbers of the same messages.
     assert re.findall(r'^(board|case) +1\.000 +(\S+) +(\S+)', printed, re.MULTILINE) == [
         (name, f'{20.0 - lag:.2f}', f'{46.2 - lag:.2f}')
         for name, lag in (('board', 0.0), ('case', 2.0))

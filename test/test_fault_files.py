@@ -101,7 +101,7 @@ def test_a_folder_that_is_read_only(folder, cli, name):
         locked = folder / 'locked'
         locked.mkdir(mode=0o500)
     else:
-        locked = Path('/proc')  # even root cannot write here
+        locked = Path('/proc')  # a folder in which not even root can write
     before, _ = COMMANDS[name]
     finished = cli(*before, locked / name, code=1, cwd=folder)
     (line,) = finished.stderr.strip().splitlines()[-1:]

@@ -66,7 +66,7 @@ def settling_s():
 
 
 def ended_s(row):
-    """Return the time from which the messages are those of the undisturbed bag again."""
+    """Return the time from which the messages equal the undisturbed bag again."""
     at, _ = row.shift
     if math.isfinite(at):
         return at

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Few positions: the parameters that they determine are right, the others stay at their prior."""
+"""Few positions: parameters that they determine are right, other parameters stay at the prior."""
 
 from dataclasses import replace
 from pathlib import Path

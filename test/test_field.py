@@ -68,7 +68,7 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
         step = 1e-7
         moved = values.copy()
         if k in levels:
-            continue  # tested below with K, which moves both levels
+            continue  # a change of K, which moves both levels, is tested below
         if k in {block.static for block in layout.bias}:
             continue
         moved[k] += step
@@ -82,7 +82,7 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
         by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
         assert np.allclose(slope, by_level, atol=1e-4)
         both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
-        # A change of K equals a change of both scale levels, within a percent.
+        # A change of K equals a change of the scale level of both sets, within a percent.
         assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
 
 
@@ -279,7 +279,7 @@ def test_update_by_the_command_line(tmp_path, unit_file, cli):
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
-    # The new file removes the residual of the old file, and the history shows both.
+    # The new file removes the residual of the old file, and the history shows both residuals.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'

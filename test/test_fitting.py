@@ -122,7 +122,7 @@ def test_the_paper_s_model_on_its_own_physics(golovach):
     # The paper's model has a linear static set and a quadratic dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # The error of the paper's model in ramps shifts the estimated biases by up to as much.
+    # The estimated biases are wrong by up to the error of the paper's model in ramps.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)

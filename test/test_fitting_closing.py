@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of series, and the end of the dynamic regime: both estimated, not assumed."""
+"""Noise of series, and the end of the dynamic regime, are estimated, not assumed."""
 
 from dataclasses import replace
 from typing import Literal

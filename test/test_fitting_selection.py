@@ -244,7 +244,7 @@ def test_outliers_do_not_pull(calm):
 
 
 def test_means_of_few_values_are_no_knocks():
-    # With a converter that carries its remainder most means are equal, others differ by a count.
+    # With a converter that carries its remainder most means are equal, some differ by a count.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
     prior = prior_of(Truth(), (), offset_sd=1e-9)
@@ -353,7 +353,7 @@ def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting():
     for n in (9, 24):
         claim, fitted = claimed(n)
         assert np.linalg.eigvalsh(claim).min() > 0.0
-        # The claim's parameters are, per axis, kappa (relative scale) and then the bias.
+        # The parameters of `claim` are, per axis, kappa (relative scale) and then the bias.
         k = (len(claim) - 3) // 3
         at = 1 + k * np.arange(3)
         ratios.append(np.sqrt(np.diag(claim)[at].mean() / np.diag(fitted)[at].mean()))

@@ -64,7 +64,7 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(client, fl
     def tell(_n, _total, row):
         if row is None:
             return
-        # Both workers are fitting a unit when the first result arrives.
+        # Two workers are fitting a unit each when the first result arrives.
         if not collected:
             os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
         collected.append(str(row['name']))

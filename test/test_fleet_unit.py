@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A unit's fit equals that of one process, and accounts for each of its bags."""
+"""The fit of a unit equals a fit in one process, and accounts for each bag of the unit."""
 
 import json
 from dataclasses import replace

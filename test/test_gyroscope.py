@@ -262,7 +262,7 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
         assert section.raw_rms > 50.0 * FLOOR
     assert judged.facts()['angular_rate']['reason'] == rate.reason
     assert 'angular rate: valid: 0.' in str(rate)
-    # A gyroscope of another unit is detected, also one without covariance.
+    # A gyroscope of another unit is detected, also if it states no covariance.
     gyro = calibration.gyroscope
     other = replace(gyro, response=(), static=gyro.dynamic, dynamic=gyro.dynamic, posterior=None)
     wrong = judge_bags(short, replace(calibration, gyroscope=other))

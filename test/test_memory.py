@@ -169,7 +169,7 @@ def test_a_second_stage_adds_the_errors_of_both():
     memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
-    # Factor 1.4 = (900 + 150) / (900 - 150): the errors of both stages may have opposite signs.
+    # Factor 1.4 = (900 + 150) / (900 - 150): the errors of the two stages may have opposite signs.
     assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
 
 

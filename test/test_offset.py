@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Raw words with an offset: the same calibration, with the offset in its bias."""
+"""Raw words with an offset give the same calibration, with the offset in its bias."""
 
 from dataclasses import replace
 
@@ -108,7 +108,7 @@ def test_a_centre_is_found_only_where_there_is_one(rng):
     ups = positions(12, 5)
     assert not rough_centre(4096.0 * ups + (800.0, -900.0, 700.0)).any()
     np.testing.assert_allclose(rough_centre(100.0 * ups + 338.0), 338.0, atol=1e-6)
-    # Positions in a plane, or too few positions, do not determine the centre across the plane.
+    # Positions in one plane do not determine the centre of the sphere across the plane.
     flat = ups * (1.0, 1.0, 0.0)
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     assert not rough_centre(100.0 * flat + 338.0).any()

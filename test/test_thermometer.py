@@ -109,7 +109,7 @@ def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
 
 
 def test_a_crossed_edge_locates_the_temperature():
-    # A reading of 20.0 becomes 21.0 when the temperature passes 20.5: then the estimate is 20.5.
+    # A reading of 20.0 becomes 21.0 when the temperature passes 20.5, which is the estimate.
     thermometer = Thermometer(ThermometerSettings(0.01, 1.0))
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0)

@@ -62,11 +62,11 @@ class Account:
     """
     State of a test, and what is missing.
 
-    The last position is unfinished. `worst_sd_g` is the sd of the force in the worst attitude,
-    `constants_sd` the sd of bias [g], relative scale and M [rad], as in `coverage`. `next_up` is
-    the recommended next direction, `next_deg` away from `now`, the direction of the newest reading
-    (NaN before any); `hole` is the direction farthest from all positions. `findings` are texts
-    about missing data.
+    The last of `positions` is unfinished. `worst_sd_g` is the sd of the force in the worst
+    attitude, `constants_sd` the sd of bias [g], relative scale and M [rad], as in `coverage`.
+    `next_up` is the recommended next direction, `next_deg` away from `now`, the direction of the
+    newest reading (NaN before any); `hole` is the direction farthest from all positions.
+    `findings` are texts about missing data.
     """
 
     positions: tuple[Position, ...]

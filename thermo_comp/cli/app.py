@@ -132,7 +132,7 @@ def _plain(message: str, arguments: list[str]) -> str:
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Split arguments into a command's and those of ROS (from ``--ros-args`` up to ``--``)."""
+    """Split arguments into the command's and ROS' (from ``--ros-args`` up to ``--``)."""
     for_command: list[str] = []
     for_ros: list[str] = []
     target = for_command

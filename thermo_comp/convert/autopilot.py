@@ -13,7 +13,7 @@ the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher
 temperature.
 
 ArduPilot's DataFlash (``.BIN``): a message type per IMU in old logs (``IMU``, ``IMU2``), a type
-with an instance number ``I`` in new ones; the IMU's temperature is ``T`` or ``Temp``. Samples
+with an instance number ``I`` in new logs; the IMU's temperature is ``T`` or ``Temp``. Samples
 logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected.
 While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets 1 at the end.
 

@@ -4,8 +4,8 @@
 Owns the exchange with other tools: calibrations to the content of their files, and back.
 
 All tools correct a reading N by ``a = A (N - b)``. In autopilots b depends on temperature
-and A is 1; in tools for tumble tests both are constant. The notes of an export name the parts of a
-calibration that are lost, with the resulting error.
+and A is 1; in tools for tumble tests b and A are constant. The notes of an export name the parts
+of a calibration that are lost, with the resulting error.
 """
 
 from dataclasses import replace

@@ -134,7 +134,7 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
-        # The last columns are blank in most rows if they are those of a slower thermometer.
+        # The last columns are blank in most rows if a slower thermometer writes them.
         whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
         is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
         candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))
@@ -299,7 +299,7 @@ def read_parquet(
     """
     Read columns of a Parquet file like `read_text`; Parquet's timestamps state their unit.
 
-    If `columns` is None all columns are read; those without numbers become NaN.
+    If `columns` is None all columns are read; columns without numbers become NaN.
     """
     pq = library('pyarrow.parquet', 'parquet', 'a Parquet file', path)
     import pyarrow as pa

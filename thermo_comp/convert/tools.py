@@ -253,7 +253,7 @@ def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
 
 
 def _read_imu_tk(text: str, _number: int | None) -> Content | None:
-    """Read imu_tk's ``.calib``: 21 numbers, with or without headings; None if not such a file."""
+    """Read imu_tk's ``.calib``: 21 numbers, with or without headings; None for another file."""
     lines = (line for line in text.splitlines() if not _HEADING.match(line))
     try:
         numbers = np.array([float(cell) for line in lines for cell in line.split()])

@@ -74,8 +74,8 @@ def fit_fleet(
     """
     Fit all units without results; raises ThermoCompError or OutputError if impossible.
 
-    `tell` is called with the number of finished tests and of all tests: before the first fit with
-    None, and after each fit with its row.
+    `tell` is called with the numbers of finished and of all tests, and None before the first fit,
+    or the row of the last fit.
     """
     _require_packages()
     storage = Storage(url)

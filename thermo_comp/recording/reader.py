@@ -76,7 +76,7 @@ class RecordingReader(ExitStack):
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
             bare = [role for role, field in self.fields.items() if not field.has_stamp]
-            note = f'{", ".join(bare)} without a stamp: counts from the sample before it'
+            note = f'{", ".join(bare)} without a stamp: dated by the sample before each reading'
             chosen = '; '.join(filter(None, (selected.chosen, note if bare else '')))
             self.info = replace(self.info, input=selected.input, chosen=chosen or None)
         except BaseException as error:

@@ -25,7 +25,8 @@ from .colour import roughest_at_rest, spread_of_variances
 #: Largest ratio of a cell's variance (n >= 30 samples) at rest to the quiet level: noise exceeds 4
 #: with a probability below 1e-11, and vibration that must be cut out is far above.
 VARIANCE_RATIO = 4.0
-#: Largest scatter at rest [g]: above that of the noisiest sensors, below that of most flights.
+#: Largest scatter at rest [g]: above the scatter of the noisiest sensors, below the scatter in
+#: most flights.
 STILL_SD = 0.05
 # Largest scatter of a gyroscope within a cell at rest, and largest distance of a cell's mean from
 # its level [rad/s]; the level drifts with temperature and is averaged over this time [s].

@@ -300,7 +300,7 @@ def _said_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
 def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
-    """Find the further thermometers: those named, and those beside the board's or the case's."""
+    """Find further thermometers: named topics, and topics beside the board's or the case's."""
     both = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))

@@ -256,8 +256,9 @@ def table_writer(
 ) -> Iterator[WriteRows]:
     """
     Write a table in the format of its suffix (`TABLES`, else CSV); the file appears when complete.
-    Yields a function that takes columns by name, shape (n,), the same names every time; CSV drops
-    the metadata. OutputError if the table may not or cannot be written, or pyarrow is missing.
+    Yields a function that takes columns by name, shape (n,), with the same names in each call; CSV
+    drops the metadata. OutputError if the table may not or cannot be written, or pyarrow is
+    missing.
     """
     kind = TABLES.get(Path(path).suffix, CSV)
     with drafted(path, kind, overwrite=overwrite) as partial, ExitStack() as stack:

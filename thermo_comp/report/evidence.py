@@ -176,7 +176,7 @@ class Evidence:
 
     @property
     def positions_text(self) -> str:
-        """Count the distinct directions, and the rests if these are more than the directions."""
+        """Count the distinct directions, and the rests if there are more rests than directions."""
         n_rests = len(self.positions)
         n = len(distinct_directions(np.array([rest.up for rest in self.positions]).reshape(-1, 3)))
         text = counted(n, 'position')

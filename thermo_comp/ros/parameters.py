@@ -5,8 +5,8 @@ Owns the node's parameters: their table, and the services that set them.
 
 The table of the parameters is `NodeConfig`. The node runs with one immutable `NodeConfig`; a
 change makes a new one or is refused as a whole. A thread waits while a file is read; the loop then
-replaces one reference. Requests are answered in order of arrival, but a request without a file
-does not wait for files.
+replaces the reference to the `NodeConfig`. Requests are answered in order of arrival, but a
+request without a file does not wait for files.
 """
 
 import math
@@ -256,7 +256,7 @@ class ParameterRequests:
             answer(kind.Response(results=results) if is_each else kind.Response(result=results[0]))
 
         def end(prepared: Future[Any]) -> None:
-            """Apply a group in the loop's thread; after the last group send the answer."""
+            """Apply a group of parameters in the loop's thread; answer after the last group."""
             try:
                 self._set(prepared, results)
             finally:

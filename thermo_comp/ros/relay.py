@@ -3,9 +3,8 @@
 """
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
-Messages do not identify their publisher. A topic with more than one publisher is ignored, and so
-is the first batch afterwards, which may still be from the publisher that left
-(`waitloop.Sources`).
+Messages do not identify their publisher. A topic with more than one publisher is ignored, as is
+the first batch afterwards, which may be from the publisher that left (`waitloop.Sources`).
 """
 
 from bisect import bisect_left, bisect_right

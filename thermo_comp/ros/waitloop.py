@@ -153,8 +153,8 @@ class RawSubscription:
 class WaitLoop:
     """Runs a node without an executor; raw subscriptions are left to the caller."""
 
-    # Messages of a best-effort subscription gather for `rest_s` [s] after each wake-up if they are
-    # frequent enough: four within three such pauses, so that no message waits alone.
+    # Messages of a best-effort subscription gather for `rest_s` [s] after each wake-up if there
+    # are four messages or more within three pauses, so that no message waits alone.
     def __init__(self, node: Node, rest_s: float = 0.0) -> None:
         self.node = node
         self._rest_ns = int(rest_s * 1e9)
