@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Unwritable outputs, killed writers: old or new file complete, one-line errors, bags readable."""
+"""If an output cannot be written or a writer is killed, the old or the new file is complete."""
 
 import os
 import re

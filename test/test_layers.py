@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rooms import from lower layers only, and each heavy library is imported in one room only."""
+"""Packages import from lower layers only; each heavy library is imported in one package only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from conftest import ran
 
 PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
 
-# One line per room: a folder, or a module in the package's root. Each room needs a line.
+# One line per package: a folder, or a module in the root. Each package needs a line.
 LAYERS = {
     '__init__': 0,  # public names, imported for type checkers
     'errors': 0,
@@ -42,7 +42,7 @@ LAYERS = {
     '__main__': 6,
 }
 
-# Rooms that may import a library; a library that is missing here may be imported anywhere.
+# Packages that may import a library; other libraries may be imported anywhere.
 ROS = ['rclpy', 'rcl_interfaces', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs']
 HOMES = {
     **{name: {'ros'} for name in ROS}, 'rosgraph_msgs': {'ros'}, 'builtin_interfaces': {'ros'},
@@ -145,7 +145,7 @@ def circle(uses):
 
 @pytest.mark.parametrize('by', ['room', 'file'])
 def test_no_circle(by):
-    # Neither two rooms nor two files may import each other, except for type annotations.
+    # Neither two packages nor two files may import each other, except for type annotations.
     uses = {}
     for path in SOURCES:
         text = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)

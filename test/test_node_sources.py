@@ -70,7 +70,7 @@ def test_samples_of_a_second_publisher_never_go_out(peer, unit):
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
         peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
-        # Right after the other driver has ended, the next samples may still be from that driver.
+        # Right after one of two drivers has ended, samples of this driver may still arrive.
         samples.send(20)
         before = len(samples.heard)
         peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
@@ -169,7 +169,7 @@ def test_two_that_send_are_never_mixed(offset, period_s):
         if not sources.of_one(n_known, [number], [round(at_s * 1e9)]):
             used.append((at_s, name))
     assert {name for _, name in used} == {'own'}
-    # Once the other driver is silent, samples of the first driver are used again after a second.
+    # A second after one of two drivers fell silent, samples of the first driver are used again.
     assert sum(at_s < 2.0 for at_s, _ in used) >= 199
     assert sum(at_s > 10.0 for at_s, _ in used) >= 199
 

@@ -366,7 +366,7 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, believable: Bools) -> Floats:
-    """Return the drift in the step after each cell, the median around it, shape (n - 1, 3)."""
+    """Return the drift between successive cells, a median over neighbours, shape (n - 1, 3)."""
     both = believable[1:] & believable[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2
