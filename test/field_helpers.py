@@ -15,9 +15,7 @@ FIRST_DAY = 21_915
 
 
 def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
-    """
-    Log three starts a day of four windows, at `rate` [K/s]; `error` of a day is a bias [m/s^2].
-    """
+    """Log 3 starts a day of 4 windows, at `rate` [K/s]; `error` of a day is a bias [m/s^2]."""
     rng = np.random.default_rng(seed)
     correction = Correction(calibration)
     M, logged = np.array(calibration.misalignment), []

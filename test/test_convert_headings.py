@@ -202,8 +202,7 @@ def test_some_repeated_rows_leave_a_time_a_time(tmp_path):
 
 
 def test_stamps_since_1970_state_their_unit(tmp_path):
-    # Without a temperature, in one attitude, the size of the stamps alone shows their unit. If a
-    # count of us had the size of a date in s, its steps would be hours.
+    # Without a temperature, in one attitude, the size of the stamps alone shows their unit.
     for unit, since, step in (('s', START_NS // 10**9, 2), ('ms', START_NS // 10**6, 5000),
                               ('us', START_NS // 10**9, 10_000)):  # fmt: skip
         path = slow_table(tmp_path / f'{unit}.csv', 'time', [since + step * k for k in range(900)],

@@ -54,8 +54,7 @@ def test_headings_are_optional(tmp_path):
 
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
 def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path, separator):
-    # A title, comments of three kinds, a key with its value, a blank line; a row of units, which
-    # counts as a row without numbers; a comment and an incomplete last row in the table itself.
+    # A row of units counts as a row without numbers; the last row is incomplete.
     head = ['Inertial logger', '# serial 7', '% matlab', '// c', f'Rate:{separator}100', '']
     rows = ['t|ax|ay|az', 's|g|g|g', *(f'{k}|0.1|0.2|{k}' for k in range(60)), '# end', '60|0.1']
     text = '\n'.join([*head, *(row.replace('|', separator) for row in rows)])

@@ -231,8 +231,7 @@ def test_what_px4_compensated_is_left_out(tmp_path, rng, begin):
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
-    # The change of a parameter has the previous message's stamp, so one sample may be on either
-    # side.
+    # The change of a parameter has the stamp of the previous message: one sample may be wrong.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])

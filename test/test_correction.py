@@ -330,8 +330,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
-    # The slopes of curve and lag cancel for an error of the thermometer, but not outside the
-    # range.
+    # Slopes of curve and lag cancel for an error of the thermometer, but not outside the range.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bias), dynamic=regime_set(bias),

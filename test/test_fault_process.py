@@ -207,8 +207,7 @@ def test_slope_and_its_error(rng):
     # `slope` leaves out the first tenth of the run, here 360 s.
     values[:300] += 50.0
     slope, sd = soak.slope(list(zip(time.tolist(), values.tolist(), strict=True)), 60.0)
-    # The sd of the slope is the sd of a mean of 60 values, divided by the root of the sum of
-    # squares of the hours of 54 windows over 0.9 h about their mean.
+    # Sd of the slope: sd of a mean of 60 values / root of the sum of squares of the 54 times.
     assert sd == pytest.approx(1.0 / 60**0.5 / (54 * 0.9**2 / 12) ** 0.5, rel=0.3)
     assert abs(slope - 7.0) < 4.0 * sd
     assert soak.slope([(0.0, 1.0), (1.0, 1.0)], 60.0) is None

@@ -117,8 +117,7 @@ def drawn(rng, n, steps, noise):
 
 @pytest.mark.parametrize('noise', [Noise(1.0, 600.0), Noise(0.3, 2000.0), Noise(30.0, 300.0)])
 def test_ratio_and_time_are_found(rng, noise):
-    # 3 axes x 9 positions x 300 windows of a minute: 240 or more correlation times determine the
-    # variance of the process to sqrt(2 / 240) = 9 %, its time to about 15 %.
+    # 240 correlation times determine the variance to sqrt(2 / 240) = 9 %, the time to 15 %.
     whitener, weight, series = drawn(rng, 9, 300, noise)
     fitted = whitener.estimate(5.0 * series, weight)
     assert 0.5 < fitted.ratio / noise.ratio < 2.0

@@ -89,8 +89,8 @@ def test_what_a_test_lacks_is_said(good, name, changed, message):
 
 
 def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, rng):
-    # WHY: bags of soaks with interpolated readings were refused. The noise of the board's reading
-    # enters its rate and, with the opposite sign, the gradient.
+    # WHY: soaks with interpolated temperatures, whose noise enters rate and gradient, were
+    # refused.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)

@@ -354,8 +354,7 @@ def test_published_huygens_coefficients_come_back(rng):
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
 def test_inactive_columns_are_known_as_if_they_took_part(noise):
-    # In a linear problem S is the inverse covariance of the columns under a flat prior, S^-1 Q
-    # their estimated weight, and the gain that of the log evidence.
+    # Linear problem: S is the inverse covariance of the columns, S^-1 Q the estimated weight.
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
     regression, state = begin(without_starts(windows), up)

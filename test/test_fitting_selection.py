@@ -193,8 +193,7 @@ def test_truth_lies_within_the_claimed_sd(noisy):
 
 
 def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
-    # Savage-Dickey against brute force: solve without the group, with the same prior for all other
-    # groups. The ratio is exact in a linear problem; the directions are linear to noise / g.
+    # Savage-Dickey against a solution without the group: exact except for the directions.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)

@@ -107,8 +107,7 @@ def test_columns_are_those_of_the_tracker(bags):
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # The tracker's lags follow its estimates, the fit's lags the readings, so plays may reverse a
-    # part of a window apart.
+    # Lags follow estimates in the tracker, readings in the fit: plays reverse at other times.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 

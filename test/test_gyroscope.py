@@ -99,8 +99,7 @@ def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
         assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
         assert rms(changes) < 1.15 * FLOOR
         assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
-        # The mean rate (turn-on of 2 mdeg/s, Earth's rate) is within 3 sd of claim and Earth's
-        # rate.
+        # The mean rate (turn-on, Earth's rate) is within 3 sd of claim and Earth's rate together.
         message = gyroscope.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
         claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
         assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()

@@ -12,8 +12,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.mark.parametrize('axis', [0, 1])
 def test_a_bias_makes_schuler_s_oscillation(axis):
-    # A bias b of a level axis that begins after levelling gives the position error
-    # b R / g (1 - cos(w t)), w^2 = g / R.
+    # A bias b after levelling gives the position error b R / g (1 - cos(w t)), w^2 = g / R.
     bias, dt, minutes = 1e-4, 0.5, 84
     force = G * UP
     force[axis] += bias

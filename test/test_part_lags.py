@@ -67,8 +67,7 @@ def judged(calibration, study):
 
 def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
     unit, study, calibration = parts
-    # A time constant wrong by 1 % moves a bias of 10 ug/K, lagging by 10 K, by 1 ug, which is
-    # twice the noise of a minute; hundreds of minutes of ramps determine it better than 1 %.
+    # 1 % of a time constant is 1 ug (10 ug/K, lag of 10 K), twice the noise of a minute.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # 0.65 ug is the noise of a mean of a minute.
     assert judged(calibration, study).norm < 2.0
@@ -214,8 +213,7 @@ def test_six_faces_in_three_soaks(given):
 
 
 def test_a_curve_between_two_soaks_is_claimed():
-    # WHY: the powers of the curve that two temperatures do not show were claimed to be zero, an
-    # eighth of the error.
+    # WHY: the claimed sd was an eighth of the error, without the powers that the bags do not show.
     rng = rng_of('two soaks')
     unit = cheap(rng)
     bags = positions(unit, SOAKS[::2], spread(18, rng), rng, rate_hz=10.0)

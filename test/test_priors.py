@@ -146,8 +146,7 @@ def test_new_rests_make_an_old_calibration_better():
 
 
 def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
-    # An hour at one temperature, without data sheet, shows a change of biases by 200 ug; the
-    # calibration stays valid in its whole range, with the same residual.
+    # An hour at one temperature shows a change of the biases by 200 ug, without a data sheet.
     moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
     old = fitted(9).calibration
 
@@ -169,8 +168,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
         for calibration, changed in ((old, lambda record: record), (old, aged), (new, aged))
     ]
     assert left[1] > 10.0 * left[0]
-    # Parts that lag by an hour start at an unknown temperature, and rests of ten minutes do not
-    # separate this from a bias: the claimed sd includes some ug for this error.
+    # In rests of ten minutes a lag of an hour with an unknown start resembles a bias.
     sd = float(sd_of_levels(new).max())
     assert sd < 10e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)

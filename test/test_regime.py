@@ -78,8 +78,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # A coarse sensor must cross two edges of its quantum, the second 62.5 to 125 mK from the
-        # start: a median of at least 146 s (94 mK), which scatters by 6 s in 12 runs.
+        # A coarse sensor must cross two edges of its quantum: median 146 s (94 mK), +-6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],

@@ -30,8 +30,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 
 def test_bias_and_scale_curves_by_hand():
-    # Bias: 0.3 counts/K in a soak, plus 0.3 counts/K times the lag, which is 10 (1 - exp(-1)) K
-    # after 10 min of 1 K/min (tau 600 s); 300 counts per m/s^2.
+    # Bias: 0.3 counts/K, and 0.3 counts/K times the lag, 10 (1 - exp(-1)) K after 10 min.
     static, dynamic = (
         regime_set(*[axis_set((0.0, 0.3), (1.0, 7e-5), delta=delta)] * 3, rate_range_k_min=(0, 2))
         for delta in (0.0, 0.5)

@@ -141,8 +141,8 @@ def test_the_shortest_rest_is_yours_to_say(rng):
 
 
 def test_a_ramp_moves_no_unit_at_rest(rng):
-    # WHY: with 60 ug/K at 2 K/min a unit at rest changes by 60 ug between cells of 30 s, 60 times
-    # the noise. WHAT: the rest is one position; a knock of 0.1 mrad in the ramp makes two.
+    # A drift of 60 ug per cell, 60 times the noise, is one position; a knock of 0.1 mrad makes
+    # two.
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG
