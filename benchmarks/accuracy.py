@@ -6,9 +6,10 @@ Owns the accuracy figures of docs/accuracy.md: the fit against the simulator's t
 Run ``python benchmarks/accuracy.py`` for everything, or a part with fewer units:
 ``python benchmarks/accuracy.py kinds --kinds own-lags,paper --seeds 1``.
 
-Every fit uses a whole test in unknown attitudes. With its result the compensator corrects the plan
-'held-out' (other ramps, other soaks, other attitudes). Errors are differences of 60 s means from
-the simulated truth, in micro-g. The floor is the error of the true model with the same noise.
+Every fit uses a whole test in unknown attitudes. With the result of the fit the compensator
+corrects the plan 'held-out' (other ramps, other soaks, other attitudes). Errors are differences of
+60 s means from the simulated truth, in micro-g. The floor is the error of the true model with the
+same noise.
 """
 
 from __future__ import annotations

@@ -144,7 +144,7 @@ def run_matrix(
 
 
 def rate_table(matrix: Matrix) -> Rows:
-    """Count detections, flips and misses of the ramps, by the rate of the readings."""
+    """Count detected and missed ramps, and flips of the state, by the rate of the readings."""
     rows = [['readings', 'ramps', 'missed', 'missed of >= 0.2 K/min', 'with a flip']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
         mine = [(scene, result) for scene, result in matrix if scene.rate_hz == rate]

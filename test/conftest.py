@@ -29,8 +29,8 @@ ROOT = Path(__file__).resolve().parent.parent
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
-# The domain follows from the id of the run and the number of the worker. Domain 0 is the user's,
-# domains from 81 are the benchmarks'.
+# The DDS domain follows from the id of the run and the number of the worker. Domain 0 is the
+# user's, domains from 81 are the benchmarks'.
 _RUN = os.environ.get('PYTEST_XDIST_TESTRUNUID', str(os.getpid()))
 _WORKER = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
 os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WORKER % 4)

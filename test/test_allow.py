@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each refusal that has a name can be overridden by it, and then gives a calibration."""
+"""Each named refusal of a fit can be overridden by its name; the fit gives a calibration."""
 
 import re
 from dataclasses import replace

@@ -63,7 +63,7 @@ def assert_same(blocks, rows, index):
 
 
 def test_signed_counts_and_the_printed_equations():
-    # Counts of +g, -g: offset = sum / 2, scale = difference / 2; (3), (4) of the paper swap them.
+    # Counts of +g, -g: offset = sum / 2, scale = difference / 2; Eq. (3), (4) swap the two.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))

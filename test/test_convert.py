@@ -72,7 +72,7 @@ def test_round_trip_through_the_bag(tmp_path):
     # The Imu marks the missing orientation by -1, and the unknown covariance of the rate by 0.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
     assert not block.imu.angular_velocity_covariance.any()
-    # A temperature becomes a message when it changes: 4 levels of the case, 10 of the board.
+    # A temperature becomes a message when it changes: 4 times in the case, 10 in the board.
     case, board = block.temperatures['case'], block.temperatures['board']
     assert case.celsius.tolist() == [20.0, 20.5, 21.0, 21.5]
     assert case.stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]

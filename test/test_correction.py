@@ -174,7 +174,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
 
 
 def drawn(unit, layout, d):
-    """Change all parameters but the scale levels, which a curve of 1 does not have."""
+    """Change all parameters but the scale levels, which a constant curve does not have."""
 
     def moved_by(values, start):
         return tuple(value + d[start + k] for k, value in enumerate(values))

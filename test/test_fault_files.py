@@ -23,7 +23,7 @@ from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 FIT = ('bags/01.mcap', 'bags/02.mcap')
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
 GRAVITY = ('--gravity', '9.80665', '--model', 'golovach')
-#: Arguments before and after the output.
+#: Arguments of a command before and after the output.
 COMMANDS = {
     'unit.yaml': (('fit', *FIT, *GRAVITY, '-f', '-o'), ()),
     'page.html': (('report', '-c', 'unit.yaml', '-f', '-o'), ()),

@@ -235,7 +235,7 @@ def test_the_first_passage_is_that_of_the_reflection_principle():
         s, k = np.sqrt(rate * days), np.arange(-40, 41)
         inside = norm.cdf((2 * k + 1) * bound / s) - norm.cdf((2 * k - 1) * bound / s)
         assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.005)
-    # A walk from nearer to a bound passes earlier; a unit that does not age never reaches a bound.
+    # A random walk passes a near bound earlier; a unit that does not age never reaches a bound.
     assert passage(30.0, 0.0, rate, bound)[1] < passage(0.0, 0.0, rate, bound)[1]
     assert passage(0.0, 0.0, 1e-12, bound) == (np.inf,) * 3
 

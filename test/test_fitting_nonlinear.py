@@ -280,7 +280,7 @@ def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
         replace(again, unit=replace(again.unit, serial=f'{k}'), gyroscope=None) for k in range(3)
     ]
     assert population(siblings).nonlinearity is None
-    # A tumble alone leaves the term at the bound of the data sheet, which the fit reports.
+    # A tumble alone leaves a nonlinear term at the bound of the data sheet, which is reported.
     alone = fit(tumble, FitOptions(gravity=G, model='golovach', k2_sd=5e-5))
     assert [finding.name for finding in alone.findings].count('nonlinearity') == 1
     (square, *_) = nonlinear_coefficients(alone.calibration)

@@ -47,7 +47,7 @@ class Dense:
         self.determinant = -2.0 * sum(np.log(np.diag(root)).sum() for root in self.roots)
 
     def state(self, x):
-        """Move the mode of the fast route by x."""
+        """Add x to the mode found by `Regression`."""
         layout, at = self.at.layout, self.at.state
         padded = np.append(x, 0.0)
         up = at.up + np.einsum('pij,pj->pi', tangent_basis(at.up), x[layout.up])

@@ -325,7 +325,7 @@ def test_siblings_help_a_unit_that_lacks_data(client, tmp_path):
     assert contents(tmp_path / 'out' / 'units') == before
     assert [bool(row['prior']) for row in helped.rows] == [True, False, False, False]
     (before_row, *_), (row, *_) = alone.rows, helped.rows
-    # The error of one axis may be small by chance, so all three are judged together.
+    # The error of one axis may be small by chance, so all three axes are judged together.
     scale = np.array(siblings[0].scale_factor)
     errors, sds = (
         [np.array([float(one[name.format(axis)]) for axis in 'xyz']) for one in (row, before_row)]

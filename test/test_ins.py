@@ -65,5 +65,5 @@ def test_updates_find_a_bias_that_levelling_has_not_seen():
     free = fly(Model(force, 1e-4, 1e-3), dt, UP, G, 0.0)
     assert free.position[-1, 0] > 1000.0
     coasted = message.position[-1, 0] - message.position[2999, 0]
-    # Without ZUPT five minutes with this bias would give 45 m.
+    # Without ZUPT a bias of 1e-3 m/s^2 would give 45 m in five minutes.
     assert abs(coasted) < 4.5

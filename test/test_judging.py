@@ -101,7 +101,7 @@ CLAIMING = corrected_by(SLOPE, 1e-5)
 class TestWindows:
     @pytest.mark.parametrize('reading_s', [30, 50])
     def test_a_slow_thermometer_leaves_all_windows(self, tmp_path, reading_s):
-        # WHY: at 2 Hz, sums of 20 s without a temperature within 15 s were dropped as leaps.
+        # WHY: at 2 Hz, sums of 20 s without a temperature in 15 s were dropped as leaps of time.
         bag = resting(tmp_path / 'bag', 30.0, minutes=30.0, rate_hz=2.0, reading_s=reading_s)
         windows = judged(bag, corrected_by(SLOPE)).windows
         assert len(windows) >= 28

@@ -85,7 +85,7 @@ def test_no_source_is_too_long_to_read():
 
 
 def test_the_manifest_asks_for_the_node_alone():
-    # Other dependencies of the commands come from PyPI; test_node_startup.py does without.
+    # Other dependencies of the commands come from PyPI; the node needs none of them.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     assert {key for key in keys if key and key.startswith('python3-')} == {
         'python3-numpy',

@@ -256,7 +256,7 @@ def test_the_relaxed_rate_moves_the_end():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # The slower of two lags decides: half the rate takes one lag times ln 2 longer.
+    # The slower of two lags decides: half the rate is reached one lag times ln 2 later.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 

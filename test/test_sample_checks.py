@@ -96,7 +96,7 @@ def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_v
         begin = end
     assert collected == expected
     assert many.n_same == one.n_same
-    np.testing.assert_array_equal(many.run, one.run)  # equal also if NaN: no sample yet
+    np.testing.assert_array_equal(many.run, one.run)  # NaN, before the first sample, equals NaN
 
 
 def test_a_user_may_believe_any_sample():

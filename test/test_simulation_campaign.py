@@ -117,7 +117,7 @@ def test_a_limited_flow_is_a_matter_of_on_and_off():
 
 
 def test_a_switched_load_heats_its_part():
-    """The warming equals the heat balance of an endless spell, and is zero before it is on."""
+    """The warming equals the heat balance of an endless load, and is zero before the load."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))

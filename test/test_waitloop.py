@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The only file that uses undocumented parts of rclpy: these tests fail if rclpy changes them."""
+"""Undocumented parts of rclpy, used by waitloop.py only: a change in rclpy fails these tests."""
 
 import threading
 import time
