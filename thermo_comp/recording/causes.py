@@ -35,7 +35,7 @@ class CauseCounter:
         self._is_imu |= imu is not None
         if covariance is not None:
             self._n_absent += int(np.count_nonzero(covariance[:, 0] == -1.0))
-        if len(self._stamps_ns) < 2:  # two different stamps: the messages have time
+        if len(self._stamps_ns) < 2:  # two different stamps show that the clock runs
             self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
 
     def cause(self, cells: Cells, still_sd: float) -> str:
