@@ -7,9 +7,9 @@
 # make nightly  the properties, ten thousand examples each
 # make oldest  the suite with the oldest versions that setup.py allows, in .venv-oldest
 # make fuzz   the fuzz targets, FUZZ_SECONDS (60) each
-# make bench  installs the package beside it, in .venv-bench, and measures its speed (half an hour)
+# make bench  installs the package in .venv-bench and measures its speed (half an hour)
 # make docs   builds the documentation as a site, in site/
-# make clean  removes .venv, .venv-bench, .venv-oldest and everything made
+# make clean  removes .venv, .venv-bench, .venv-oldest and all generated files
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -52,7 +52,7 @@ lint: $(VENV)/.installed-dev
 nightly: $(VENV)/.installed-test
 	$(BIN)/python -m pytest --hypothesis-profile=nightly -n $(JOBS) test/test_properties.py
 
-# Installs of each library the first release of the oldest series that setup.py allows.
+# Tests with the first release of the oldest series of each library that setup.py allows.
 oldest:
 	grep -oE "'[A-Za-z0-9-]+(\[[a-z]+\])?>=[0-9.]+" setup.py \
 	  | sed -E "s/'([A-Za-z0-9-]+)(\[[a-z]+\])?>=([0-9.]+)/\1==\3.*/" | sort -u > oldest.txt

@@ -6,9 +6,10 @@ Owns the accuracy figures of docs/accuracy.md: the fit against the simulator's t
 Run ``python benchmarks/accuracy.py`` for everything, or a part with fewer units:
 ``python benchmarks/accuracy.py kinds --kinds own-lags,paper --seeds 1``.
 
-Every fit uses a whole test in unknown attitudes. With its result the compensator corrects the plan
-'held-out' (other ramps, other soaks, other attitudes). Errors are those of 60 s means, in micro-g,
-against the simulated truth. The floor is the error of the true model with the same noise.
+Every fit uses a whole test in unknown attitudes. With the result of the fit the compensator
+corrects the plan 'held-out' (other ramps, other soaks, other attitudes). Errors are differences of
+60 s means from the simulated truth, in micro-g. The floor is the error of the true model with the
+same noise.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from thermo_comp.unit.calibration import Calibration, parameter_layout
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
-N_SIBLINGS = 10  # units whose calibrations make the prior
+N_SIBLINGS = 10  # number of siblings that make the prior
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,8 @@ GOALS = {
     'slow-noise': Goal(1.15, 1.15, is_relative=True),
     'plain': Goal(1.05, 1.05, is_relative=True, plan='chamber-9'),
 }
-# Tests with little time in the chamber: alone, and with the prior of siblings.
+# Limits for tests with little time in the chamber: without a prior, and with the prior of
+# siblings.
 PLAN_GOALS = {
     'chamber-9': (None, None),
     'tumble-3': (Goal(1.5, 2.5), Goal(1.2, 2.1)),
@@ -135,7 +137,8 @@ def fit_and_correct(
         columns = np.column_stack((corrected.specific_force, corrected.covariance[:, [0, 4, 8]]))
         size = np.diff(first, append=len(slots))
         mean = np.add.reduceat(columns, first, axis=0)[size == size.max()] / size.max()
-        # White noise and rounding average out, the other parts of the published variance do not.
+        # In means of 60 s white noise and rounding average out, the rest of the published variance
+        # does not.
         white = np.array(compensator.thermal.correction.noise)
         forces.append(mean[:, :3])
         sds.append(np.sqrt(np.maximum(mean[:, 3:] - white, 0.0) + density**2 / WINDOW_S))
@@ -243,7 +246,7 @@ def part_kinds(options: argparse.Namespace) -> None:
 
 
 def part_plans(options: argparse.Namespace) -> None:
-    """Print the errors of short chamber tests, without a prior and with that of ten siblings."""
+    """Print the errors of short chamber tests, without a prior, and with one of ten siblings."""
     print('| test | unit | seed | floor | alone | with siblings | error / claimed sd, both |')
     print('|---|---|---|---|---|---|---|')
     for kind in options.kinds or ('own-lags', 'between', 'products'):

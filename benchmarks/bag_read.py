@@ -60,7 +60,7 @@ def read_ours_whole(path: Path) -> int:
 
 
 def read_ours_blocks(path: Path) -> int:
-    """Read block by block, as for the compensator."""
+    """Read the bag block by block, as for the compensator."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks())
 
@@ -133,7 +133,7 @@ def measure(
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure all readers and print the table."""
     parser = argparse.ArgumentParser(description='Reading a bag, against rosbags and mcap.')
     parser.add_argument(
         '--samples', type=int, default=2_000_000, help='messages that thermo_comp reads'

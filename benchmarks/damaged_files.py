@@ -28,14 +28,14 @@ def damaged(
 
 
 def flip(file: Path, place: float = 0.5) -> None:
-    """Flip one bit."""
+    """Flip one bit of a file."""
     data = bytearray(file.read_bytes())
     data[int(len(data) * place)] ^= 4
     file.write_bytes(data)
 
 
 def wipe(file: Path) -> None:
-    """Overwrite some kB in the middle."""
+    """Overwrite some kB in the middle of a file."""
     data = bytearray(file.read_bytes())
     half = len(data) // 2
     data[half : half + 4096] = bytes(4096)
@@ -43,7 +43,7 @@ def wipe(file: Path) -> None:
 
 
 def cut(file: Path) -> None:
-    """Keep only the first half."""
+    """Keep only the first half of a file."""
     data = file.read_bytes()
     file.write_bytes(data[: len(data) // 2])
 

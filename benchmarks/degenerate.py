@@ -100,7 +100,7 @@ def run(name: str, command: str, path: Path, out: Path) -> Run:
     pid = 0
     megabytes = 0.0
     while not pid and time.monotonic() - began < LIMIT_S:
-        # The memory of wait4 starts with that of the parent process.
+        # The peak memory by wait4 includes the parent's memory at the fork, so read it from /proc.
         megabytes = max(megabytes, _peak_megabytes(process.pid))
         pid, status, _ = os.wait4(process.pid, os.WNOHANG)
         time.sleep(0.01)

@@ -39,7 +39,7 @@ class Columns:
 
 
 def whole() -> Columns:
-    """Make the recording that the other inputs are derived from."""
+    """Make the recording from which all degenerate inputs are derived."""
     rng = np.random.default_rng(20)
     n = RATE_HZ * POSITIONS * POSITION_S
     row = np.arange(n)
@@ -79,7 +79,7 @@ def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]
 
 
 def spoilt(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
-    """Apply a defect to any other part."""
+    """Apply a defect to samples, readings or topics."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -250,7 +250,8 @@ def _samples(columns: Columns, n: int) -> None:
 @dataclass(frozen=True)
 class Input:
     """
-    One degenerate input; with `is_lost` a part of it cannot be read, so that exit code 0 is wrong.
+    A degenerate input; `is_lost`: a part of the input cannot be read, so that exit code 0 is
+    wrong.
     """
 
     make: Callable[[Path], Path]

@@ -88,7 +88,8 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
 
     columns = []
     for j in range(len(start)):
-        # Steps of the size of the standard deviations, from the signal itself.
+        # Steps of the derivatives: 1e-6 for direction and M, 1e-3 for bias and scale, less per
+        # power.
         step = np.zeros(len(start))
         step[j] = 1e-6 if j >= 9 else 1e-3
         step[j] *= 1e-3 if j < 18 and j % 3 == 2 else 1e-1 if j < 18 and j % 3 == 1 else 1.0
@@ -129,7 +130,7 @@ def efficiency(n_units: int) -> None:
 
 
 def main() -> int:
-    """Run it."""
+    """Print the table of the efficiency."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

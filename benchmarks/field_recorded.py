@@ -5,7 +5,7 @@ Owns updates on real recordings, for the benchmark `field.py`.
 
 None of the recordings spans days, so each is cut into sections: a fit of the first section
 replaces the calibration of a laboratory, and each further section counts as one start of the node.
-An update by all sections so far and the fit of the first section are compared on the next section.
+On each section, an update by all previous sections is compared with the fit of the first.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def part(of: Columns, begin: float, end: float) -> Columns:
 
 
 def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple[Start, Rest]]:
-    """Return what a node that starts with a part would have logged of it."""
+    """Return the rest log that a node would write if it started at the beginning of a part."""
     compensator = Compensator(calibration)
     correction = compensator.thermal.correction
     start = Start(

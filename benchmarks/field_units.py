@@ -143,7 +143,7 @@ def temperature(day: float, rng: np.random.Generator) -> float:
 
 
 def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[float]:
-    """Split the rests of a start: one attitude of a vehicle, 20 to 90 s each of a drone."""
+    """Split a rest: a vehicle keeps its attitude, a drone changes it every 20 to 90 s."""
     while seconds >= WINDOW_S:
         rest = seconds if kind == 'level' else min(seconds, rng.uniform(20.0, 90.0))
         yield rest

@@ -58,7 +58,7 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
         lines=True,
     )
     if done.returncode:
-        # A process that was ended by the system prints nothing.
+        # A process that the system has killed, as for lack of memory, prints nothing.
         lines = done.stderr.splitlines() or [f'exit code {done.returncode}']
         sys.exit(f'{task} of {len(paths)} bags failed: {lines[-1]}')
     return dict(json.loads(done.stdout))
@@ -87,7 +87,7 @@ def run_task(task: str, paths: list[Path]) -> dict[str, float]:
 
 
 def main() -> int:
-    """Write, read, fit, print."""
+    """Simulate bags, read and fit them, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

@@ -90,7 +90,7 @@ def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
 @dataclass(frozen=True)
 class Measured:
     """
-    One run.
+    Figures of one run of a fleet.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def count_bytes() -> None:
 
 
 def bytes_written() -> int:
-    """Return the number counted by `count_bytes`."""
+    """Return the number of bytes counted by `count_bytes`."""
     from distributed.comm.tcp import TCP
 
     return int(TCP.n_written)
@@ -312,7 +312,7 @@ def loads() -> str:
 
 
 def main() -> int:
-    """Run one part."""
+    """Run one part of the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

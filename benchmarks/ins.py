@@ -161,7 +161,7 @@ def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> 
 
 def models() -> tuple[dict[str, Model], float, Floats, float]:
     """
-    Fit the sample bags and correct the held-out one; also return its step [s], true up and
+    Fit the sample bags and correct the held-out bag; also return its step [s], true up and
     gravity.
     """
     bags, held_out = sorted((BAGS / 'fit').glob('*.mcap')), BAGS / 'held_out.mcap'
@@ -213,7 +213,7 @@ def draw(path: Path, results: dict[str, dict[str, Flights]]) -> None:
 
 
 def main() -> int:
-    """Print the table, and draw."""
+    """Print the table, and draw the figure."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -3,8 +3,8 @@
 """
 Runs the live node in this process, without loss of messages, and records what it publishes.
 
-The demonstration, tests and benchmarks use it. As in a bag written by `replay`, the log time of an
-Imu is its stamp, and the log time of any other output the newest Imu stamp before it.
+The demonstration, tests and benchmarks use this module. As in a bag written by `replay`, the log
+time of an Imu is its stamp, and the log time of any other output the newest Imu stamp before it.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Recorder:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        """Stop; write the bag, or drop it after an error."""
+        """Stop recording; write the bag, or drop the bag after an error."""
         self._stack.close()
         if raised[0] is not None:
             self._writer.abort()
@@ -160,7 +160,7 @@ def through_the_node(
     ):
 
         def is_joined() -> bool:
-            """Whether every topic has discovered both ends."""
+            """Whether publishers and subscribers of all topics have discovered each other."""
             heard = {subscription.topic_name for subscription in node.node.subscriptions}
             sent = {publisher.topic_name for publisher in player.node.publishers}
             results = {f'{namespace}/{topic.name}' for topic in OUTPUTS}

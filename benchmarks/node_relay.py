@@ -20,9 +20,10 @@ The source keeps `--depth` samples to repeat them. With a reliable relay Fast DD
 from the source's store 859 at a time; with 2000 kept samples the removal delays the source by 1 to
 3 ms, which is no property of the relay.
 
-Processes that missed each other's first announcements discover each other at the next, 3 s later.
-A process that opens another's shared memory may stand still for a third of a second, as Fast DDS
-waits for a reader. The measurement begins when all processes have been discovered.
+Processes that missed each other's first DDS announcements discover each other at the next
+announcements, 3 s later. A process that opens another's shared memory may stand still for a third
+of a second, as Fast DDS waits for a reader. The measurement begins when all processes have been
+discovered.
 
 An idle core sleeps and needs time to wake up, and an idle virtual core may be given away. If the
 system allows it (Linux, as root) all cores are kept awake for all relays alike, by a request for
@@ -54,10 +55,10 @@ import thermo_comp
 ROOT = Path(__file__).resolve().parent.parent
 RATES = (100, 400, 1000, 2000, 5000, 10000)
 ROLES = ROOT / 'benchmarks' / 'relay_roles.py'
-# Interval of announcements, and three times a third of a second for processes that discover each
-# other.
+# Wait for discovery [s]: the interval of DDS announcements, 3 s, and a third of a second for each
+# of three processes.
 MEETING_S = 4.0
-# Effective while open: the longest wake-up time in us, as a native 32-bit number.
+# File that limits the wake-up time of the cores while open: a native 32-bit number [us].
 LATENCY_REQUEST = Path('/dev/cpu_dma_latency')
 CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
 
@@ -177,7 +178,7 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _ratio(runs: list[dict[str, Any]], naive: list[dict[str, Any]]) -> float:
     """
-    Divide each run's CPU time by that of the naive relay just before it; return the median ratio.
+    Divide each run's CPU time by the naive relay's in the run before; return the median ratio.
 
     The speed of a machine changes over minutes by more than the differences to be measured.
     """
@@ -206,8 +207,7 @@ def _expect(process: subprocess.Popen[str], word: str) -> None:
 @contextmanager
 def _cores_kept_awake(may_sleep: bool) -> Iterator[bool]:
     """
-    Request from the system that cores do not sleep while this is open; return whether it is
-    possible.
+    Keep the cores awake as long as the context is open; yield whether the system allows it.
     """
     with ExitStack() as stack:
         asked = False

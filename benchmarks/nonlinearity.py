@@ -82,7 +82,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class Run:
-    """A run: its samples and readings, the true force, and what is stated of |f|."""
+    """A run: its samples and readings, the true force, and the stated |f|."""
 
     block: Block
     force: Floats

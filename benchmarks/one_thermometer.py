@@ -26,7 +26,7 @@ MICRO_G = 9.80665e-6
 
 
 def command(*arguments: object) -> dict[str, Any]:
-    """Run a command and return its JSON; exit code 1 is a verdict and accepted."""
+    """Run a command and return its JSON; exit code 1, a verdict, is accepted."""
     line = [sys.executable, '-m', 'thermo_comp', *map(str, arguments), '--json']
     done = subprocess.run(line, capture_output=True, text=True, check=False, cwd=ROOT)
     if done.returncode not in {0, 1} or not done.stdout:

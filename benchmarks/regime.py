@@ -37,7 +37,7 @@ Matrix = list[tuple[Scene, Outcome]]
 
 
 def quantiles(delays: list[float]) -> tuple[float, float]:
-    """Median and 95 %; infinite if empty."""
+    """Median and 95 % quantile; infinite if empty."""
     if not delays:
         return np.inf, np.inf
     return float(np.median(delays)), float(np.percentile(delays, 95))
@@ -144,7 +144,7 @@ def run_matrix(
 
 
 def rate_table(matrix: Matrix) -> Rows:
-    """Count detections, flips and misses of the ramps, by the rate of the readings."""
+    """Count detected and missed ramps, and flips of the state, by the rate of the readings."""
     rows = [['readings', 'ramps', 'missed', 'missed of >= 0.2 K/min', 'with a flip']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
         mine = [(scene, result) for scene, result in matrix if scene.rate_hz == rate]
@@ -209,7 +209,7 @@ def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_cost(_pool: Pool, _arguments: argparse.Namespace) -> Tables:
-    """Time a reading."""
+    """Measure the time that a reading takes."""
     yield 'Cost', cost_table()
 
 

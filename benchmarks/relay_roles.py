@@ -103,8 +103,8 @@ def _sink(arguments: argparse.Namespace) -> None:
     Receive Imu messages until all have arrived or none comes; print number and latency
     percentiles.
 
-    The middleware stores when each message arrived, so messages may wait here; a sink that wakes
-    up for each would use the relay's core.
+    The middleware stores when each message arrived, so messages may wait in the sink; a sink that
+    wakes up for each message would disturb the relay.
     """
     import numpy as np
     import rclpy

@@ -67,13 +67,13 @@ def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
 
 
 def read(path: Path) -> int:
-    """Read to columns, block by block."""
+    """Read a bag to columns, block by block."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks())
 
 
 def read_and_compensate(path: Path) -> int:
-    """Read to columns and correct."""
+    """Read a bag to columns and correct them."""
     compensator = Compensator(calibration())
     with open_recording(path) as reader:
         return sum(len(process_block(compensator, block).index) for block in reader.blocks())
@@ -86,7 +86,7 @@ def compensate(path: Path) -> tuple[int, float]:
     n = 0
     with open_recording(path) as reader:
         for block in reader.blocks():
-            # Use the clock of this thread only, as the reader decompresses ahead in others.
+            # Measure the CPU time of this thread: the reader's is not part of the correction.
             begin = time.thread_time()
             n += len(process_block(compensator, block).index)
             spent += time.thread_time() - begin
@@ -94,12 +94,12 @@ def compensate(path: Path) -> tuple[int, float]:
 
 
 def ours(path: Path, output: Path) -> int:
-    """Replay as the command does."""
+    """Replay a bag as `thermo_comp replay` does."""
     return replay_bag(path, calibration(), output, overwrite=True).counters.n_out
 
 
 def rosbags_pipeline(path: Path, output: Path) -> int:
-    """Replay message by message with rosbags."""
+    """Replay a bag message by message with rosbags."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -225,7 +225,7 @@ def memory(folder: Path, gigabytes: float) -> None:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure the offline run and print the tables."""
     parser = argparse.ArgumentParser(description='The offline run, against rosbags.')
     parser.add_argument('--samples', type=int, default=1_000_000, help='samples of the pipelines')
     parser.add_argument('--hours', type=float, default=2.0, help='length of the bag for reading')

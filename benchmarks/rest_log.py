@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Measures the cost of the rest log: CPU time per sample and latency of the node with and without it.
+Measures the cost of the rest log: CPU time per sample and latency of the node with and without the
+log.
 
     python benchmarks/rest_log.py [--rates 400 1000 10000] [--seconds 60]
 
-The node runs in this process, source and sink of samples in two others; the log is on in even
+The node runs in this process, source and sink of samples in two others; the rest log is on in even
 seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because a shared
 machine changes its pace. The latency runs from the source's publish call to the arrival in the
 sink's middleware. The wall time of one block of sums is the longest time for which the block can
@@ -60,7 +61,7 @@ def cost(
 
 
 def tail_latencies(file: Path) -> tuple[Floats, Floats]:
-    """Return the p99 latency [ms] of each even second, with the log, and of each odd one."""
+    """Return the p99 latency [ms] of each even second (log on) and odd second (log off)."""
     stamp_ns, latency_ns = np.load(file)
     second = stamp_ns // 1_000_000_000
     # Exclude the first and the last second, which are incomplete.
@@ -121,7 +122,7 @@ def _compared(with_log: Floats, without: Floats, unit: str) -> str:
 
 
 def main() -> None:
-    """Measure each rate."""
+    """Measure the node at each sample rate."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--rates', type=int, nargs='+', default=(400, 1000, 10000))
     parser.add_argument('--seconds', type=int, default=60)

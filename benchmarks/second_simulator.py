@@ -88,7 +88,7 @@ def unit_of(kind: str, seed: int) -> SimpleNamespace:
     def signed(low: float, high: float) -> Floats:
         return np.asarray(draw.uniform(low, high, 3) * draw.choice([-1, 1], 3))
 
-    # The order of the draws must not change, as it defines the units.
+    # The order of the random draws defines the units, so it must not change.
     unit = SimpleNamespace(
         scale_factor=4e5 * (1.0 + 0.01 * draw.standard_normal(3)),
         constant=normal(1500.0),
@@ -239,7 +239,7 @@ def runs_of(
             for celsius in (board, case)
             for sd in [READING_SD * draw.standard_normal(len(read))]
         ]
-        # A sample is stamped at its end.
+        # A sample has the stamp of the end of its cycle.
         stamps, read_ns = (np.rint(1e9 * (time + 0.5 * SAMPLE_S)).astype(np.int64)
                            for time in (middle, read))  # fmt: skip
         result.append(

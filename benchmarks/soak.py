@@ -145,7 +145,7 @@ class Soak:
             self._news.notify_all()
 
     def send(self, n: int) -> None:
-        """Publish samples, each after the temperatures before it."""
+        """Publish samples, and the temperatures that precede them."""
         head, frame_length, frame = HEAD
         for index in range(self.n_sent, self.n_sent + n):
             sec, nanosec = divmod(self.start_ns + index * SECOND_NS // self.rate, SECOND_NS)
@@ -165,7 +165,7 @@ class Soak:
                 raise SystemExit(f'{what} did not come; {self.account}; {self.process.said}')
 
     def meet(self) -> None:
-        """Publish samples until the first of them comes back; count from there."""
+        """Publish samples until the node returns the first of them; count from there."""
         deadline = time.monotonic() + TIMEOUT_S
         while not self.n_heard and time.monotonic() < deadline:
             self.send(self.rate // READINGS_HZ)
@@ -179,7 +179,7 @@ class Soak:
             time.sleep(2.0 * REPORT_S)
         self.n_sent_before, self.n_in_before = self.n_sent, n_in
         self.n_out_before, self.n_heard_before = int(self.account['samples out']), self.n_heard
-        # A pause of the wall clock, not of the stamps.
+        # Drop the latencies of the samples before discovery.
         self.latencies.clear()
 
     def reload(self, path: str) -> None:
@@ -195,7 +195,7 @@ class Soak:
         self.client.call_async(request).add_done_callback(count)
 
     def run(self, seconds: float, paths: list[str]) -> dict[str, Any]:
-        """Publish for this time; return the counts."""
+        """Publish samples for the given time; return the counts of messages."""
         memory: list[tuple[float, float]] = []
         latency: list[tuple[float, float, float]] = []
         n_reloads = n_sent = 0

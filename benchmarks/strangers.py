@@ -42,7 +42,8 @@ from thermo_comp.fitting import FitOptions
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.posterior import Posterior
 
-#: Options of the models by the package: the fit, and two baselines beside constants and cubic.
+#: Options of the three models that the package fits: the fit itself, and two of the four
+#: baselines.
 PACKAGE: dict[str, dict[str, Any]] = {
     'fit': {},
     'golovach': {'model': 'golovach'},
@@ -81,7 +82,7 @@ def fitted(
     study: Study, prior: thermo_comp.Calibration | None = None, **model: Any
 ) -> thermo_comp.Calibration:
     """Fit a study's bags; `model` holds further options."""
-    # The option `gravity_sd` of a study is left out for a version of the package without it.
+    # Leave out the option `gravity_sd` for versions of the package that lack this option.
     known = {option.name for option in fields(FitOptions)}
     options = {name: value for name, value in study.options.items() if name in known}
     if prior is not None:
@@ -199,7 +200,7 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
         key: (read_s, celsius + unit.reading_sd * rng.standard_normal(len(read_s)))
         for key, celsius in rest.items()
     }
-    # Switch off two checks of the node: these samples are constant, and |f| is not gravity.
+    # Switch off two checks of the node: the samples here are constant, and |f| is not gravity.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     out = corrected(calibration, Bag('zero', time_s, zero, temperatures), config)
     # The samples have no noise, so the white noise is subtracted from the claimed variance.
@@ -217,8 +218,9 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     """
     Return a calibration whose covariance has no constants: bias, scale and misalignment.
 
-    One pose determines the constants to 50 mg only. They cancel in its drift, but not in a
-    difference of two variances: ``a^2`` times the variance of a scale factor has the noise of `a`.
+    One pose determines the constants to 50 mg only. The constants cancel in the drift of one pose,
+    but not in a difference of two variances: ``a^2`` times the variance of a scale factor has the
+    noise of `a`.
     """
     if calibration.posterior is None:
         return calibration
@@ -320,7 +322,7 @@ def run_case(
     path: Path | None,
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
-    """Run all studies of a case, or those with the label."""
+    """Run all studies of a case, or the studies with the label."""
     results = []
     for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
         done: dict[str, thermo_comp.Calibration] = {}

@@ -55,7 +55,7 @@ def means(values: Floats, first: Ints, size: Ints) -> Floats:
 
 
 def minutes(bag: Bag) -> Minutes:
-    """Average a bag."""
+    """Average the samples and readings of a bag over windows."""
     first, size = slots(bag)
     board = np.full(len(first), REFERENCE_C)
     if 'board' in bag.temperatures:

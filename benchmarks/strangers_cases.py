@@ -48,7 +48,7 @@ ROOM = program(21, 20)
 #: The range of SHORT ends 2 K before the range of USE, on both sides.
 SHORT = program(20, 20, (33, 1, 50), (7, 1, 60), (20, 1, 12))
 USE = (program(20, 20, (35, 0.7, 45), (15, 1.5, 40)), program(20, 20, (5, 1.2, 50), (24, 0.6, 40)))
-#: Programs of MEMS: a simple oven.
+#: Programs of the tests of MEMS units, as in a simple oven.
 WARM = program(22, 15, (45, 1, 30), (12, 1, 40), (22, 1, 20))
 WARM_HELD = (program(15, 15, (40, 0.8, 40)), program(40, 15, (18, 1.2, 40)))
 

@@ -128,7 +128,7 @@ LIMITS = {
     'bump': Limit(norm=60.0),
     'carry': Limit(),
     'support': Limit(vector=60.0),
-    # The data do not show a wrong gravity, which the baselines have, too: limit only the ratio.
+    # The data do not show a wrong gravity, which the baselines also use: limit only the ratio.
     'gravity': Limit(best=np.inf),
     'cold-start': Limit(),
     # A further bag of another environment must not increase the error by more than the noise of

@@ -86,7 +86,7 @@ def part(bag: Bag, rows: slice, name: str) -> Bag:
 
 
 def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
-    """Cut a recording, or a rest of it, into blocks by the clock."""
+    """Cut a recording, or one rest of a recording, into blocks by the clock."""
     number = (bag.time_s // BLOCK_S).astype(int)
     edges = np.flatnonzero(np.diff(number, prepend=-1, append=-1)).tolist()
     return {
@@ -97,7 +97,7 @@ def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
 
 
 def cats(path: Path) -> Iterator[Study]:
-    """Hold out every other block of the real unit, then each of its rests."""
+    """Hold out every second block of the real unit, then each rest of the unit."""
     whole = real_unit(path)
     rests = [part(whole, rows, f'rest{k}') for k, rows in enumerate(rests_of(whole))]
     still: tuple[list[Bag], list[Bag]] = ([], [])

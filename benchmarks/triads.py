@@ -27,8 +27,8 @@ from thermo_comp.simulation.unit import Stream, SwitchedLoad, UnitModel, generat
 from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G
 
-#: Kinds of triads, each with one kind of physics in addition to tempcos that lag; the order is the
-#: numbering of their streams of random numbers, after those of the instruments.
+#: Kinds of triads, each with one kind of physics in addition to tempcos that lag; the order
+#: numbers the streams of random numbers of the kinds, after the instruments' streams.
 TRIAD_NAMES = (
     *('own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load'),
     *('paper', 'slow-noise', 'plain'),
@@ -113,7 +113,7 @@ def triad(kind: str, seed: int = 0) -> UnitModel:
 
 
 def unit_of(kind: str, seed: int = 0) -> UnitModel:
-    """Return a triad, or a specimen of a kind of the package."""
+    """Return a triad of this module, or a unit of a kind of the package."""
     return triad(kind, seed) if kind in TRIAD_NAMES else unit_preset(kind, seed)
 
 
@@ -128,7 +128,7 @@ def _tempcos(draw: Specimen, parts: list[str]) -> list[Effect]:
 
 
 def _slips(draw: Specimen) -> list[Effect]:
-    # Per axis a joint that slips abruptly and a joint that slips gradually.
+    # Each axis has a joint that slips abruptly and a joint that slips gradually.
     effects: list[Effect] = []
     for i in range(3):
         for is_gradual in (False, True):

@@ -155,7 +155,7 @@ def draw_layout(figure: Figure) -> None:
             return
         panel = saved['configById'][node]
         title = panel.get('title') or panel.get('foxglovePanelTitle') or node.split('!')[1]
-        # Axis labels beside and below each panel, its title above.
+        # Each panel has axis labels beside and below, and a title above.
         left, below, above = 0.04, 0.048, 0.032
         axes = figure.add_axes(
             (x + left, 1.0 - y - height + below, width - left - 0.016, height - below - above)

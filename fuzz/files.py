@@ -37,7 +37,7 @@ MAP = {
     'accel': {'columns': [1, 2, 3], 'unit': 'counts', 'output': 'counts'},
     'board': {'column': 4},
 }
-#: No message is shorter than this, and zstd expands a byte to at most 30 kB.
+#: Largest number of messages per byte of a file: zstd expands a byte to at most 30 kB.
 MOST_PER_BYTE = 1000
 
 

@@ -60,7 +60,7 @@ def small_calibration() -> Calibration:
 
 
 UNIT = small_calibration()
-#: More messages in one input reveal nothing new.
+#: Largest number of messages in an input: more would only slow the fuzzer down.
 MOST_MESSAGES = 6
 #: One compensator for all inputs, as making it takes longer than most inputs.
 COMPENSATOR = Compensator(UNIT)
@@ -79,7 +79,7 @@ def check_calibration(data: bytes) -> None:
         return
     assert parse_calibration(dump_calibration(value).encode()) == value
     row = Compensator(value).process(START_NS, 1.0, 2.0, 3.0)
-    # There is no temperature yet; a correction by constants needs none.
+    # No temperature has been given; only a correction by constants needs no temperature.
     assert row is None or not value.needs_temperature
 
 
@@ -122,7 +122,7 @@ def check_mcap(data: bytes) -> None:
 
 def check_cdr(data: bytes) -> None:
     """For any messages the node's output is a complete, finite Imu message."""
-    # ROS is needed for this target only.
+    # Import ROS here, because only the targets `parameters` and `cdr` need ROS.
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.serialization import deserialize_message
     from sensor_msgs.msg import Imu
@@ -156,8 +156,8 @@ def check_cdr(data: bytes) -> None:
 
 
 def check_parameters(data: bytes) -> None:
-    """Send any bytes as a request to set parameters: it is answered, a refusal with a reason."""
-    # ROS is needed for `parameters` and `cdr` only.
+    """Send any bytes as a request to set parameters: the answer to a bad request has a reason."""
+    # Import ROS here, because only the targets `parameters` and `cdr` need ROS.
     from rcl_interfaces.msg import Parameter, ParameterValue
     from rcl_interfaces.srv import SetParameters
     from rclpy.serialization import deserialize_message
@@ -169,7 +169,8 @@ def check_parameters(data: bytes) -> None:
     try:
         messages = deserialize_message(data, SetParameters.Request).parameters
     except (RuntimeError, ValueError):
-        # The data are no request: the first byte is the type of a value, the rest its text.
+        # Bytes that are no request become a value: the first byte is the type, the others the
+        # text.
         text = data[1:].decode(errors='replace').replace('\0', '')
         value = ParameterValue(type=data[0] if data else 0, string_value=text)
         messages = [Parameter(name=name, value=value) for name in ('frame_id', 'calibration_file')]

@@ -34,10 +34,7 @@ def regime_set(x=None, y=None, z=None, **keys):
 
 
 def calibration(**keys):
-    """
-    Make a unit of 300 counts per m/s^2; without arguments it has no bias and no temperature
-    function.
-    """
+    """Make a unit of 300 counts per m/s^2, by default without bias and temperature functions."""
     values = {
         'format_version': 2, 'unit': Unit('T-1', 'counts', 32767.0, 0.01),
         'reference_temperature_c': 20.0, 'gravity_m_s2': GRAVITY,
@@ -59,9 +56,7 @@ def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
 
 
 def rich_calibration():
-    """
-    Make a calibration with every kind of term, on every axis and in both regimes, and a posterior.
-    """
+    """Make a calibration with a posterior and every kind of term, on all axes, in both regimes."""
 
     def one(sign, dynamic):
         size = 2 if dynamic else 1
@@ -143,9 +138,7 @@ class Columns:
 
 
 def columns_from_events(events):
-    """
-    Columns from (kind, stamp_ns, value) in file order; kind is 'accel' or a thermometer's name.
-    """
+    """Columns of (kind, stamp_ns, value) in file order; kind: 'accel', or a thermometer's name."""
     accel = [(s, v) for kind, s, v in events if kind == 'accel']
     readings = {}
     n_accel = 0
@@ -164,11 +157,7 @@ def columns_from_events(events):
 
 
 def stream(compensator, events):
-    """
-    Run events one by one; return the rows and the indices of the published samples.
-
-    With a gyroscope a row also contains the rate, a thousandth of the sample.
-    """
+    """Run events one by one (rates: sample / 1000); return rows and published indices."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns what all tests share: a DDS domain per test process, seeds, and the command line's fixtures.
-"""
+"""Owns what all tests share: a DDS domain per process, seeds, the command line's fixtures."""
 
 import fcntl
 import gc
@@ -27,33 +25,31 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# One BLAS thread, as several threads for many small matrices wait for each other on a busy
-# machine. The variable is set before numpy is imported, which reads it.
+# One BLAS thread: several wait for each other on a busy machine. numpy reads this at import.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
-# The run id separates runs, the worker's number separates workers. Domain 0 is the user's, domains
-# from 81 are the benchmarks'.
+# The DDS domain follows from the id of the run and the number of the worker. Domain 0 is the
+# user's, domains from 81 are the benchmarks'.
 _RUN = os.environ.get('PYTEST_XDIST_TESTRUNUID', str(os.getpid()))
 _WORKER = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
 os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WORKER % 4)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.pop('ROS_STATIC_PEERS', None)
 
-# A shell starts background processes with SIGINT ignored, which their children inherit.
+# Background processes of a shell, and their children, ignore SIGINT: restore it.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# No deadline, as the duration of an example depends on the machine.
+# Examples of hypothesis have no deadline, because their duration depends on the machine.
 settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
-# For `make nightly`; tests with a stated number of examples are unchanged.
+# Profile of `make nightly`; tests with a stated number of examples keep this number.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
-#: The longest files first: parallel workers begin with them, so that no worker is left with a long
-#: file at the end (`make test` keeps this order).
+#: The longest test files, in order of duration, with which `make test` begins.
 _LONG = (
     *('fleet_run', 'cli_help', 'real_data', 'fitting', 'record', 'faults', 'fitting_selection'),
     *('priors', 'regime', 'docs', 'degenerate', 'gyroscope', 'cli_demo', 'few_positions'),
@@ -72,9 +68,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """
-    Exclude imported objects from garbage collection, which would otherwise scan them repeatedly.
-    """
+    """Exclude imported objects from garbage collection, which would scan them repeatedly."""
     gc.freeze()
 
 
@@ -163,9 +157,7 @@ def _caught(name, descriptor):
 
 @contextmanager
 def _as_a_process(cwd):
-    """
-    Give a command the state of a new process, and restore the state of this process afterwards.
-    """
+    """Give a command the state of a new process; restore the state of this process afterwards."""
     folder, environment = Path.cwd(), dict(os.environ)
     log = logging.getLogger()
     handlers, log.handlers = log.handlers, []  # pytest's handlers keep log messages from stderr
@@ -189,10 +181,7 @@ def _as_a_process(cwd):
 
 @pytest.fixture(scope='session')
 def cli(program):
-    """
-    Return a function that runs the command line in this process, or in a new process with
-    variables.
-    """
+    """Return a function that runs a command here, or with variables in a new process."""
     from thermo_comp.cli.app import run as run_command
 
     def run(*args, code=0, cwd=None, **env):

@@ -28,9 +28,7 @@ _EXPORTS = {'autopilot.params': 'px4', 'xsens_acc.calib': 'imu_tk',
 
 
 def write_fit_of_the_readme(path, cli):
-    """
-    Write the calibration of the sample bags, and the output of the README's command beside it.
-    """
+    """Write the calibration of the sample bags, and the README command's output beside it."""
     words, _ = shown()['fit']
     bags = ROOT / 'bags' / 'fit'
     assert words[1] == 'bags/fit/*.mcap'
@@ -70,7 +68,7 @@ class Desk:
         elif name == 'unit.yaml':
             shutil.copy(self._make('unit42.yaml'), path)
         elif name in ('unit01.yaml', 'unit02.yaml', 'unit03.yaml'):
-            # The paper's model is small: the population of three responses takes ten seconds.
+            # The paper's model is small; a prior from three larger models would take ten seconds.
             bags = sorted(self._make('bags/unit42').iterdir())
             given = ('--gravity', '9.8154', '--model', 'golovach', '--serial', path.stem)
             self._cli('fit', *bags, *given, '-o', path, '-q')
@@ -78,7 +76,7 @@ class Desk:
             to = ('--to', _EXPORTS[name])
             self._cli('export', self._make('unit42.yaml'), *to, '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
-            # A short bag, as some examples play it in real time.
+            # The bag is short, because some examples play it in real time.
             self._cli('simulate', '--profile', '20 1s', '-o', path, '-q')
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
@@ -137,15 +135,12 @@ class Desk:
             write_new(path, np.random.default_rng(5))
 
     def run(self, command, cli=None):
-        """
-        Run one example as written, with a shorter wait; it must succeed. Each example has a new
-        folder, except that fleets share one.
-        """
+        """Run one example with a short wait for subscribers, in a new folder (fleets: one)."""
         words = shlex.split(command, comments=True)
         assert words.pop(0) == 'thermo_comp'
         outputs = {after for word, after in itertools.pairwise(words) if word == '-o'}
         self._n += 1
-        # A fleet is continued in its folder; a second run reports the existing results.
+        # A second `fleet fit` in the same folder reports the existing results.
         here = self._folder / ('fleet' if words[0] == 'fleet' else f'run{self._n}')
         (here / 'bags').mkdir(parents=True, exist_ok=True)
         for word in words:
@@ -163,16 +158,14 @@ class Desk:
             arguments += sorted(str(path.relative_to(here)) for path in paths) or [word]
         if arguments[0] == 'play':
             pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-            # There is no subscriber to wait for.
+            # No node subscribes in this test, so do not wait for subscribers.
             arguments[1:1] = ['--wait', '0.5']
         if arguments[:2] == ['record', '--positions']:
             return self._interrupted(arguments, here)
         return (cli or self._cli)(*arguments, cwd=here)
 
     def _interrupted(self, arguments, here):
-        """
-        Start a command that runs until Ctrl-C, and send Ctrl-C once it has printed its first line.
-        """
+        """Start a command that runs until Ctrl-C; send Ctrl-C once it has printed a line."""
         process = subprocess.Popen(
             [sys.executable, '-m', 'thermo_comp', *arguments], cwd=here,
             env={**os.environ, 'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE,

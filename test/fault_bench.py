@@ -32,8 +32,8 @@ from thermo_comp.ros.waitloop import WaitLoop
 
 #: Longest wait for any event [s]; reached only if the bench is broken.
 TIMEOUT_S = 60.0
-#: A lot covers this part of the bag [s], with at most this number of messages: the shared memory
-#: of Fast DDS holds 512, and further messages are repeated seconds later, out of order.
+#: Length of bag [s] and largest number of messages in one lot: the shared memory of Fast DDS holds
+#: 512, and further messages are repeated seconds later, out of order.
 LOT_S, LOT_SIZE = 10.0, 400
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 FRAME = b'sensor\0'
@@ -78,7 +78,7 @@ class Bench:
     def __init__(self, node, context):
         self.process = node
         self.node = rclpy.create_node('fault_bench', context=context)
-        # The wait loop does not serve clients.
+        # The wait loop of the package does not serve service clients.
         self._operator = Peer()
         self._client = self._operator.node.create_client(
             SetParameters, 'thermo_comp/set_parameters'
@@ -116,7 +116,7 @@ class Bench:
             while not publisher.get_subscription_count():
                 pause.wait(0.01)
                 assert self.process.is_alive, self.process.said
-        # The node's reader knows the new writer once it has acknowledged that nothing is missing.
+        # The node's readers need a moment to discover the new publishers completely.
         pause.wait(0.5)
 
     def close(self):
@@ -155,7 +155,7 @@ class Bench:
     def set_parameters(self, **values):
         future = self.ask(**values)
         pause = threading.Event()
-        # A callback of the future would wait for the executor, which waits for the next answer.
+        # Poll the future: a callback would wait for the executor, which waits for the answer.
         while not future.done():
             pause.wait(0.001)
             assert self.process.is_alive, self.process.said
@@ -175,19 +175,18 @@ class Bench:
         return n
 
     def meet(self):
-        """Send samples with later stamps until the first of them comes back."""
+        """Send samples with later stamps until the node returns the first of them."""
         pause = threading.Event()
         standing = _STANDING.copy()
         for k in range(1000):
             stamp_ns = START_NS + (100_000 + k) * 1_000_000_000
-            # A unit at rest at constant temperature: even a long wait gives the node's checks
-            # nothing to reject, and its thermometers nothing to learn.
+            # Send a unit at rest at constant temperature, which the node's checks always accept.
             standing[2] += 1.0
             self.send([('board', stamp_ns, _REST[0]), ('counts', stamp_ns, tuple(standing))])
             pause.wait(0.02)
             if self._frames:
                 break
-        # Messages sent before discovery are lost; count from here.
+        # Messages sent before discovery are lost: start the counts anew.
         last_ns = stamp_ns + 1_000_000_000
         standing[2] += 1.0
         self.send([('counts', last_ns, tuple(standing))])

@@ -27,7 +27,7 @@ START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5
 READINGS_HZ = 2.5
 DURATION_S = 320.0
-#: The platform turns until this time and is at rest afterwards.
+#: Time until which the platform turns; afterwards it is at rest [s].
 STANDS_S = 40.0
 RAMP_S = (60.0, 120.0)
 RAMP_K_S = 0.1
@@ -177,11 +177,7 @@ def seconds_of(stamp_ns):
 
 
 def changed(topic, begin_s, end_s, change):
-    """
-    Change the messages of a topic within a span.
-
-    `change(event)` returns the events that replace it.
-    """
+    """Replace each message of a topic within a span by the events of `change(event)`."""
 
     def inject(events):
         result = []

@@ -39,7 +39,7 @@ N_SAMPLES = round(RATE_HZ * DURATION_S)
 class Row:
     fault: str
     inject: Inject
-    #: (level, part of the message) of the required reports.
+    #: Required diagnostics: level, and a part of the message.
     says: tuple[tuple[int, str], ...]
     #: Smallest number of published samples.
     n_least: int
@@ -47,11 +47,11 @@ class Row:
     silent: tuple[tuple[float, float], ...] = ()
     #: Span before the fault can be detected, in which the output may be wrong.
     blind: tuple[float, float] = (0.0, 0.0)
-    #: Time from which the output is within 1 ug of that without the fault; 0: always; inf: never.
+    #: Time from which the output is within 1 ug of the fault-free output [s]; inf: never.
     recovered: float = 0.0
     #: Time from which stamps are ahead of the truth, and by how much [s].
     shift: tuple[float, float] = (math.inf, 0.0)
-    #: The bag, if it is not that of `fault_rig`.
+    #: Messages of the row; None: the bag of `fault_rig`.
     source: list[Event] | None = field(default=None, repr=False)
 
 

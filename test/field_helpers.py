@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns rests of a unit with any calibration, for tests: what its node would have logged."""
+"""Owns rests of a unit with any calibration, for tests, as its node would have logged them."""
 
 import numpy as np
 
@@ -15,10 +15,7 @@ FIRST_DAY = 21_915
 
 
 def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
-    """
-    Log three starts a day with four windows each, in soaks (or ramps of `rate` [K/s]) at 15 to 25
-    degC; `error` gives the bias [m/s^2] that the calibration lacks after some days.
-    """
+    """Log 3 starts a day of 4 windows, at `rate` [K/s]; `error` of a day is a bias [m/s^2]."""
     rng = np.random.default_rng(seed)
     correction = Correction(calibration)
     M, logged = np.array(calibration.misalignment), []

@@ -31,9 +31,7 @@ def write_unit(
     is_exchanged=False,
     counts='accel/counts',
 ):
-    """
-    Simulate a thermal test of a unit, one bag per position; its thermometers may be exchanged.
-    """
+    """Simulate a thermal test of a unit, a bag per position; thermometers may be exchanged."""
     unit = unit or preset('mems', seed)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []

@@ -33,9 +33,7 @@ class ImuBlock(ArrayBlock):
 
 @dataclass
 class Rest:
-    """
-    Samples of a sensor at rest: noise about `level`, and a board that cools from `warm` by `fall`.
-    """
+    """A sensor at rest: noise about `level`, a board that cools by `fall` from `warm`."""
 
     rng: np.random.Generator
     duration_s: float = 600.0

@@ -24,9 +24,7 @@ _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
 def shown():
-    """
-    Return the console examples of the page: sub-command -> (words of the command line, output).
-    """
+    """Return the page's console examples: sub-command -> (words of the command, output)."""
     collected = {}
     for kind, text in FENCE.findall(SESSION.read_text(encoding='utf-8')):
         if kind == 'console':
@@ -44,12 +42,7 @@ def shown_of_demo():
 
 
 def is_alike(got, expected):
-    """
-    Compare two outputs: words exactly, numbers within a third.
-
-    Figures may differ on another processor (last bits) or day (speed), but not in order of
-    magnitude.
-    """
+    """Compare two outputs: words exactly, numbers within a third, as processors differ."""
     if _NUMBER.sub('#', got).split() != _NUMBER.sub('#', expected).split():
         return False
     numbers = zip(_NUMBER.findall(got), _NUMBER.findall(expected), strict=True)

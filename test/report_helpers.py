@@ -42,17 +42,14 @@ def fitted():
         number = position + 1
         keys = {'sha256': f'{number:064x}', 'serial': 'thermostatted-0001'}
         sources.append(source_of(*arrays_of(record), name=f'{number:02d}.mcap', **keys))
-    # Without products the bank of columns is a third as large.
+    # Without the group `product` the bank of columns is a third as large.
     groups = ('curve', 'set', 'gradient', 'board')
     return fitting.fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))
 
 
 @cache
 def evidence():
-    """
-    Gather the evidence of the fit, with assumed left-out residuals of 1, 2, ... ug for all
-    positions but the last.
-    """
+    """Gather the evidence of the fit, with assumed left-out residuals of all positions but one."""
     *others, last = fitted().positions
     left_out = [
         replace(other, left_out_rms=rms) for other, rms in zip(others, LEFT_OUT_RMS, strict=True)
@@ -63,7 +60,7 @@ def evidence():
 
 @cache
 def certificate():
-    """Render the page of the fit once, as drawing takes seconds."""
+    """Render the page of the fit once, because drawing takes seconds."""
     return render_report(evidence())
 
 

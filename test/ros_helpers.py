@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the other end of the node in tests: a peer on real DDS that publishes, listens and calls
-services.
-"""
+"""Owns the other end of the node in tests: a peer on DDS with publishers and clients."""
 
 import contextlib
 import threading
@@ -96,9 +93,7 @@ class Peer:
         return publisher
 
     def join(self, node):
-        """
-        Wait until both ends of every topic have discovered each other, so that nothing is lost.
-        """
+        """Wait until both ends of every topic have discovered each other: then nothing is lost."""
         topics = {subscription.topic_name for subscription in self.node.subscriptions}
         outputs = [output for output in node.node.publishers if output.topic_name in topics]
         # Not every test has all thermometers of the unit.
@@ -114,7 +109,7 @@ class Peer:
         )
 
     def call(self, kind, name, request):
-        # Clients are kept, as discovering a service takes longer than its answer.
+        # Keep service clients, because discovering a service takes longer than a call.
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]

@@ -14,7 +14,7 @@ def of_part(truth, node):
 
 
 def ideal_regime(run, threshold_k_min=0.02):
-    """Return where, on the thermal grid, the board's temperature really changes."""
+    """Return, for each time of the thermal grid, whether the board's temperature changes."""
     truth = run.truth
     rate = np.gradient(of_part(truth, truth.unit.board.node), truth.grid_s)
     return np.asarray(np.abs(rate) * 60.0 > threshold_k_min)

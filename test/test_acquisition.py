@@ -101,7 +101,6 @@ def test_a_position_grows_until_it_is_good(stream):
     assert collected[-1] == ('', True)
     assert 'positions are missing' in account.findings[0]
     assert not account.is_complete
-    # The unit is upside down from this time on.
     assert account.next_deg == pytest.approx(np.degrees(np.arccos(account.next_up @ account.now)))
 
 
@@ -116,7 +115,7 @@ def test_what_is_wrong_with_a_position_is_said(stream):
     stream.turn()
     stream.rest((0, -1, 0), 30.0)
     stream.turn()
-    # The unit is knocked, then back in its place.
+    # The unit is turned and put back in the same position.
     stream.rest((0, -1, 0), 30.0)
     test = Acquisition(5, 50.0)
     for block in stream.blocks(0.5):

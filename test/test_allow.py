@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each refusal that has a name can be overridden by it, and then gives a calibration."""
+"""Each named refusal of a fit can be overridden by its name; the fit gives a calibration."""
 
 import re
 from dataclasses import replace
@@ -14,7 +14,7 @@ from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.options import REFUSALS
 from thermo_comp.simulation.campaign import positions
 
-# The model does not matter here; golovach is the fastest to fit.
+# Refusals do not depend on the model; golovach is the fastest to fit.
 COUNTS = FitOptions(gravity=GRAVITY, model='golovach')
 FORCE = replace(COUNTS, input='m/s^2')
 
@@ -56,7 +56,7 @@ def swapped(source, rest):
         ('units', as_it_is, COUNTS, 1),
         ('jump', jumped, FORCE, 1),
         ('jump', jumped, FORCE, 7),
-        # Ten minutes are too short to determine which thermometer leads.
+        # Bags of ten minutes do not determine which thermometer leads.
         ('swapped', as_it_is, FORCE, 7),
         ('compensated', compensated, FORCE, 12),
     ],
@@ -122,7 +122,7 @@ def in_kelvins(rest):
     ],
 )
 def test_what_gives_no_numbers_is_a_sentence(rng, spoil, text):
-    # WHY: each of these faults once ended in a traceback, or readings were dropped silently.
+    # WHY: temperatures of another clock or in mK, or a dead axis, ended in a traceback.
     with pytest.raises(FitError, match=text):
         fit(spoilt(rng, spoil), FORCE)
 

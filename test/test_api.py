@@ -66,7 +66,7 @@ def test_arrays_have_the_bits_of_a_replayed_bag(root, tmp_path, fitted):
 
 
 def test_no_reading_is_lost_however_many(rng):
-    # WHY: all readings were queued at the same time, and the queue is limited.
+    # WHY: `correct` queued all readings at once, and the limited queue dropped some of them.
     time_s = np.arange(5000) * 0.1
     readings = {name: 20.0 + rng.normal(0.0, 0.01, 5000) for name in ('board', 'case')}
     counts = rng.normal([5.0, -3.0, 2940.0], 2.0, (5000, 3)).round()
@@ -84,7 +84,7 @@ def test_readings_beside_the_samples_are_those_at_times_of_their_own(arrays):
         for here in [~np.isnan(arrays[name])]
     }
     again = unit.correct(arrays['time_s'], arrays['counts'], **pairs)
-    # The values are held between the readings, as in a merged table.
+    # In a merged table each reading is repeated up to the next reading.
     filled = {
         name: np.repeat(arrays[name][~np.isnan(arrays[name])], 10) for name in ('board', 'case')
     }
@@ -124,7 +124,7 @@ def test_data_are_no_exceptions_but_rows_of_nan(arrays):
     counts[7, 1], counts[9, 2] = np.nan, 32767.0
     board = np.where(arrays['time_s'] < 0.55, np.nan, arrays['board'])
     out = thermal_calibration().correct(arrays['time_s'], counts, board=board, case=arrays['case'])
-    # The first board reading is at the sample of 1 s.
+    # The first board reading left is at the sample of 1 s: 10 samples have no temperature.
     assert np.isnan(out.specific_force[:10]).all()
     assert np.isnan(out.covariance[:10]).all()
     assert np.isfinite(out.specific_force[10:]).all()

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Attacks on the surroundings of the core: clocks, rates, many clients, links, full disks, logs.
-"""
+"""Attacks on the core's surroundings: clocks, rates, many clients, links, full disks, logs."""
 
 import itertools
 import random
@@ -43,8 +41,7 @@ def test_a_clock_that_goes_back_or_pauses_is_none_of_the_samples(peer, tmp_path)
         driver = drive(peer, node)
         assert peer.set_parameters(use_sim_time=True)[0].successful
         clock = peer.publisher(Clock, '/clock')
-        # The clock starts, jumps back by an hour, stands for five checks, jumps ahead by a year,
-        # and ends.
+        # /clock starts, goes back an hour, stands for five checks, jumps ahead a year, and ends.
         hour = 3600 * 10**9
         times = [START_NS, START_NS + hour, START_NS, *[START_NS] * 5, START_NS + 8760 * hour]
         for n, now_ns in enumerate(times):

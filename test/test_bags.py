@@ -32,7 +32,7 @@ def test_their_commands_make_them(command, tmp_path, cli):
     for path in made:
         shipped = read_recording(ROOT / path.relative_to(tmp_path))
         anew = read_recording(path)
-        # The bags state the version that made them.
+        # Only the version in `simulated_by` may differ between shipped and new bags.
         own, theirs = (dict(bag.info.metadata) for bag in (anew, shipped))
         assert own.pop('simulated_by').split()[0] == theirs.pop('simulated_by').split()[0]
         assert own == theirs, path.name
@@ -44,8 +44,7 @@ def test_their_commands_make_them(command, tmp_path, cli):
             before = shipped.columns.temperatures[name]
             np.testing.assert_array_equal(readings.stamp_ns, before.stamp_ns, err_msg=path.name)
             np.testing.assert_array_equal(readings.after, before.after, err_msg=path.name)
-            # The last bit of an exponential may differ on another processor, but not the rounded
-            # counts.
+            # Processors differ in the last bit of an exponential, but not in the rounded counts.
             np.testing.assert_allclose(readings.celsius, before.celsius, rtol=1e-12)
 
 

@@ -29,7 +29,7 @@ from thermo_comp.unit.provenance import GroupEvidence
 REPOSITORY = Path(__file__).parents[1]
 # A bias must be within twice the full scale of 32767.
 number = st.floats(-6.5e4, 6.5e4)
-# With these coefficients the fourth power of 15 K is far from making a scale function 0.
+# A scale function with coefficients up to 1e-6 stays far from 0 over 15 K.
 small = st.floats(-1e-6, 1e-6)
 RICH = rich_calibration()
 
@@ -205,7 +205,7 @@ def test_refusals_name_key_value_and_rule(old, new, key, message):
 def test_bytes_that_are_no_calibration(content, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
-    # Peers without access to the file get the same message without quotations from it.
+    # `rule` is the message for peers without access to the file: it quotes nothing of the file.
     rule, whole = caught.value.rule or str(caught.value), str(caught.value)
     quotes = whole.startswith('not valid YAML: ')
     assert re.fullmatch(r'not valid YAML( \(line \d+\))?', rule) if quotes else rule == whole

@@ -17,7 +17,7 @@ from sensor_msgs.msg import Imu, Temperature
 from thermo_comp.ros.conversion import SampleConverter, read_temperature
 
 floats = st.floats(allow_nan=True, allow_infinity=True, width=64)
-# A NUL ends the string in CDR, and lone surrogates have no UTF-8.
+# No NUL, which ends a string in CDR, and no lone surrogates, which have no UTF-8.
 frames = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
 
 
@@ -69,7 +69,7 @@ def test_counts_become_an_imu(order, sec, nanosec, frame, values):
     fields = doubles(written[0])
     assert fields[25:28] == [z, x, y]
     assert b''.join(fields[28:]) == pack('<', covariance)
-    # REP 145: unmeasured fields are marked, and the quaternion is still a valid one.
+    # Fields without a measurement are marked by -1 (REP 145), and the quaternion stays valid.
     assert b''.join(fields[:4]) == pack('<', [0.0, 0.0, 0.0, 1.0])
     assert fields[4] == fields[16] == pack('<', [-1.0])
     assert not any(b''.join(fields[5:16] + fields[17:25]))
@@ -103,7 +103,7 @@ def test_signalling_nan_survives_the_byte_swap():
 
 
 def test_frames_of_other_lengths_in_one_stream():
-    # WHY: two drivers on one topic, or a changed frame_id, shift all later bytes.
+    # WHY: another length of frame_id, as of a second driver, shifts all later bytes of a message.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
     written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))
@@ -119,7 +119,7 @@ def test_what_has_another_form_goes_through_rclpy(kind, override):
     values = [float(k) for k in range(37 if kind is Imu else 3)]
     good = cdr('<', (3, 4), 'imu', values)
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
-    # rclpy accepts bytes after the end of a message; their exact plain form has none.
+    # rclpy accepts bytes after the end of a message; the plain form has no such bytes.
     (expected,), (written,) = convert(fast, good), convert(slow, good + bytes(8))
     assert (fast.traffic.n_fallback, slow.traffic.n_fallback) == (0, 1)
     assert deserialize_message(written, Imu) == deserialize_message(expected, Imu)
@@ -146,8 +146,7 @@ def test_unreadable_bytes_are_counted_and_the_stream_goes_on(bad):
 
 
 def test_the_first_message_may_be_any_bytes():
-    # WHY: found by fuzzing: a first message of one byte matched the initial empty layout. PROMISE:
-    # a message of one byte is counted, and the stream goes on.
+    # WHY: a first message of one byte matched the initial empty layout (found by fuzzing).
     for n in range(40):
         converter = SampleConverter(Vector3Stamped)
         good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])

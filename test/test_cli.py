@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The command line: help with examples, tables that fit and pipe, JSON that parses, quick starts.
-"""
+"""The command line: help with examples, tables that fit and pipe, valid JSON, quick starts."""
 
 import json
 import os
@@ -78,7 +76,6 @@ class TestOutput:
 
 def test_a_command_computes_in_one_thread():
     # WHY: on two busy cores a fit took 16 times as long, as BLAS threads waited for each other.
-    # WHAT: the number of threads is set before numpy is imported; a user's setting stays.
     code = (
         'import os, sys; from thermo_comp.cli import app; '
         "app.run = lambda _: print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS']); "
@@ -105,7 +102,7 @@ def on_a_terminal(*arguments, no_color=False):
     while True:
         try:
             part = os.read(leader, 65536)
-        except OSError:  # the process has ended and closed the other end
+        except OSError:  # the command has ended and closed its terminal
             break
         if not part:
             break

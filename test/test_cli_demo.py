@@ -28,8 +28,7 @@ def test_end_to_end(tmp_path):
                              text=True, check=True).stdout  # fmt: skip
     assert 'messages in 15407, messages out 15407' in printed
     assert 'bit for bit: yes' in printed
-    # The output equals that on the page of the command line and, in part, in the README, except
-    # for the speed, which depends on the machine.
+    # The output is that of docs/cli.md and, in part, of the README, except for the speed.
     speed = re.compile(r' in [\d.]+ s, \d+ times real time')
     assert is_alike(speed.sub('', printed), speed.sub('', shown()['demo'][1])), printed
     lines = speed.sub('', printed).splitlines()
@@ -45,8 +44,8 @@ def test_end_to_end(tmp_path):
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # The drift is some hundred ug. One set leaves the difference of the regimes, two sets
-        # leave the lags; the noise over 20 cycles of the converter is below 10 ug.
+        # One set leaves the difference of the regimes, two sets the lags; the noise is below 10
+        # ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

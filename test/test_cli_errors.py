@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Bad input gives one clear line on stderr and an exit code.
-
-1: the data or the result is bad. 2: the command line is wrong. There is never a traceback (`cli`
-checks every run), nothing on stdout and no file left.
-"""
+"""Bad input: one line on stderr, no file, exit code 1 (bad data) or 2 (bad command line)."""
 
 import re
 
@@ -166,8 +161,7 @@ class TestFits:
 
 class TestEvaluations:
     def test_a_calibration_that_does_not_hold_is_exit_code_1(self, cli, tmp_path):
-        # The unit rests at 20 degC and reads exactly g; the calibration wrongly adds 50 mg of bias
-        # through a temperature function.
+        # The unit reads exactly g at 20 degC; the calibration wrongly adds 50 mg by a function.
         wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
         sets = regime_set(wrong, wrong, wrong)
         save_calibration(calibration(static=sets, dynamic=sets), tmp_path / 'wrong.yaml')
@@ -181,7 +175,7 @@ class TestEvaluations:
             writer.write_counts(TOPICS.counts, stamps, level)
         finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
         assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-        # This calibration corrects the 10 mg of its constants again, and has no covariance.
+        # The second calibration (no covariance): delta +10 mg, -10 mg in the constants.
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
         axes = Axes(*[AxisReference(300.0, -30.0)] * 3)

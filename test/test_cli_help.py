@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The output on a terminal is right: examples run, JSON parses, --quiet prints nothing, lines fit.
-"""
+"""The output on a terminal: examples run, JSON parses, --quiet prints nothing, lines fit."""
 
 import re
 
@@ -31,10 +29,9 @@ EXAMPLES = [
     for name, command in COMMANDS.items()
     for line in re.findall(r'^ +(thermo_comp .*)$', command.help or '', re.MULTILINE)
 ]
-# This example runs in a separate process, all others in this one.
+# Example that runs in a separate process; all other examples run in the process of the tests.
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
-# One example of each command that prints figures and ends by itself; `play`, `report` and `fit`
-# are tested in test_cli, test_cli_errors and test_docs.
+# One example of each command that prints figures and ends; others are tested elsewhere.
 WITH_JSON = {
     example.split()[1]: example
     for example in EXAMPLES

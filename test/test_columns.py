@@ -50,7 +50,7 @@ def test_the_bank():
         'gradient_even': 42, 'play': 20,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
-    # Knees within the temperatures seen, for the board and for parts that lag it.
+    # Knees lie within the temperatures of the bags, for the board and for parts that lag it.
     assert 'bend' not in by_group(bank(span_k=(-0.4, 0.4)))
     bends = [column for column in bank(span_k=(-10.0, 2.0)) if column.group == 'bend']
     assert len(bends) == 12 * len({column.tau_s for column in bends}) == 96
@@ -64,7 +64,7 @@ def test_change_is_even_about_rest():
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((Layout(MemorySpec(('case', 'tip'))).width, 3))
-    # The gradients are that at rest, and two equally far from it on either side.
+    # Gradients: the value at rest (-0.5 K), and 1.5 K above and below it.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -109,7 +109,7 @@ def test_each_value_by_hand():
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = Layout(spec)
-    # board, var, rate, weight, unknown; case, tip; two lags; a play.
+    # State: board, variance, rate, weight, unknown regime; case and tip gradients; 2 lags; a play.
     state = np.array(
         [[23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]]
     ).T
@@ -120,7 +120,7 @@ def test_each_value_by_hand():
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0, 1.0, 0.5, 0.0,
     ]  # fmt: skip
     assert values == pytest.approx(expected)
-    # t is limited to the calibrated temperatures, the lag is not.
+    # In a product t is limited to the calibrated temperatures; the lag itself is not limited.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
     assert at_edge[2] == 0.5
@@ -133,8 +133,7 @@ def test_a_bend_moves_with_the_board_and_its_lag():
     state = np.zeros((Layout(spec).width, 1))
     lag = Layout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
-    # The derivatives are by the number that a column is computed from, and by the board at a given
-    # lag.
+    # Each bend has derivatives by its quantity of the state and by the board temperature.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
     assert not np.any(table.slopes(state))

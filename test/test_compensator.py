@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The compensator against hand calculations and Monte Carlo; single samples equal blocks of any cut.
-"""
+"""The compensator against hand calculations and Monte Carlo; samples equal blocks of any cut."""
 
 import math
 import random
@@ -31,13 +29,12 @@ from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.correction import Correction
 
 UNIQUE = [0, 1, 2, 4, 5, 8]
-#: Variance of one message of the plain unit: density^2 / cycle, plus the rounding of a converter
-#: that carries its remainder on.
+#: Variance of one message: density^2 / cycle, plus the rounding with a carried remainder.
 NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
 def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
-    """Feed steady readings; with a flicker, so that they are not taken for stuck."""
+    """Feed steady readings; a `flicker` [K] keeps them from counting as a stuck thermometer."""
     for second in range(start_s, until_s):
         noise = flicker * (-1) ** second
         compensator.push('board', second * SECOND_NS, celsius + noise)
@@ -66,8 +63,7 @@ def assert_same(blocks, rows, index):
 
 
 def test_signed_counts_and_the_printed_equations():
-    # Signed counts of +g and -g: the offset is half their sum, the scale is of half their
-    # difference. Eq. (3) and (4) as printed exchange sum and difference.
+    # Counts of +g, -g: offset = sum / 2, scale = difference / 2; Eq. (3), (4) swap the two.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -103,9 +99,7 @@ STRANGE = (math.nan, math.inf, -math.inf, 32767.0, -32768.0, 0.0, -0.0, 5e-324)
 
 
 def event_list(seed):
-    """
-    Make messages in any order: late, repeated, jumping back, not finite, saturated, in two clocks.
-    """
+    """Make messages in any order: late, repeated, jumping back, not finite, saturated."""
     rng = random.Random(seed)
     events = []
     stamp = rng.choice([0, rng.randrange(2**60)])
@@ -141,8 +135,7 @@ def at_seconds(*events):
     ]
 
 
-# The examples: a reading from tomorrow, or a reading that was applied before, decides which of the
-# waiting readings are of another clock, also if a cut separates them.
+# A reading from tomorrow, or an applied one, tells which waiting readings are of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -217,8 +210,8 @@ def test_a_stamp_that_leaps_ahead_needs_a_second_one(run):
     usual = np.arange(1, 6) * step
     for stamps, kept in (
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
-        (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),  # a real gap
-        # Two separate damaged stamps; two damaged stamps in falling order.
+        (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),  # a gap, confirmed twice
+        # Cases: two separate damaged stamps, and two damaged stamps in falling order.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -250,12 +243,7 @@ def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
 @pytest.mark.parametrize('n_before', [0, 3])
 @pytest.mark.parametrize('ahead_s', [0, 2])
 def test_readings_of_a_long_time_without_samples_all_count(n_before, ahead_s):
-    """
-    WHY: of thermometers at 50 Hz that arrived 41 s before the samples, a block lost the newest
-    readings.
-
-    WHAT: readings of a silence of any length are applied in order, as in a node.
-    """
+    """Temperatures at 50 Hz that arrive 41 s before the samples are applied in order."""
     first = [('accel', k * SECOND_NS // 100, (1.0, 2.0, 2930.0)) for k in range(1, 1 + n_before)]
     readings = [
         (name, k * SECOND_NS // 50, 20.0 + 1e-4 * k + 1e-3 * (k % 7))
@@ -288,7 +276,7 @@ def test_flush_lets_the_regime_go_on_without_samples():
 
 
 def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
-    # 0.025 counts = 8.5 ug, independent of time
+    # The sets differ by 0.025 counts = 8.5 ug, at any temperature.
     unit = calibration(dynamic=regime_set(axis_set(delta=0.025)))
     config = CompensatorConfig(
         transition_time_s=100.0, stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0
@@ -310,7 +298,7 @@ def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, 1e200])
 def test_what_is_not_finite_is_never_published_whatever_led_to_it(monkeypatch, bad):
-    # WHY: this is the last check, after the bounds of a calibration and its trial.
+    # The compensator drops what is not finite even if the checks of the calibration missed it.
     line = Correction.line
 
     def broken(self, start, end, slow, excess):

@@ -67,13 +67,12 @@ def test_round_trip_through_the_bag(tmp_path):
     np.testing.assert_allclose(
         np.degrees(block.imu.angular_velocity),
         np.column_stack([columns[k] for k in ['wx', 'wy', 'wz']]),
-        rtol=1e-14,  # one rounding in each direction
+        rtol=1e-14,  # deg/s to rad/s and back round once each
     )
-    # The missing orientation is marked; the rate has an unknown covariance.
+    # The Imu marks the missing orientation by -1, and the unknown covariance of the rate by 0.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
     assert not block.imu.angular_velocity_covariance.any()
-    # A held value is one message: 4 levels of the case, 10 of the board, at the time of each
-    # change.
+    # A temperature becomes a message when it changes: 4 times in the case, 10 in the board.
     case, board = block.temperatures['case'], block.temperatures['board']
     assert case.celsius.tolist() == [20.0, 20.5, 21.0, 21.5]
     assert case.stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
@@ -124,7 +123,7 @@ def test_an_offset_is_taken_away(tmp_path):
 
 @pytest.mark.parametrize('unit', ['ms', 'us'])
 def test_a_counter_of_32_bits_continues_at_its_end(tmp_path, unit):
-    # WHY: Arduino's micros() begins again after 71.6 min; a fit read a part of such a log.
+    # WHY: Arduino's micros() begins again after 71.6 min; a fit read only a part of such a log.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     ticks = [(2**32 - 2000 + 10 * k) % 2**32 for k in range(400)]
@@ -136,7 +135,7 @@ def test_a_counter_of_32_bits_continues_at_its_end(tmp_path, unit):
     report = write_log(log, tmp_path / 'bag')
     assert (report.findings['continued'].count, report.findings['continued'].lines) == (1, (202,))
     assert report.findings['backwards'].count == 0
-    # A clock that is set back elsewhere is no end of a counter.
+    # A clock that is set back from a small value is not a counter that begins again.
     lines[200] = lines[200].replace(lines[200].partition(',')[0], '1000.0')
     path.write_text('\n'.join(lines))
     report = write_log(table_log(path, column_map()), tmp_path / 'other')
@@ -149,24 +148,23 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
     lines = path.read_text().splitlines()
     for k in range(201, 401):
         at, _, rest = lines[k].partition(',')
-        lines[k] = f'{float(at) - 2500.0},{rest}'  # by 2.5 s, in the middle of the log
+        lines[k] = f'{float(at) - 2500.0},{rest}'  # set back by 2.5 s
     path.write_text('\n'.join(lines))
     write_log(table_log(path, column_map()), tmp_path / 'bag')
     board = read_recording(tmp_path / 'bag').columns.temperatures['board']
-    # One change in 40 rows. A reading precedes the sample of its row.
+    # The temperature changes once in 40 rows. A reading precedes the sample of its row.
     assert board.after.tolist() == list(range(0, 400, 40))
 
 
 def test_readings_that_are_no_temperatures_are_left_out(tmp_path):
-    # WHY: a DS18B20 without contact reads -127 degC; 46 such readings in a log of two hours left
-    # an error of 0.68 mg instead of 0.02 mg after a fit.
+    # WHY: with 46 readings of -127 degC (DS18B20 without contact) a fit left 0.68 mg, not 0.02.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in (50, 51, 300):
         lines[k] = lines[k].rpartition(',')[0] + ',-127'
     path.write_text('\n'.join(lines))
     report = write_log(table_log(path, column_map()), tmp_path / 'bag')
-    assert report.findings['impossible'].count == 2  # held for two rows, it is one reading
+    assert report.findings['impossible'].count == 2  # a reading held for two rows counts once
     board = read_recording(tmp_path / 'bag').columns.temperatures['board']
     assert board.celsius.min() == 25.0
 
@@ -191,7 +189,7 @@ def test_every_odd_row_is_accounted_for(tmp_path):
     assert (report.findings['backwards'].count, report.findings['backwards'].lines) == (1, (43,))
     assert (report.findings['repeated'].count, report.findings['repeated'].lines) == (1, (52,))
     assert len(block) == report.messages['accel'] == 397
-    # The clipped row and the wrong order stay in the bag for the node to judge.
+    # A clipped row and rows in wrong order stay in the bag, because the node rejects them.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
     # The log time keeps the order of the file where stamps do not.
@@ -230,7 +228,7 @@ def test_temperature_units(tmp_path, unit, celsius):
     board = {'column': 'board', 'unit': unit, **raw}
     write_log(table_log(path, column_map(board=board)), tmp_path / 'bag')
     first = float(read_recording(tmp_path / 'bag').columns.temperatures['board'].celsius[0])
-    # 300 K, the boiling point of water, 160 steps of 1/16 K above 20 degC.
+    # Expected: 300 K, 212 degF (boiling water), and 160 steps of 1/16 K above 20 degC.
     assert first == pytest.approx({'K': 26.85, 'degF': 100.0, 'raw': 30.0, 'degC': 30.0}[unit])
 
 
@@ -368,7 +366,7 @@ class TestFreezer:
         report = write_log(table_log(path, columns), tmp_path / 'bag')
         assert report.rows == report.messages['accel'] == 24514
         assert report.findings['clipped'].count == 7
-        # The unit was moved before 49 s and after 1945 s of its clock, which starts at 1.5 s.
+        # The unit was moved before 49 s and after 1945 s of a log that starts at 1.5 s.
         first, last = report.stillness.moving_ns[0], report.stillness.moving_ns[-1]
         assert first[0] == report.log.stamp_ns[0]
         assert first[1] * 1e-9 == pytest.approx(49.0, abs=3.0)

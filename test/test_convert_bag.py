@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags by others: topics of any name, ROS 1 and 2, and units recognised at rest."""
+"""Bags of other programs: topics of any name, ROS 1 and 2, units recognised at rest."""
 
 import numpy as np
 import pytest
@@ -168,7 +168,7 @@ def test_command(tmp_path, rng, cli):
         (16100.0, 'counts'),
         (3003.0, 'counts'),
         (0.1, 'unknown'),
-        (32.2, 'unknown'),  # ft/s^2
+        (32.2, 'unknown'),  # gravity in ft/s^2
     ],
 )
 def test_what_a_still_sensor_reads_says_its_unit(magnitude, unit):
@@ -180,10 +180,10 @@ def test_what_a_still_sensor_reads_says_its_unit(magnitude, unit):
 def test_nothing_is_said_against_what_may_be_true():
     assert contradiction('g', 1.15, None) is None
     assert contradiction('m/s^2', 9.6, None) is None
-    # Values above those of all units are counts of a precise converter.
+    # Any magnitude at rest above that of mg may be counts of a precise converter.
     assert contradiction('counts', 2941.7, None) is None
     assert contradiction('counts', 2060.0, 2048.0) is None
-    # Never at rest: the unit cannot be recognised.
+    # A sensor that never rests cannot contradict the stated unit.
     assert contradiction('g', float('nan'), None) is None
 
 
@@ -199,7 +199,7 @@ def test_movement_is_found_in_any_unit(rng, scale):
     n = 5000
     stamp_ns = np.arange(1, n + 1) * 10_000_000
     stillness = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
-    # The middle fifth of 50 s is 20..30 s, which are edges of cells of half a second.
+    # The sensor is shaken in the middle fifth of 50 s, from 20 to 30 s.
     assert [(t0 * 1e-9, t1 * 1e-9) for t0, t1 in stillness.moving_ns] == [
         (pytest.approx(20.01), pytest.approx(30.01))
     ]

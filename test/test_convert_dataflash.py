@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-ArduPilot logs: a converted DataFlash file gives the data of each sensor.
-
-The writer below follows the public description of the format and shares no code with the reader.
-"""
+"""ArduPilot logs: a file as in DataFlash's public description gives the data of each sensor."""
 
 import struct
 
@@ -88,7 +84,7 @@ def test_new_instances(tmp_path, rng, imu, baro):
         bag.accel_stamp_ns, (2_000_000 + np.arange(N) * STEP_US + imu) * 1000
     )
     np.testing.assert_array_equal(bag.accel, force[imu])
-    # The tolerance is the rounding of 0.3 to float32.
+    # The log stores the rate 0.3 as float32, which rounds it by up to 1e-7.
     np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
     # The chip's temperature is constant for ten samples; only its changes are messages.
     np.testing.assert_array_equal(
@@ -149,8 +145,7 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
     [
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log of ArduPilot's learning was refused, because ArduPilot sets 1 after the
-        # learning.
+        # WHY: a log of ArduPilot's temperature learning, whose parameter ends at 1, was refused.
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )
@@ -161,7 +156,7 @@ def test_what_was_corrected_is_left_out(tmp_path, rng, course, kept, share):
     np.testing.assert_array_equal(read.accel, force[0][kept])
     assert f'INS_TCAL1_ENABLE was 1 for {share} % of the samples' in read.chosen
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
-    # The temperatures continue, as the fit needs the thermal history.
+    # Temperatures of the dropped part stay, because the fit needs the thermal history.
     assert len(read.temperatures['board'].celsius) > 1
 
 
@@ -213,7 +208,7 @@ def test_damaged_formats_are_refused(tmp_path, rng, columns, message):
     log.write('IMU', 1000, 0, *np.zeros(6), 0, 0, 30.0, 1, 1, 1000, 1000)
     body = bytearray(log.body)
     if 'longer' in message:
-        # The length in the second FMT message, which follows the 89 bytes of the first.
+        # Position of the length in the second FMT message; the first FMT message has 89 bytes.
         body[89 + 4] -= 10
     path = tmp_path / 'damaged.BIN'
     path.write_bytes(body)

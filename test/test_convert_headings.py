@@ -35,10 +35,10 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
     [
         ('2026-03-29T01:30:00Z', 0),
         ('2026-03-29T01:30:00.123456789Z', 0.123456789),
-        ('2026-03-29 01:30:00', 0),  # without a zone: UTC
+        ('2026-03-29 01:30:00', 0),  # UTC if no zone is given
         ('2026-03-29T03:30:00.5+02:00', 0.5),
-        ('2026-03-29T03:30:00+0200', 0),  # GGIR
-        ('2026-03-29 03:30:00.250+0200 [Europe/Paris]', 0.25),  # actipy
+        ('2026-03-29T03:30:00+0200', 0),  # format of GGIR
+        ('2026-03-29 03:30:00.250+0200 [Europe/Paris]', 0.25),  # format of actipy
         ('2026-03-28 20:00:00-05:30', 0),
         ('2026-03-29 01:30', 0),
     ],
@@ -104,7 +104,7 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
 
 @pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])
 def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
-    # WHY: Parquet once needed a column map, although it contains more information than text.
+    # WHY: a Parquet table needed a column map, although its headings name the columns.
     pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
     import pyarrow.parquet as pq
 
@@ -196,14 +196,13 @@ def test_a_slow_log_of_one_attitude_is_in_seconds(tmp_path, step, since):
 
 
 def test_some_repeated_rows_leave_a_time_a_time(tmp_path):
-    # WHY: a table in which one row in seven was written twice had `not a rising time`.
+    # WHY: a table in which one row in seven was written twice was refused as `not a rising time`.
     times = [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)]
     assert guess_columns(slow_table(tmp_path / 'log.csv', 'time', times)).stamp.unit == 's'
 
 
 def test_stamps_since_1970_state_their_unit(tmp_path):
-    # No temperature, one attitude: the size of the stamps alone decides. A count of us since
-    # power-up that has the size of a date in s has steps of hours then.
+    # Without a temperature, in one attitude, the size of the stamps alone shows their unit.
     for unit, since, step in (('s', START_NS // 10**9, 2), ('ms', START_NS // 10**6, 5000),
                               ('us', START_NS // 10**9, 10_000)):  # fmt: skip
         path = slow_table(tmp_path / f'{unit}.csv', 'time', [since + step * k for k in range(900)],
@@ -221,7 +220,7 @@ def test_stamps_since_1970_state_their_unit(tmp_path):
     ],
 )
 def test_times_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
-    # WHY: minutes were read as seconds; the other cases had one sentence, which did not apply.
+    # WHY: minutes were read as seconds; the message for other times did not apply to them.
     with pytest.raises(RecordingError, match=reason):
         guess_columns(slow_table(tmp_path / 'log.csv', heading, times))
 
@@ -237,8 +236,7 @@ def test_a_date_that_is_not_iso_is_shown(tmp_path, cell):
 
 
 def test_a_slower_thermometer_leaves_cells_blank(tmp_path, rng):
-    # WHY: a blank last cell in most rows was taken for the end of the row, so the row with the
-    # headings, which has one cell more, was no part of the table.
+    # WHY: blank last cells of most rows were not counted: the headings had a cell too many.
     accel = 9.8 * (UP + 0.002 * rng.standard_normal(UP.shape))
     rows = [
         f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f},{20 + k / 100 if k % 100 == 0 else ""}'
@@ -262,14 +260,14 @@ def test_headings_in_a_comment_are_read(tmp_path, comment, sign):
     columns = guess_columns(path)
     assert columns.board.column == 'temp'
     assert len(table_log(path, columns).accel) == 900
-    # A comment of as many words is no heading.
+    # A comment with as many words as the table has columns is not a row of headings.
     path.write_text('\n'.join(['# one two three four five', *rows]) + '\n')
     with pytest.raises(RecordingError, match='5 columns without headings'):
         guess_columns(path)
 
 
 def test_two_columns_of_one_name_are_named_with_the_file(tmp_path):
-    # WHY: it was `Invalid value: column 'temp' is given twice`, a mistake of the command line.
+    # WHY: the message `column 'temp' is given twice` read as a mistake of the command line.
     path = slow_table(tmp_path / 'log.csv', 't', [k / 10 for k in range(900)])
     rows = [f'{row},20.0' for row in path.read_text().splitlines()[1:]]
     path.write_text('\n'.join(['t,ax,ay,az,temp,temp', *rows]) + '\n')
@@ -352,7 +350,7 @@ def test_a_guessed_map_is_printed_once(tmp_path, rng, cli):
 def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
     rest = Rest(rng, level=(0.0, 0.0, one_g), sd=0.002 * one_g)
     rest.accel[:] = np.rint(rest.accel)
-    rest.accel[100] = 2.0**bits - 1.0  # a valid one
+    rest.accel[100] = 2.0**bits - 1.0  # largest valid word
     bag = reduce_source(rest.source(), full_scale=32767.0)
     assert (bag.n_saturated, len(bag.intervals)) == (1, 1)
 
@@ -393,7 +391,7 @@ def test_the_unit_of_times_is_that_of_a_sample_rate(tmp_path, rng, step, unit, r
 
 
 def test_a_second_is_told_from_a_millisecond_by_how_fast_a_hand_turns(tmp_path, rng):
-    # WHY: samples at 1 Hz were taken for 1 kHz. Half a turn takes 1 s or 0.8 s.
+    # WHY: samples at 1 Hz were taken for 1 kHz. The tables turn half a turn in 1 s and in 0.8 s.
     angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
     ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
     for turned, unit in ((angle, 's'), (ramp, 'ms')):

@@ -54,8 +54,7 @@ def test_headings_are_optional(tmp_path):
 
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
 def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path, separator):
-    # A title, comments of three kinds, a key with its value, a blank line; a row of units, which
-    # counts as a row without numbers; a comment and an incomplete last row in the table itself.
+    # A row of units counts as a row without numbers; the last row is incomplete.
     head = ['Inertial logger', '# serial 7', '% matlab', '// c', f'Rate:{separator}100', '']
     rows = ['t|ax|ay|az', 's|g|g|g', *(f'{k}|0.1|0.2|{k}' for k in range(60)), '# end', '60|0.1']
     text = '\n'.join([*head, *(row.replace('|', separator) for row in rows)])
@@ -67,7 +66,7 @@ def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path, separator):
 
 
 def test_a_column_may_begin_late(tmp_path):
-    # WHY: a thermometer that reports later than the accelerometer is the last column.
+    # WHY: a table was not read if its last column, a thermometer, begins some rows late.
     rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
     path = write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows]))
     table = read_text(path, ['t', 'celsius'], ROWS_ALONE)
@@ -179,11 +178,7 @@ class TestParquet:
 @pytest.mark.parametrize('suffix', ['csv', 'parquet'])
 @pytest.mark.parametrize('unit', ['s', 'ns'])
 def test_stamps_that_ros_cannot_hold(tmp_path, suffix, unit):
-    """
-    WHY: an integer stamp of 2e10 s overflowed to 600 s, and 1e30 gave all rows one stamp.
-
-    WHAT: a row is in the bag with its stamp, or it is left out and counted.
-    """
+    """A row is in the bag with its stamp, or left out and counted; stamps of 2e10 s overflowed."""
     scale = 10**9 if unit == 's' else 1
     good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]
     bad = [-1, 2**31, 2 * 10**10, 2**62, 2**63] if unit == 's' else [-1, 2**31 * 10**9, 2**63]

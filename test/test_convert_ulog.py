@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-PX4 logs: a converted ULog file gives the data of each sensor.
-
-The writer below follows the public description of the format and shares no code with the reader.
-"""
+"""PX4 logs: a file as in ULog's public description gives the data of each sensor."""
 
 import struct
 
@@ -90,11 +86,11 @@ def test_log_arrives_in_the_bag(flight, tmp_path, imu):
     recording = read_recording(tmp_path / 'bag.mcap')
     bag = recording.columns
     assert report.messages['accel'] == N
-    # The time of the sample is used, not that of its publication, separately for each IMU.
+    # The stamp is the time of the sample, not of its publication, separately for each IMU.
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # The chip's temperature changes with every sample; the barometer is the slower thermometer.
+    # The board temperature is the chip's at every sample, the case temperature the barometer's.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
@@ -104,7 +100,7 @@ def test_gyro_of_the_same_instance_travels_along(flight, tmp_path):
     path, _ = flight
     write_log(read_autopilot(path, imu=0), tmp_path / 'bag.mcap')
     rate = read_recording(tmp_path / 'bag.mcap').columns.imu.angular_velocity
-    # Both sensors have the same stamps here; values are rounded to float32.
+    # Gyroscope and accelerometer have the same stamps here; the log rounds values to float32.
     np.testing.assert_allclose(rate[:, 0], 0.001 * np.arange(N), atol=1e-6)
     assert read_autopilot(path, imu=1).gyro is None
 
@@ -174,7 +170,7 @@ AIR = 'vehicle_air_data:uint64_t timestamp;uint64_t timestamp_sample;float baro_
 
 
 def write_combined(path, rng, later=None, **parameters):
-    """Write a log with PX4's default profile, from before it logged single sensors."""
+    """Write a log of a PX4 version that did not log single sensors by default."""
     log = UlogWriter(COMBINED, AIR)
     for name, value in parameters.items():
         log.message('P', parameter(name, value))
@@ -213,7 +209,7 @@ def test_the_combined_sensor_stands_in(tmp_path, rng, cli):
     np.testing.assert_array_equal(read.accel, force)
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
-    # The barometer's thermometer is the only one, so it must become the board's.
+    # The only thermometer in the log, the barometer's, must become the board's.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, 40.0 + np.arange(6))
     assert 'case' not in read.temperatures
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
@@ -235,8 +231,7 @@ def test_what_px4_compensated_is_left_out(tmp_path, rng, begin):
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
-    # The change of a parameter has the stamp of the previous message, so one sample at the change
-    # may count as before or after it.
+    # The change of a parameter has the stamp of the previous message: one sample may be wrong.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])

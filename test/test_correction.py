@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Corrections with all columns: single samples equal blocks bit for bit, axes are independent, the
-claimed sd equals the scatter of random calibrations.
-"""
+"""Corrections with all columns: same bits in blocks, axes independent, claimed sd = scatter."""
 
 import math
 from dataclasses import replace
@@ -50,7 +47,7 @@ def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
     """Draw a unit with all columns of two sensors."""
     terms = []
     for column in bank(SENSORS):
-        # Some counts and 1e-4 at the edges, for any power of a column.
+        # Weights give some counts of bias and 1e-4 of scale at the edges of a column of any power.
         sd = 10.0**-column.power * size
         bias, scale = np.zeros(3), np.zeros(3)
         bias[list(axes)] = 0.05 * sd * rng.standard_normal(len(axes))
@@ -140,8 +137,7 @@ def states_of(unit, rng, n=5):
 
 
 def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_posterior(rng):
-    # Levels, curves and all weights are correlated: the corrections of random calibrations at a
-    # state must scatter as SlowUncertainty states, at any specific force.
+    # The corrections of random, correlated calibrations scatter as SlowUncertainty states.
     unit = replace(full_bank(rng), noise_density_m_s2_sqrt_hz=(1e-4,) * 3)
     layout = parameter_layout(unit)
     n = layout.n_parameters
@@ -157,7 +153,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
     slow = SlowUncertainty(judged, Correction(judged))
     nobody = [0.0] * len(Correction(unit).memory.lags)
     draws = rng.multivariate_normal(np.zeros(n), posterior.covariance(), size=300)
-    # The same state in the static regime, and during the transition of the sets.
+    # Evaluate one state in the static regime (weight 0) and during the transition (weight 0.3).
     weights = np.array([0.0, 0.3])
     pair = np.repeat(np.array([states[-1][1]]), 2, axis=0).T
     pair[3] = weights
@@ -173,15 +169,12 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
         for axis, (a, b, c) in enumerate(np.reshape(slow.at(state, nobody), (3, 3))):
             for x in (-9.8, 0.0, 9.8):
                 variance = np.var(scatter[:, 0, axis, k] + scatter[:, 1, axis, k] * x)
-                # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %: 4 sigma.
+                # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %; tolerance: 4 sd.
                 assert a + b * x + c * x * x == pytest.approx(variance, rel=0.33)
 
 
 def drawn(unit, layout, d):
-    """
-    Change every parameter of a unit except the levels of the scale, which a curve of 1 does not
-    have.
-    """
+    """Change all parameters but the scale levels, which a constant curve does not have."""
 
     def moved_by(values, start):
         return tuple(value + d[start + k] for k, value in enumerate(values))
@@ -236,7 +229,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
         bias, scale = values[:, axis]
         for x in (-9.8, 0.0, 9.8):
             expected = np.var(bias / 300.0 + scale / 300.0 * x) / small**2
-            # A variance from 4000 draws has a relative sd of 2.2 %: 4 sigma.
+            # A variance from 4000 draws has a relative sd of 2.2 %; the tolerance is 4 sd.
             assert a + b * x + c * x * x == pytest.approx(expected, rel=0.09)
 
 
@@ -260,7 +253,7 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # Within a span the variance changes only by the thermometer's part: 30 counts/K, some mK.
+        # Within 10 s only the thermometer's part of the variance changes: 30 counts/K, some mK.
         part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - collected[0][0]) * 1e-9 + 1.0
@@ -337,24 +330,23 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
-    # b = 0.5 L: slopes of the curve and of its lag cancel for an error of the thermometer, but not
-    # for 6 K of all parts.
+    # Slopes of curve and lag cancel for an error of the thermometer, but not outside the range.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bias), dynamic=regime_set(bias),
         response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
     )  # fmt: skip
     assert sd_at(unit, 35.0) == pytest.approx(1e-6, rel=1e-6)
-    # The temperature is 6 K outside the range, whose half is 15 K.
+    # The board is at 41 degC, 6 K outside a range of +-15 K.
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
 
 
 def test_beyond_the_range_slopes_that_cancel_are_no_knowledge():
-    # 0.5 + 0.02 t counts/K: 0.8 at the upper edge, cancelled by a force of 10 m/s^2.
+    # The slope of the bias is 0.8 counts/K at the upper edge; a force of 10 m/s^2 cancels it.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
-    # Over 30 K the slope changes by 0.02 * 30 / sqrt(12), slightly more with few temperatures.
+    # RMS change of the slope over 30 K: 0.02 * 30 / sqrt(12), slightly more with few temperatures.
     bends = 0.6 / math.sqrt(12.0)
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
@@ -387,14 +379,14 @@ def test_beyond_the_range_curves_go_on_along_their_tangent_for_a_quarter_of_the_
 
 
 def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
-    # The dynamic set ends 5 K below and begins 5 K below the static one.
+    # Ranges: static 5 to 35 degC, dynamic 0 to 30 degC.
     unit = calibration(
         static=regime_set(axis_set(BENT)),
         dynamic=regime_set(axis_set(WAVY, delta=2.0), temperature_range_c=(0.0, 30.0)),
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Beyond a range the difference of the sets is that at the last temperature within both ranges.
+    # Outside both ranges the sets differ as at the last temperature within both ranges.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -404,9 +396,9 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
 
 
 def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng):
-    # Correction and regressors are linear in the parameters: the change of the correction by any
-    # change of them must equal the regressors times it. The range of the dynamic set ends first
-    # above, that of the static set below.
+    # Correction and regressors are linear in the parameters: the correction must change by the
+    # regressors times the change of the parameters. The range of the dynamic set ends first above,
+    # the range of the static set below.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     one = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -460,7 +452,7 @@ def test_a_part_that_is_still_outside_is_paid_for():
         static=regime_set(bent), dynamic=regime_set(bent),
         response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
     )  # fmt: skip
-    # The board is back at 33 degC, the part is at 34, then still at 41.
+    # The board is back at 33 degC; a part at 34 degC adds nothing, a part still at 41 degC does.
     assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
     bends = 0.6 / math.sqrt(12.0)
     assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The value of further directions: against closed forms, a second route and the scatter of estimates.
-"""
+"""The value of further directions, against closed forms and the scatter of estimates."""
 
 import numpy as np
 import pytest
@@ -56,7 +54,7 @@ def test_columns_are_the_derivatives_of_the_measured_force(rng):
 def test_without_positions_the_prior_is_left():
     covariance = constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
-    # With one axis vertical the variances of bias and scale of this axis add.
+    # If an axis is vertical, the variance of |f| is the sum of those of its bias and its scale.
     assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
 
 
@@ -90,7 +88,7 @@ def test_the_next_direction_lowers_the_mean_variance(n, rng):
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
     others = [before - mean_variance(np.vstack([up, unit]), at) for unit in units(rng, 300)]
-    # An easily held face is chosen even with half the benefit of the best direction.
+    # A face, which is easy to hold, is chosen even with half the benefit of the best direction.
     assert gain > 0.45 * max(others)
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 
@@ -100,7 +98,7 @@ def test_who_follows_the_proposals_gets_a_good_test():
     for _ in range(18):
         covariance = constants_covariance(up, np.full(len(up), SD))
         up = np.vstack([up, next_direction(covariance, SD, up)])
-    # First the faces, starting upright; then directions that determine the misalignment.
+    # Recommended are first the faces, upright before all, then directions for the misalignment.
     assert up[0].tolist() == [0.0, 0.0, 1.0]
     assert {tuple(row) for row in up[:6]} == {tuple(face) for face in FACES}
     proposed = worst_sd(constants_covariance(up, np.full(18, SD)))

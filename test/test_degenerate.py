@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Degenerate inputs through the real commands: inputs that once needed gigabytes, hung, or lost data
-silently.
-
-`benchmarks/degenerate.py` runs every command on every input.
-"""
+"""Inputs that needed gigabytes, hung or lost data; benchmarks/degenerate.py runs all commands."""
 
 import degenerate
 import pytest
@@ -49,5 +44,5 @@ def test_the_cause_is_said_in_the_users_words(name, text, tmp_path, cli):
     failed = cli('fit', path, '--gravity', '9.81', '-o', tmp_path / 'out.yaml', code=1)
     (line,) = [text for text in failed.stderr.splitlines() if ': error: ' in text]
     assert text in line
-    # The message names the topic if it was chosen by its type.
+    # If the input's topic was chosen by its type, the message names the topic.
     assert 'bag.mcap (/imu/data)' in line or name in {'stamps all zero', 'axes that lean'}

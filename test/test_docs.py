@@ -21,8 +21,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
-# test_readme runs the session of cli.md with its output; a bag that plays for minutes and a
-# growing bag have their own tests (test_player, test_record).
+# Tested elsewhere: the session of cli.md, a bag that plays for minutes, a growing bag.
 ELSEWHERE = (
     'thermo_comp play bags/held_out.mcap --rate 20',
     'thermo_comp record session --positions 18 --soak 45min -o bags/unit42',
@@ -68,7 +67,7 @@ def test_completion_is_a_script_that_bash_takes():
     bash = shutil.which('bash')
     if bash is None:
         pytest.skip('no bash')
-    # The program looks for the shell that started it; the `:` keeps that shell waiting.
+    # thermo_comp looks for the shell that started it; the `:` keeps this shell running.
     words = f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'
     finished = ran(bash, '-c', words)
     assert (finished.returncode, finished.stderr) == (0, '')
@@ -120,7 +119,7 @@ def test_refusals_are_quoted_as_they_are_said():
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10
     sources = ''.join(path.read_text() for path in (ROOT / 'thermo_comp').rglob('*.py'))
-    # Adjacent literals form one sentence.
+    # Join adjacent string literals, which form one message.
     spoken = re.sub(r"'\s+f?'", '', sources)
     for sentence in quoted:
         # Numbers and the text after them are only known at run time.

@@ -138,9 +138,7 @@ def test_record_writes_them_as_temperatures(peer):
         sent = []
 
         def wait(_seconds):
-            """
-            Send each message after the previous one has arrived; return when all have arrived.
-            """
+            """Send each message after the previous one has arrived, until all have arrived."""
             if len(outputs) == len(sent) < len(messages):
                 role, message = messages[len(sent)]
                 sent.append(role)

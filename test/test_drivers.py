@@ -123,7 +123,7 @@ def bag(request, tmp_path, store):
             force += NOISE * noise.standard_normal(3)
             for link, kind in links.values():
                 if kind == IMU or row % RATE == 0:
-                    # A barometer lags.
+                    # The barometer is 2 K colder than the board.
                     celsius = 20.0 + warmer - (2.0 if 'baro' in link.topic else 0.0)
                     sent = message(store, kind, stamp_ns, celsius, force)
                     writer.write(link, stamp_ns + 1, store.serialize_cdr(sent, kind))
@@ -148,7 +148,7 @@ def test_every_command_works_on_the_drivers_bag(path, bag, tmp_path, cli):
     printed = cli('info', bag, *topics).stdout
     assert f'{SECONDS * RATE} samples of imu, {RATE} Hz' in printed
     assert f'{len(UPS)} still intervals' in printed
-    # The thermometers are those of the file only; other numbers of their messages are not used.
+    # Only the thermometers of the file are used, no other numbers of the same messages.
     assert re.findall(r'^(board|case) +1\.000 +(\S+) +(\S+)', printed, re.MULTILINE) == [
         (name, f'{20.0 - lag:.2f}', f'{46.2 - lag:.2f}')
         for name, lag in (('board', 0.0), ('case', 2.0))
@@ -173,7 +173,7 @@ def test_every_command_works_on_the_drivers_bag(path, bag, tmp_path, cli):
     cli('replay', bag, '-c', fitted, '-o', tmp_path / 'out.csv', *topics)
     with (tmp_path / 'out.csv').open() as file:
         rows = list(csv.DictReader(file))
-    # A sample with the stamp of the first reading is before it, and does not wait for it.
+    # The first sample arrives before the first reading, and is published without waiting for it.
     assert len(rows) >= SECONDS * RATE - 1
     if not has_board:
         command = 'replay', bag, '-c', tmp_path / 'warm.yaml', '-o', tmp_path / 'o.csv'
@@ -209,8 +209,7 @@ def test_the_node_works_as_the_file_says(path, tmp_path):
         topics = {topic.partition(':')[0] for name, topic in names.items() if name != 'output'}
         board, _, field = names['board'].partition(':')
         if field:
-            # The message package is not installed here; an installed type is looked up when the
-            # driver sends.
+            # The package is not installed; an installed type is looked up when the driver sends.
             assert topics - {board} <= heard_topics
             with pytest.raises(ThermoCompError, match=f'{board}: its type .* is not installed'):
                 LiveField(board, layout[board], field)

@@ -89,7 +89,7 @@ def test_px4_formula_gives_our_bias(cubic):
         for celsius in (5.0, 20.0, 33.0, 45.0):
             d = celsius - p['TC_A2_TREF']
             offset = sum(p[f'TC_A2_X{power}_{axis}'] * d**power for power in range(4))
-            # Nine digits are written, as in a float32.
+            # PX4's file has nine digits, which determine a float32.
             assert offset == pytest.approx(bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9)
 
 
@@ -150,7 +150,7 @@ def test_the_angular_rate_goes_both_ways(cubic):
 
     ardupilot = export_calibration(unit, 'ardupilot', number=2).text
     assert 'INS_TCAL2_GYR1_X' in ardupilot
-    # ArduPilot has its own offset; it is 0 at the temperature of the calibration.
+    # ArduPilot keeps the constant offset itself: the cubic is 0 at the calibration temperature.
     found = again(f'{ardupilot}INS_GYR2_CALTEMP,{celsius[3]}\n')
     np.testing.assert_allclose(found, true - true[3], atol=1e-9)
     zeros = re.sub(r'(GYR\d_.),.*', r'\1,0', ardupilot)
@@ -196,7 +196,7 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic):
 
 
 def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic):
-    # WHY: PX4 subtracts the offset from the reading in m/s^2; 0.5 % of the scale are 5 mg at rest.
+    # WHY: PX4 subtracts the offset from readings in m/s^2; a scale error of 0.5 % is 5 mg at rest.
     axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
     calibration = replace(cubic, axes=axes)
     plain = export_calibration(calibration, 'px4')
@@ -206,7 +206,7 @@ def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic):
     up = (0.6, 0.0, 0.8)
     level = numbers(export_calibration(calibration, 'px4', up=up).text, '\t')
     for axis in range(3):
-        # At this attitude and the reference temperature only gravity remains of a reading.
+        # At the attitude `up` and the reference temperature a reading less the offset is gravity.
         d = 20.0 - level['TC_A0_TREF']
         reading = 0.995 * 9.81 * up[axis] + (0.1, -0.2, 0.3)[axis]
         offset = sum(level[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))
@@ -317,7 +317,7 @@ def test_imu_tk_formula_gives_our_correction(tumbled):
     assert np.all(np.tril(T, -1) == 0.0)
     assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
     theirs = (RAW - numbers[18:]) @ (T @ K).T
-    # Angles are written with six digits, which gives errors of 1e-6 of 90 m/s^2.
+    # The note of the export gives the angles with six digits: errors of 1e-6 of 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     np.testing.assert_allclose(
         np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12
@@ -341,14 +341,14 @@ def test_tumble_round_trip(tumbled, to):
     file = export_calibration(tumbled, to)
     back = import_calibration(file.text, serial='7')
     assert back.unit.input == 'counts'
-    # The triangular matrix of imu_tk is rotated there and back.
+    # Export to imu_tk rotates the frame, import rotates it back.
     np.testing.assert_allclose(ours(back, RAW), ours(tumbled, RAW), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(back.misalignment, tumbled.misalignment, atol=1e-12)
     assert any('holds at 20 degC' in note for note in file.notes)
 
 
 def test_a_file_that_imu_tk_saved_is_read():
-    # imu_tk's stream writes columns of six digits; `theirs` is its formula by hand.
+    # imu_tk's stream writes columns of six digits; `theirs` is imu_tk's formula by hand.
     text = (
         '          1 -0.00354989 -0.00890444\n          0           1 -0.0213032\n'
         '          0           0           1\n\n'

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Outputs that cannot be written, and writers that are killed: the old or the new file is complete,
-the error is one line, and the incomplete file of a killed writer can be read.
-"""
+"""If an output cannot be written or a writer is killed, the old or the new file is complete."""
 
 import os
 import re
@@ -22,11 +19,11 @@ from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
-#: Two bags that are fitted in half a second; they are in the working folder.
+#: Bags of a fit that takes half a second, in the working folder.
 FIT = ('bags/01.mcap', 'bags/02.mcap')
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
 GRAVITY = ('--gravity', '9.80665', '--model', 'golovach')
-#: Arguments before and after the output.
+#: Arguments of a command before and after the output.
 COMMANDS = {
     'unit.yaml': (('fit', *FIT, *GRAVITY, '-f', '-o'), ()),
     'page.html': (('report', '-c', 'unit.yaml', '-f', '-o'), ()),
@@ -74,7 +71,7 @@ def test_a_conversion_on_a_full_disk_leaves_no_draft(small_disk, tmp_path, cli):
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
 def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
-    # About 700 KB of noise, which compresses to not less than half.
+    # The recording is 700 KB of noise, which compresses to more than the disk of 300 KB holds.
     n = 20000
     stamps = np.arange(n) * 10**8
     samples = np.random.default_rng(1).normal((0.0, 0.0, 2942.0), 3.0, (n, 3))
@@ -104,15 +101,14 @@ def test_a_folder_that_is_read_only(folder, cli, name):
         locked = folder / 'locked'
         locked.mkdir(mode=0o500)
     else:
-        locked = Path('/proc')  # not writable for root either
+        locked = Path('/proc')  # a folder in which not even root can write
     before, _ = COMMANDS[name]
     finished = cli(*before, locked / name, code=1, cwd=folder)
     (line,) = finished.stderr.strip().splitlines()[-1:]
     assert line.startswith(f'thermo_comp: error: {locked / name}: ')
 
 
-#: Runs the command and kills itself when the temporary file has been opened, or just before it is
-#: renamed.
+#: Runs the command; kills itself when the temporary file is open, or before its renaming.
 KILLED = """
 import os, signal, sys
 point, target = sys.argv[1:3]
@@ -157,10 +153,10 @@ def test_a_killed_command_leaves_the_old_file(folder, name, point):
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert output.read_bytes() == old
     (rest,) = set(folder.iterdir()) - listed
-    # The file that remains has another name, which no tool takes for the output.
+    # The file that a killed command leaves has a hidden name, which no tool takes for an output.
     assert rest.name.startswith('.')
     if point == 'before':
-        # The hidden file was complete already.
+        # Killed just before the rename, the hidden file is complete.
         if name == 'unit.yaml':
             assert load_calibration(rest).unit.serial
         elif name == 'bag.mcap':

@@ -54,7 +54,7 @@ def test_nothing_wrong_is_published(inject):
     sd = np.sqrt(table[:, [3, 6, 8]])
     off = (np.abs(table[:, :3] - force_at(seconds)) / sd).max(axis=1)
     assert seconds[off > SIGMAS].tolist() == []
-    # The covariance before the fault is only noise and residual, too small to cover any fault.
+    # Before the fault the published sd is noise and residual alone, too small to cover any fault.
     assert sd[450:540].max() < 3e-4
 
 
@@ -66,7 +66,7 @@ def settling_s():
 
 
 def ended_s(row):
-    """Return the time from which the messages are those of the undisturbed bag again."""
+    """Return the time from which the messages equal the undisturbed bag again."""
     at, _ = row.shift
     if math.isfinite(at):
         return at

@@ -67,7 +67,7 @@ def test_the_node_is_killed_and_restarts_in_the_ramp(path):
         assert first.values['memory settled'] == 'False'
         rest = node.play([e for e in events if seconds_of(e[1]) >= 91.0])
     n = len(first.force)
-    # The covariance includes what the new process has not observed.
+    # The covariance includes the unknown temperatures before the new process.
     at = round(90.0 * RATE_HZ)
     assert (first.covariance[:, 0, 0] > 4.0 * undisturbed[at : at + n, 3].max()).all()
     assert max(sigmas(first), sigmas(rest)) < SIGMAS
@@ -89,7 +89,7 @@ def unreadable(path):
     if os.geteuid():
         path.chmod(0)
     else:
-        # No file is locked for root, but no process can read this one at its beginning.
+        # Root may open any file, but no process can read /proc/self/mem from its beginning.
         path.unlink()
         path.symlink_to('/proc/self/mem')
 
@@ -152,7 +152,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path):
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
-    # The time is enough for any machine; the loop ends with the last answer.
+    # 60 s of samples suffice on any machine; the loop below ends with the last answer.
     events = bag(rate_hz=1000.0, duration_s=60.0)
     n_reloads = 100
     with bench(path) as node:
@@ -204,11 +204,10 @@ def test_a_signal_while_samples_flow(path, number):
 def test_slope_and_its_error(rng):
     time = np.arange(3600.0)
     values = 100.0 + 7.0 * time / 3600.0 + rng.standard_normal(3600)
-    # The slope leaves out the first 300 s.
+    # `slope` leaves out the first tenth of the run, here 360 s.
     values[:300] += 50.0
     slope, sd = soak.slope(list(zip(time.tolist(), values.tolist(), strict=True)), 60.0)
-    # The sd of the slope is the sd of a mean of 60 values, divided by the root of the sum of
-    # squares of the hours of 54 windows over 0.9 h about their mean.
+    # Sd of the slope: sd of a mean of 60 values / root of the sum of squares of the 54 times.
     assert sd == pytest.approx(1.0 / 60**0.5 / (54 * 0.9**2 / 12) ** 0.5, rel=0.3)
     assert abs(slope - 7.0) < 4.0 * sd
     assert soak.slope([(0.0, 1.0), (1.0, 1.0)], 60.0) is None

@@ -22,7 +22,7 @@ from thermo_comp.ros.diagnostics import findings_of
 from thermo_comp.ros.reader import LoadedCalibration
 from thermo_comp.unit.calibration_file import save_calibration
 
-#: Largest error of a sound number, in the standard deviations that it was published with.
+#: Largest error of a published number that is not wrong, in its published standard deviations.
 SIGMAS = 5.0
 #: Largest difference [m/s^2] of a recovered output to the undisturbed run: 1 ug.
 RECOVERED = 9.80665e-6
@@ -80,7 +80,7 @@ def test_row(row, reference):
         assert not ((begin <= seconds) & (seconds < end)).any(), (begin, end)
     for level, text in row.says:
         assert heard.says(text, level), (level, text, sorted(set(heard.reports)))
-    # Wrong or not, the output must be finite and the covariance positive definite.
+    # Even wrong output must be finite, with a positive definite covariance.
     assert np.isfinite(heard.force).all()
     if len(seconds):
         assert np.linalg.eigvalsh(heard.covariance).min() > 0.0

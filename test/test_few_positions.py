@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Few positions: the parameters that they determine are right, the others stay at their prior."""
+"""Few positions: parameters that they determine are right, other parameters stay at the prior."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,9 +41,8 @@ def left_by(pair, **options):
 
 @pytest.mark.parametrize('pair', [(1, 2), (3, 9)])
 def test_two_positions_tell_the_thermal_response(pair):
-    # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine their sd to 6 %, and a few
-    # superfluous columns may add a tenth. Half of all 36 pairs of positions leave as little
-    # (docs/accuracy.md).
+    # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine the sd to 6 %, and superfluous
+    # columns may add 10 %. Half of 36 pairs of positions reach this (docs/accuracy.md).
     assert left_by(pair) == pytest.approx([1.2] * 3, rel=0.3)
 
 
@@ -87,7 +86,7 @@ def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
 def test_one_position_leaves_the_scale_at_its_prior(one_position):
     calibration = one_position.calibration
     for axis in calibration.static.axes():
-        # Each of the three powers has a prior sd of 1e-4 at the RMS of its column.
+        # Each power of the scale curve has a prior sd of 1e-4 at the RMS of its column.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
     # The prior sd of a MEMS are 5 % of the scale and 1 % of misalignment.
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
@@ -157,7 +156,7 @@ def test_six_faces_claim_the_cross_axis_sensitivity_of_a_mems(rng):
     out = calibration.correct(np.arange(1.0, len(reading) + 1.0), reading)
     sd = np.sqrt(np.diagonal(out.covariance, axis1=1, axis2=2))
     ratio = (out.specific_force - corners)[:, 1:] / sd[:, 1:]
-    # Three random elements: their RMS is within a factor of 2 of the sd in 95 % of the draws.
+    # RMS of three random elements of M: within a factor of 2 of their sd in 95 % of the draws.
     assert 0.5 < np.sqrt(np.mean(ratio**2)) < 2.0
 
 

@@ -54,7 +54,7 @@ def jump_of(size, day):
 
 
 def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
-    # Every column and both sets, on a ramp; the second route is a difference of two evaluations.
+    # A ramp excites every column and both sets; the expected derivatives are finite differences.
     unit = rich_calibration()
     logged = rests(unit, any_way, no_error, days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
@@ -63,12 +63,12 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Blocks have odd lengths, so that every kind of parameter comes on one axis at least.
+    # Test every second parameter: as blocks have odd lengths, each kind is tested on some axis.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
         if k in levels:
-            continue  # checked below: both levels of a scale move together, as K does
+            continue  # a change of K, which moves both levels, is tested below
         if k in {block.static for block in layout.bias}:
             continue
         moved[k] += step
@@ -82,7 +82,7 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
         by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
         assert np.allclose(slope, by_level, atol=1e-4)
         both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
-        # A level of the scale is relative to K, and so are the other parameters, within a percent.
+        # A change of K equals a change of the scale level of both sets, within a percent.
         assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
 
 
@@ -93,7 +93,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
     series = series_of(history.rests, unit)
     best = field_units.BestFilter(process)
     for k in range(len(series)):
-        # The filter takes the rests of the series, one by one.
+        # Give the Kalman filter the rests of the series, one by one.
         first = int(series.n_windows[:k].sum())
         windows = [r for _, r in history.rests[first : first + int(series.n_windows[k])]]
         mean = np.mean([window.mean for window in windows], axis=0) / field_units.K
@@ -115,8 +115,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # The series has six sums of each start at its mean time instead of all its rests: the
-        # error is below a fifth of the sd.
+        # The series sums the rests of a start at one time, which costs under a fifth of the sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
@@ -166,8 +165,7 @@ def test_axes_that_no_rest_shows_keep_their_bits():
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
-    # Upright rests give only the sum of bias and scale of z: 300 ug, to 15 ug with a turn-on of 20
-    # ug.
+    # Upright rests show a change of 300 ug in bias plus scale of z; turn-ons of 20 ug leave 15 ug.
     assert updated.moved[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
     old_sd, new_sd = (
@@ -230,14 +228,14 @@ def test_too_few_starts_are_refused():
 
 
 def test_the_first_passage_is_that_of_the_reflection_principle():
-    # The probability to be inside (-c, c) is the sum over k of
-    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = rate t.
+    # A random walk of rate r stays within (-c, c) up to t with the probability: sum over k of
+    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t.
     rate, bound = 4.0, 50.0
     for probability, days in zip((0.1, 0.5, 0.9), passage(0.0, 0.0, rate, bound), strict=True):
         s, k = np.sqrt(rate * days), np.arange(-40, 41)
         inside = norm.cdf((2 * k + 1) * bound / s) - norm.cdf((2 * k - 1) * bound / s)
         assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.005)
-    # A walk from nearer to a bound passes earlier; a unit that does not age never reaches a bound.
+    # A random walk passes a near bound earlier; a unit that does not age never reaches a bound.
     assert passage(30.0, 0.0, rate, bound)[1] < passage(0.0, 0.0, rate, bound)[1]
     assert passage(0.0, 0.0, 1e-12, bound) == (np.inf,) * 3
 
@@ -281,7 +279,7 @@ def test_update_by_the_command_line(tmp_path, unit_file, cli):
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
-    # The new file removes the residual of the old file, and the history shows both.
+    # The new file removes the residual of the old file, and the history shows both residuals.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A temperature in a message of any type: the values of many messages at once equal those of
-`rosbags`.
-"""
+"""A temperature in a message of any type: values of many messages equal those of rosbags."""
 
 import numpy as np
 import pytest
@@ -141,7 +138,7 @@ def test_definitions_are_the_bags_own_or_known_or_said():
 
 
 def driver_bag(path, store, storage=StoragePlugin.MCAP):
-    """Write 50 Imu messages, and PX4's and a bare Float64 between them; return PX4's."""
+    """Write 50 Imu messages, with PX4's and Float64's between; return the readings of PX4."""
     celsius = []
     with Writer(path, version=9, storage_plugin=storage) as bag:
         kinds = {'/imu/data': 'sensor_msgs/msg/Imu', '/case': 'std_msgs/msg/Float64',

@@ -46,10 +46,9 @@ def left_by(groups):
 def test_a_knee_of_the_bias_is_found():
     unit, left = left_by(('curve', 'bend'))
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
-    # Knees stand a kelvin apart: the fit uses the knees on both sides of the true knee.
+    # Trial knees are a kelvin apart: the fit uses the trial knees on either side of the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # Between two knees the fitted slope is the mean of both sides: an error of at most 20 ug/K
-    # times a quarter of their distance, over one of the 22 kelvins of the recording.
+    # The mean slope between two knees is wrong by at most 20 ug/K * 0.25 K in 1 of 22 kelvins.
     assert left < 1.5
 
 
@@ -105,7 +104,7 @@ def test_a_bag_of_another_environment_takes_no_part_and_is_claimed():
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'took no part' in note
-        # The other bag is off by 5 times 20 ug/K over the 11 K above the knee; z by half as much.
+        # In bag r4 the slope above the knee is 5 times 20 ug/K, over 11 K; half as much on z.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 600.0
     # One more bag of the same environment is no contradiction.

@@ -58,7 +58,7 @@ def claimed(calibration):
     return sd[bias], sd[scale], sd[layout.misalignment :]
 
 
-# Readings come every four seconds, in which a ramp of 1.5 K/min changes the board by 0.1 K.
+# A reading every four seconds suffices: a ramp of 1.5 K/min changes the board by 0.1 K in 4 s.
 OWN_LAGS, PAPER, PLAIN = (
     triad(name, 1).with_thermometers(rate_hz=0.25) for name in ('own-lags', 'paper', 'plain')
 )
@@ -88,7 +88,7 @@ def test_truth_lies_within_the_claimed_sd(response):
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0
     assert np.sqrt(np.mean(pull**2)) < 2.0
-    # The claimed sd is small: micro-g and ppm, for a drift of hundreds.
+    # The claimed sd is some ug and ppm, for a drift of hundreds of ug.
     bias_sd, scale_sd, M_sd = claimed(response.calibration)
     assert (bias_sd / np.array(OWN_LAGS.counts_per_micro_g)).max() < 5.0
     assert scale_sd.max() < 10e-6
@@ -116,14 +116,13 @@ def test_the_paper_s_model_on_its_own_physics(golovach):
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        # Each regime has a curve, so that the calibration has no single curve.
+        # The paper's model has a separate curve for each regime, so there is no row of one set.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
     # The paper's model has a linear static set and a quadratic dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # The paper's model leaves an error in the unit's ramps, which shifts the estimated levels by
-    # as much.
+    # The estimated biases are wrong by up to the error of the paper's model in ramps.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)
@@ -143,7 +142,7 @@ def test_the_evidence_is_complete(response):
     assert {finding.level for finding in response.findings} <= {'advice', 'good'}
     assert 'refusal' not in {finding.level for finding in response.findings}
     judged = {(group.part, group.group) for group in calibration.evidence}
-    # The bias of each axis of this unit is a curve over the temperature of the axis' part.
+    # In this unit the bias of each axis is a curve over the temperature of the axis' part.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
     # A term with zero weight is only needed for the covariance.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
@@ -157,8 +156,7 @@ def test_the_file_holds_the_fit(response, tmp_path):
 
 
 def test_the_compensator_does_what_the_fit_promised(response):
-    # A run in a new attitude, corrected sample by sample: the same noise as in positions left out,
-    # and the published variance covers the error.
+    # In a new attitude the error is that of left-out positions, and within the published sd.
     up = np.array([[0.48, -0.6, 0.64]])
     (record,) = records_of(OWN_LAGS, up, 77)
     compensator = Compensator(response.calibration)
@@ -166,13 +164,13 @@ def test_the_compensator_does_what_the_fit_promised(response):
     per_window = round(60.0 * RATE_HZ)
     n = len(after.index) // per_window
     force = after.specific_force[: n * per_window].reshape(n, per_window, 3).mean(axis=1)
-    # The uncertainty of the lags' start dominates until it has decayed.
+    # Leave out the first 45 min, in which the unknown initial lag states dominate.
     late = force[45:]
     rms = residual_statistics(norm_residual(late, STANDARD_GRAVITY)).rms
     assert rms < 2.0 * response.residuals[-1].left_out.rms
     density = np.array(response.calibration.noise_density_m_s2_sqrt_hz)
     variance = after.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)
-    # White noise and rounding average out, the other errors do not.
+    # In means of 60 s white noise and rounding average out; the other errors do not.
     variance += density**2 / 60.0 - np.array(compensator.thermal.correction.noise)
     error = (force - record.truth.specific_force) / np.sqrt(variance)
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
@@ -187,15 +185,13 @@ def test_six_faces_leave_misalignment_at_its_prior():
     np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
     finding = next(finding for finding in result.findings if finding.name == 'misalignment')
     assert (finding.level, finding.message.startswith('6 positions')) == ('advice', True)
-    # Bias and scale are determined, except for the effect of M of 1 mrad on the faces: half its
-    # square.
+    # Bias and scale are determined, except for half the square of M (1 mrad) on the faces.
     assert scale_sd.max() < 2e-5
     assert np.abs(pulls(result, PLAIN)).max() < 4.0
 
 
 def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng):
-    # WHY: compensated samples, and samples of a triad without drift, were both fitted without a
-    # message.
+    # WHY: compensated samples, and a triad without drift, were fitted without a message.
     records = records_of(PLAIN, positions(9, 1), 4)
     bias, scale, M = PLAIN.bias_at_reference, PLAIN.scale_factor, np.array(PLAIN.M)
 
@@ -206,8 +202,7 @@ def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng)
         return fit(sources, FitOptions(**options))
 
     def force(counts):
-        # The output of a compensator has no quantisation steps, and its noise hides those of the
-        # counts.
+        # Like a compensator's output: in m/s^2, with noise that hides the steps of the counts.
         return ((counts - bias) / scale) @ M.T + 5e-4 * rng.standard_normal(counts.shape)
 
     raw = fit_of(lambda counts: counts)
@@ -226,8 +221,7 @@ def test_bags_with_and_without_temperature_contradict_themselves():
 
 
 def test_a_switch_of_the_sets_moves_the_output_gently(golovach):
-    # An INS at rest must not notice the switch: at most 1 ug per second, or, for the longest
-    # transition of ten times the given 30 s, the difference divided by its duration.
+    # A switch of sets changes the output by 1 ug/s, or by the difference of the sets in 300 s.
     (record,) = records_of(PAPER, positions(1, 5), 905)
 
     def forces(weight):
@@ -238,8 +232,7 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach):
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return corrected.specific_force
 
-    # The three outputs have the same noise, which cancels; the change of weight along the
-    # difference of the sets remains.
+    # The equal noise of the three outputs cancels, which gives the weight of the dynamic set.
     output, static, dynamic = forces(None), forces(0.0), forces(1.0)
     gap = dynamic - static
     size = np.linalg.norm(gap, axis=1)
@@ -248,7 +241,7 @@ def test_a_switch_of_the_sets_moves_the_output_gently(golovach):
     moved = np.abs(weight[per_second:] - weight[:-per_second]) * size[per_second:]
     assert weight[0] == pytest.approx(0.0, abs=1e-6)
     assert weight.max() == pytest.approx(1.0, abs=1e-6)
-    # During the transition the difference of the sets changes by far less than a hundredth.
+    # The difference of the sets itself changes by less than 1 % during the transition.
     assert moved.max() / MICRO_G < 1.01 * max(1.0, size.max() / MICRO_G / 300.0)
 
 
@@ -295,8 +288,7 @@ def test_saturated_samples_are_refused(rng):
 
 
 def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mountings():
-    # Misalignments of some mrad explain the norms of nine positions. Mountings of 5 mg would also
-    # explain the norms, with constants wrong by 5 mg. The noise of a minute is 22 ug.
+    # Misalignments of some mrad explain the norms of nine positions, as would mountings of 5 mg.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
     calibration = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY)).calibration

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A board warmer than its case by self-heating: effects of temperature changes are even about the
-gradient at rest.
-"""
+"""Self-heating makes a board warmer than its case: effects are even about the rest gradient."""
 
 from itertools import pairwise
 
@@ -55,8 +52,7 @@ def test_what_a_change_does_is_found_about_rest(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # The estimate has a noise of 0.1 mK (two readings of 3 mK a minute for twenty hours), and an
-    # error by the rates, which are means over minutes.
+    # The estimate has a noise of 0.1 mK (1200 minutes of 3 mK) and an error as rates are means.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     about_rest, about_0 = (
@@ -66,7 +62,7 @@ def test_what_a_change_does_is_found_about_rest(rng):
     kept = {column.group for column in about_rest.calibration.response}
     assert 'gradient_even_about_rest' in kept
     assert 'gradient_even' not in kept
-    # Means of a minute; columns even about 0 leave a part of the effect.
+    # In means of a minute, columns that are even about 0 leave a part of the effect.
     floor = NOISE / np.sqrt(30.0)
     assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor

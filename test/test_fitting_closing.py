@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of series, and the end of the dynamic regime: both estimated, not assumed."""
+"""Noise of series, and the end of the dynamic regime, are estimated, not assumed."""
 
 from dataclasses import replace
 from typing import Literal
@@ -52,7 +52,7 @@ def weight(record, closes):
     [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],
 )
 def test_evidence_says_when_the_regime_closes(closes, options):
-    # Readings come every four seconds, in which the case changes by 0.1 K.
+    # A reading every four seconds suffices: the case changes by at most 0.1 K in 4 s.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
     plan = [Position(PROGRAM, up) for up in FACES]
@@ -61,7 +61,7 @@ def test_evidence_says_when_the_regime_closes(closes, options):
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.closes == closes
-    # Sets of the fit start and end at slightly other times, as it estimates the sensor settings.
+    # The fit estimates the sensor settings, so its regimes switch at slightly other times.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
 
@@ -117,8 +117,7 @@ def drawn(rng, n, steps, noise):
 
 @pytest.mark.parametrize('noise', [Noise(1.0, 600.0), Noise(0.3, 2000.0), Noise(30.0, 300.0)])
 def test_ratio_and_time_are_found(rng, noise):
-    # 3 axes x 9 positions x 300 windows of a minute: 240 or more correlation times determine the
-    # variance of the process to sqrt(2 / 240) = 9 %, its time to about 15 %.
+    # 240 correlation times determine the variance to sqrt(2 / 240) = 9 %, the time to 15 %.
     whitener, weight, series = drawn(rng, 9, 300, noise)
     fitted = whitener.estimate(5.0 * series, weight)
     assert 0.5 < fitted.ratio / noise.ratio < 2.0
@@ -134,8 +133,7 @@ def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
 
 
 def test_a_time_that_no_position_holds_is_not_claimed(rng):
-    # Positions of twenty minutes do not show a correlation time of hours: the longest time tried
-    # is a fifth of them.
+    # Correlation times up to a fifth of the length of a position (20 min) are tried.
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
     alone = Whitener(np.arange(3), np.zeros(3))

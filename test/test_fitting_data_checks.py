@@ -74,8 +74,7 @@ def test_a_good_test_passes(good):
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
         ('directions', lambda w: {'rate': np.abs(w.rate)}, 'only heating was recorded'),
         ('soak', lambda w: {'weight': 0.0 * w.weight + 1.0}, 'only 0 % of the windows are static'),
-        # WHY: the static set was wrong by 800 ug at the other temperatures, with a claimed sd of
-        # 100 ug, as its soaks were static at one temperature.
+        # WHY: soaks at one temperature left 800 ug at others, with a claimed sd of 100 ug.
         ('soak', lambda w: {'weight': 1.0 * (np.abs(w.temperature - 20.0) > 3.0)},
          r'% of the windows are static, over [56]\.\d of \d\d\.\d K'),
         ('swapped', lambda w: {'gradient': -w.gradient}, r'are the two sensors exchanged\?'),
@@ -90,8 +89,8 @@ def test_what_a_test_lacks_is_said(good, name, changed, message):
 
 
 def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, rng):
-    # WHY: bags of soaks with interpolated readings were refused. The noise of the board's reading
-    # enters its rate and, with the opposite sign, the gradient.
+    # WHY: soaks with interpolated temperatures, whose noise enters rate and gradient, were
+    # refused.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)
@@ -131,7 +130,7 @@ def test_few_and_badly_spread_positions_are_said(good):
 
 
 def test_geometry_is_the_scatter_of_the_parameters(rng):
-    # The second route is Monte Carlo: least squares of noise of the norm on the nine parameters.
+    # Expected by Monte Carlo: least-squares fits of the nine parameters to noise of the norm.
     up = positions(12, 5)
     x, y, z = up.T
     jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))
@@ -173,7 +172,7 @@ def test_what_the_fit_left_is_said():
     ('given', 'name', 'message'),
     [
         ((500.0, 400.0, 300.0, 500.0), 'misfit', 'temperature does not explain'),
-        # Temperatures an hour late by another clock.
+        # The temperatures are stamped an hour late, as by another clock.
         ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw error'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
         ((100.0, 1.0, 0.2, 1.5), 'units', 'expected near 1'),

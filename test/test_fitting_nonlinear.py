@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Fits beyond 1 g: derivatives, terms that stay or leave, radius, statements of |f|, whole runs.
-"""
+"""Fits beyond 1 g: derivatives, choice of terms, radius, statements of |f|, whole runs."""
 
 import math
 from dataclasses import replace
@@ -103,7 +101,7 @@ def test_derivatives_are_those_of_differences(rng):
                 )
                 expected = (below - above) / 2e-6
                 derived = derivatives[p, axis, :, column]
-                # The tolerance is rounding of 1e-14 over 1e-6, for forces up to 95 m/s^2.
+                # Rounding of 1e-14 divided by the step 1e-6, for forces up to 95 m/s^2.
                 scale = np.abs(expected).max()
                 np.testing.assert_allclose(derived, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)
 
@@ -218,7 +216,7 @@ def test_a_constant_rotation_is_a_rest_and_its_change_is_none(rng):
     summed = cells.finish()
     still = still_intervals(without_rotation(summed), 3.0)
     edges = [(summed.time[a], summed.time[b - 1]) for a, b in still]
-    # After a change the median takes 5 s to follow; cells beside a motion do not count.
+    # After a change of rate the median needs 5 s to follow; cells beside a motion are not still.
     assert len(edges) == 3
     for (a, b), (begun, ended) in zip(edges, ((0, 80), (100, 180), (190, 240)), strict=True):
         assert begun <= a < begun + 8.0
@@ -263,14 +261,14 @@ def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
     judged = judge_bags(result.bags, result.calibration)
     assert [round(size / G, 1) for size in judged.by_force] == [1.0, 3.2, 8.1]
     *_, most = judged.by_force.values()
-    # 60 s of 5 ug/sqrt(Hz) noise and rounding leave some ug; the terms were hundreds.
+    # Noise and rounding leave some ug in means of 60 s; the nonlinear terms were hundreds of ug.
     assert most.rms < 10.0 * MICRO < 100.0 * MICRO < most.raw_rms
     narrow = replace(result.calibration.nonlinearity, force_range_m_s2=(9.0, 5.0 * G))
     outside = judge_bags(result.bags, replace(result.calibration, nonlinearity=narrow))
     assert outside.sections['outside'].n == most.n
     rows = results(evidence_of_fit(result), CertificateInfo(), ())
     assert {'K2 x', 'K3 z'} < {row.quantity for row in rows}
-    # A tumble at 1 g later keeps what the centrifuge has shown.
+    # A later tumble at 1 g, with this calibration as the prior, keeps the nonlinear terms.
     still = [Position(program, position) for position in positions(6, 2)]
     later = arrays(unit, still, 9, rate_hz=2.0)
     tumble = [source(run, None, f'still{k}') for k, run in enumerate(later)]
@@ -282,7 +280,7 @@ def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
         replace(again, unit=replace(again.unit, serial=f'{k}'), gyroscope=None) for k in range(3)
     ]
     assert population(siblings).nonlinearity is None
-    # A tumble alone leaves the term at the bound of the data sheet, which the fit reports.
+    # A tumble alone leaves a nonlinear term at the bound of the data sheet, which is reported.
     alone = fit(tumble, FitOptions(gravity=G, model='golovach', k2_sd=5e-5))
     assert [finding.name for finding in alone.findings].count('nonlinearity') == 1
     (square, *_) = nonlinear_coefficients(alone.calibration)

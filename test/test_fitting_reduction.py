@@ -62,7 +62,7 @@ def test_chunks_do_not_matter(rng):
         other = reduced(split(whole, n_parts))
         for a, b in zip(at_once.intervals, other.intervals, strict=True):
             np.testing.assert_array_equal(a.count, b.count)
-            # The order of addition differs, and therefore the rounding of the sums.
+            # Blocks change the order in which samples are added, and so the rounding of the sums.
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
         np.testing.assert_array_equal(at_once.board.value, other.board.value)
@@ -70,7 +70,7 @@ def test_chunks_do_not_matter(rng):
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng, rest_s):
-    # WHY: at 1 Hz a cell was half a minute, and the mean over all attitudes was 0.07 m/s^2 long.
+    # WHY: at 1 Hz a cell took half a minute and averaged several attitudes to 0.07 m/s^2.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
@@ -80,7 +80,7 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
         size = np.linalg.norm(interval.mean, axis=1)
         # The noise is 5 ug per sample, in windows of ten samples and shorter ones at the end.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
-    # A long rest has cells of the same length as before.
+    # Without short rests the cells of slow samples stay half a minute long.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])
     assert reduced([alone], full_scale=None).window_s == 30.0
 
@@ -90,7 +90,7 @@ def test_windows_are_means_of_their_samples(rng):
     (interval,) = reduced([block(samples)]).intervals
     assert interval.count.sum() == len(samples)
     assert len(interval.time) == 6
-    # Half-second cells of 50 samples: a window is 20 cells.
+    # A window of 10 s is 20 cells of half a second, 50 samples each.
     np.testing.assert_allclose(interval.mean[2], samples[2000:3000].mean(axis=0), atol=1e-10)
     assert interval.time[2] == pytest.approx(24.995, abs=1e-9)
     np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)
@@ -112,8 +112,8 @@ def test_positions_in_one_bag_are_told_apart(rng):
 
 def test_a_chamber_whose_compressor_cycles_has_one_position(rng):
     # WHY: half of the recording was left out, and each pause of the compressor was a position: 18
-    # bags had 1135, and their fit took ten minutes. WHAT: twelve shakes of three times the noise
-    # belong to the rest, and a turn by 300 urad between two of them is still detected.
+    # bags had 1135 positions, and their fit took ten minutes. WHAT: twelve shakes of three times
+    # the noise belong to the rest, and a turn by 300 urad between two of them is still detected.
     accel = still(rng, 720.0, (0.0, 0.0, 3000.0))
     for start in range(3000, 72000, 6000):
         accel[start : start + 3000] += 0.9 * rng.standard_normal((3000, 3))
@@ -125,16 +125,14 @@ def test_a_chamber_whose_compressor_cycles_has_one_position(rng):
 
 
 def test_a_knock_starts_a_new_position(rng):
-    # The attitude shifts by 1 count of 3000 without any vibration: 300 urad, a step of 20 sd of
-    # a cell mean.
+    # Without vibration the attitude shifts by 1 count of 3000, 300 urad, or 20 sd of a cell mean.
     accel = still(rng, 60.0, (0.0, 0.0, 3000.0))
     accel[3000:] += (1.0, 0.0, 0.0)
     assert len(reduced([block(accel)]).intervals) == 2
 
 
 def test_a_drift_is_no_motion(rng):
-    # A drift of 100 ppm/K at 3 K/min is 0.015 counts per second, or 0.02 sd of a cell mean per
-    # cell.
+    # A drift of 100 ppm/K at 3 K/min is 0.015 counts/s, or 0.02 sd of a cell mean per cell.
     accel = still(rng, 300.0, (0.0, 0.0, 3000.0))
     accel[:, 2] += 0.015 * np.arange(len(accel)) / RATE_HZ
     assert len(reduced([block(accel)]).intervals) == 1
@@ -170,8 +168,7 @@ def test_time_origin_does_not_matter(rng):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # Cells of half a second fill windows of 10 s; 30 samples at 4 Hz do not, and 30 at 1 Hz last
-    # longer.
+    # Cells of 0.5 s fill a window of 10 s; cells of 30 samples do not at 4 Hz and 1 Hz.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
 def test_windows_are_as_long_as_stated(rate_hz, cell_s, window_s, rng):
@@ -207,7 +204,7 @@ def test_fast_readings_are_averaged(rng):
 
 @pytest.mark.parametrize(
     ('latitude', 'height', 'expected'),
-    # These values of gravity are published for WGS 84 at the equator, the pole and 45 degrees.
+    # Expected: gravity by WGS 84 at the equator, the pole and 45 degrees, as published.
     [(0.0, 0.0, 9.7803253359), (90.0, 0.0, 9.8321849379), (45.0, 0.0, 9.8061977694)],
 )
 def test_normal_gravity_of_the_tables(latitude, height, expected):
@@ -284,8 +281,7 @@ def test_a_slow_ramp_is_not_to_be_missed(rng):
 
 @pytest.mark.parametrize('step', [1.0, 16.0, 1.0 / 300.0])
 def test_a_coarse_sensor_rests_too(step, rng):
-    # An axis that is constant for long, or alternates between two values, is at rest whatever its
-    # quantum; a tenth of the cells has no variance at all.
+    # An axis that is constant, or alternates between two values, is at rest at any quantum.
     slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
     accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))
     bag = reduced([block(np.round(accel) * step)], full_scale=None)

@@ -32,10 +32,7 @@ from thermo_comp.fitting.unknowns import Noise, State, inverse_misalignment, tan
 
 
 class Dense:
-    """
-    The posterior of a `Regression` by a slow second route: all unknowns in one vector, dense
-    covariances, numerical derivatives.
-    """
+    """The posterior of a `Regression` by dense linear algebra and numerical derivatives."""
 
     def __init__(self, regression, prior, at):
         self.windows, self.prior, self.at = regression.windows, prior, at
@@ -50,7 +47,7 @@ class Dense:
         self.determinant = -2.0 * sum(np.log(np.diag(root)).sum() for root in self.roots)
 
     def state(self, x):
-        """Move the mode of the fast route by x."""
+        """Add x to the mode found by `Regression`."""
         layout, at = self.at.layout, self.at.state
         padded = np.append(x, 0.0)
         up = at.up + np.einsum('pij,pj->pi', tangent_basis(at.up), x[layout.up])
@@ -85,7 +82,7 @@ class Dense:
             state.offset.ravel() / prior.offset_sd,
             state.tilt.ravel() / prior.tilt_sd,
             state.start.ravel() / np.sqrt(prior.start_share),
-            # The mean of the starts of all bags has a tenth of the sd of one start.
+            # The mean initial lag state of all bags has a tenth of the sd of one bag's state.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_share)),
         ]
         for weights, sd in zip(state.weights, prior.column_sd, strict=True):
@@ -106,7 +103,7 @@ class Dense:
 @pytest.fixture(scope='module', params=[1, 4], ids=['a position per bag', 'up to 4'])
 def solved(request):
     rng = np.random.default_rng(5)
-    # The table draws a start for each position, but those of one bag have a common start: 0.
+    # The table draws an initial state per position; positions of one bag share one state, here 0.
     truth = Truth(
         start_sd=0.5 if request.param == 1 else 0.0, noise=Noise(4.0, 2000.0),
         offset_sd=2.0 * MICRO, tilt_sd=5e-6,
@@ -143,20 +140,17 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
-        # Correlations of 0.999 lose three of the eight digits of the derivatives. The information
-        # of a bag about its own unknowns is computed without the bound on the mean of all bags.
+        # Correlations of 0.999 lose three of the eight digits of the derivatives.
         np.testing.assert_allclose(
             mode.covariance / np.outer(sd[:n], sd[:n]), covariance, atol=1e-4
         )
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
-        # Laplace: -2 ln Z = misfit + ln det of noise, of prior and of Hessian; directions have no
-        # prior.
+        # Laplace: -2 ln Z = misfit + ln det of noise, prior, Hessian; directions have no prior.
         precision = regression.precision(wide, mode.layout)
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # The bound on the mean of all starts, a tenth of the sd of a start, depends on the number of
-    # bags: allow for this difference.
+    # The prior of the mean initial lag state depends on the number of bags: allow for this.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
@@ -181,9 +175,8 @@ def test_truth_comes_out_without_noise(rng):
 
 
 def test_claimed_sd_is_the_scatter():
-    # Under the true priors the inverse Hessian is the Cramer-Rao bound: errors over claimed sd
-    # have an RMS of 1. 36 units of 3 x 2 + 3 + 24 numbers, some of them correlated: the RMS of
-    # each kind is determined to 13 % or better.
+    # With true priors (the inverse Hessian is the Cramer-Rao bound) errors / sd have an RMS of 1,
+    # determined by 36 units with 33 partly correlated numbers to 13 % or better.
     rng = np.random.default_rng(11)
     truth = Truth(noise=Noise(0.5, 1000.0), offset_sd=MICRO, start_sd=0.3)
     errors = []
@@ -212,14 +205,13 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: With LINEAR groups the problem is linear in everything except directions, which are determined
-#: to some urad: the result is exact except for rounding. With PRODUCTS a score lacks the product
-#: of the changes of start and weight, as scores of positions are linear, and scores of sections
-#: are two linear steps.
+#: to some urad: the result is exact except for rounding. With PRODUCTS the scores, which are one
+#: or two linear steps, neglect the product of the changes of initial state and weight.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
 def scored(groups, n, rng, *, n_windows, step_s, **changes):
-    """Fit a unit whose errors are of these groups; return its windows, ups and fit."""
+    """Fit a unit whose errors are of the given groups; return windows, directions and fit."""
     used = np.isin(GROUPS, groups)
     truth = Truth(on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used, start_sd=0.3,
                   **changes)  # fmt: skip
@@ -265,7 +257,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
         size = np.sqrt(np.mean(expected**2))
         assert score.sections.square[section] == pytest.approx(size**2, rel=2.0 * tolerance)
     assert score.sections.rms == pytest.approx(np.sqrt(score.sections.square.mean()))
-    # One position cannot be left out: the drift is that of the sections.
+    # A single position cannot be left out: the score is the drift of the sections.
     alone, state = begin(rows_of(windows, np.arange(24)), up[:1])
     alone_score = score_of(alone, alone.solve(state, prior))
     assert np.isnan(alone_score.positions.rms)
@@ -274,7 +266,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
 
 
 def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
-    # Without one of six faces the bias of the axis is not separated from the scale.
+    # Five of the six faces do not separate bias and scale of the axis whose face is left out.
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
     regression, state = begin(windows, up)
@@ -283,7 +275,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift needs neither bias nor scale; M keeps its value and its uncertainty.
+    # The score of the drift needs neither bias nor scale; M keeps its value and its sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
     places = mode.layout.misalignment
@@ -292,7 +284,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
 def test_no_step_goes_uphill(seed):
-    # Bags that started far from rest, with little data: the product of start and weight matters.
+    # Bags with few data start far from rest, so the product of initial state and weight matters.
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
     windows, up = table_of(truth, 4, rng, n_windows=12, step_s=400.0)
@@ -309,7 +301,7 @@ def test_no_step_goes_uphill(seed):
 def test_what_takes_no_part_any_more_is_gone(solved):
     regression, prior, mode = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
-    # The result is that of a state to which no step has been applied.
+    # Excluded columns get zero weight even without a step of the solver.
     state = regression.solve(mode.state, narrow, n_steps=0).state
     assert not state.weights[0, :, 2:4].any()
     np.testing.assert_array_equal(state.weights[1], mode.state.weights[1])
@@ -349,7 +341,7 @@ def test_published_huygens_coefficients_come_back(rng):
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
         printed = [f'{got[0]:.5e}', f'{got[1]:.5e}', f'{got[2]:.5e}']
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
-        # The bias is in counts, sf times offset: the offset in g is their ratio.
+        # The fit's bias is in counts; divided by sf it is the published offset [g].
         bias = K0 * polynomial.polyval(
             t[:40], np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
         )
@@ -362,8 +354,7 @@ def test_published_huygens_coefficients_come_back(rng):
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
 def test_inactive_columns_are_known_as_if_they_took_part(noise):
-    # In a linear problem S is the inverse covariance of the columns under a flat prior, S^-1 Q
-    # their estimated weight, and the gain that of the log evidence.
+    # Linear problem: S is the inverse covariance of the columns, S^-1 Q the estimated weight.
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
     regression, state = begin(without_starts(windows), up)
@@ -387,7 +378,7 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise):
     gain = max(gains) - posterior.log_evidence
     assert gain > 100.0
     assert inactive.gain(wide, asked) == pytest.approx(gain, rel=0.01)
-    # The columns that the data contain are chosen one after another, no other column, none twice.
+    # Exactly the columns that the data contain are chosen, one after the other.
     chosen = inactive.chosen(wide, asked, 4.0, 9)
     assert np.array(GROUPS)[chosen].tolist() == ['board'] * (np.array(GROUPS) == 'board').sum()
     assert inactive.chosen(wide, asked, 4.0, 1).sum() == 1

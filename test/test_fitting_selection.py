@@ -37,7 +37,7 @@ IDLE = np.array(GROUPS) == 'idle'
 
 
 def constants(truth):
-    """No columns yet, and wrong noise parameters."""
+    """Return the prior of a fit without columns, with wrong noise parameters."""
     return prior_of(
         truth, (), offset_sd=MICRO, offset_scale=30.0 * MICRO, sigma=np.full(3, 5.0 * MICRO),
         noise=Noise(), misalignment_sd=1e-3,
@@ -88,8 +88,7 @@ def test_what_explains_nothing_is_not_chosen(calm):
 def test_models_that_were_looked_at_show_their_left_out_errors(calm):
     _, selected, truth = calm
     rms = {trial.groups: trial.score.rms for trial in selected.trials}
-    # The trials contain the constants, then the curve; the error is the size of the missing
-    # effect.
+    # Constants are tried before the curve; their error is the size of the missing effect.
     assert [*rms][:2] == [(), ('curve',)]
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
@@ -110,8 +109,7 @@ def test_what_is_forced_stays(calm):
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
 def test_a_group_must_explain_more_than_an_accident(where, is_chosen):
-    # WHY: a column may fit one recording, or one part of the program that all bags share. WHAT:
-    # the evidence favours the group in each case; data left out of the fit decide.
+    # The evidence favours the group in three cases; left-out data reject it in the last two.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -127,8 +125,7 @@ def test_a_group_must_explain_more_than_an_accident(where, is_chosen):
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
 def test_a_part_that_lags_is_found_although_no_curve_helps_alone(n_positions, step_s):
-    # WHY: the selection stopped at constants, 440 ug instead of 0.6, as a curve alone did not
-    # help. WHAT: a bias that follows only a lagged temperature is a curve and a lag that cancel.
+    # WHY: a bias that follows only a lagged temperature needs curve and lag together.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     truth = Truth(on_bias=on_bias, on_scale=np.zeros((3, 6)))
@@ -146,10 +143,10 @@ def test_noises_come_out(noisy):
     assert {'curve', 'board'} <= chosen_groups(chosen)
     # 1080 windows per axis determine the white noise to 3 %, slightly worse with the slow noise.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
-    # Positions last six correlation times, and curves absorb a part of the slow noise.
+    # Positions last only six correlation times of the slow noise, and curves absorb a part of it.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
-    # Of 18 x 3 readings directions, scale, bias and M use 36 + 9: the others give the sd to 24 %.
+    # 54 readings less 45 unknowns (directions, scale, bias, M) give the mounting sd to 24 %.
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
 
 
@@ -160,8 +157,9 @@ def test_white_noise_is_not_taken_for_slow_noise(calm):
 
 
 def test_prior_sds_are_those_of_the_weights(calm):
-    # The fixed point: sd^2 = sum of squares / effective parameters, three if all are determined;
-    # the hyperprior of a factor of ten shifts it by 1 / (2 x 3 x 5.3) of the distance.
+    # At the fixed point sd^2 = sum of squared weights / effective parameters, three per column if
+    # all are determined; the hyperprior (sd of a factor of ten) shifts log sd by 1 / (2 x 3 x 5.3)
+    # of the distance.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -171,7 +169,7 @@ def test_prior_sds_are_those_of_the_weights(calm):
 
 
 def test_no_weight_is_believed_steeper_than_a_data_sheet():
-    # A unit with ten times the steepest slope per kelvin: its prior stays at the limit.
+    # For a unit with ten times the steepest plausible slope the prior sd stays at its limit.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
     regression, state = begin(windows, up)
@@ -188,16 +186,14 @@ def test_truth_lies_within_the_claimed_sd(noisy):
     errors = truth.errors(regression, chosen.posterior)
     # Pruned weights have no sd; the true weights of the idle columns are 0.
     every = np.concatenate([*errors.values()])
-    # About thirty numbers determine their RMS to 13 %, which is slightly less with estimated prior
-    # sd.
+    # 30 errors determine the RMS of error / sd to 13 %; estimated prior sd lower the RMS.
     assert len(every) > 20
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
     assert np.abs(every).max() < 4.0
 
 
 def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
-    # Savage-Dickey against brute force: solve without the group, with the same prior for all other
-    # groups. The ratio is exact in a linear problem; the directions are linear to noise / g.
+    # Savage-Dickey against a solution without the group: exact except for the directions.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
@@ -224,7 +220,7 @@ def test_what_a_group_explains_is_what_it_adds(calm):
     evidence = group_evidence(regression, chosen.posterior)
     explains = {(group.part, group.group): group.explains_m_s2 for group in evidence}
     expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
-    # The effect is about 100 ug, the noise 2 ug.
+    # The group's effect is about 100 ug, the noise of a window 2 ug.
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
@@ -237,8 +233,7 @@ def test_outliers_do_not_pull(calm):
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
     _, other = selected_of(truth, dirty, calm[1].posterior.state.up)
     sd = np.sqrt(one.posterior.variance[one.posterior.layout.bias])
-    # 2 % of the windows, each limited to 3 sd, shift the result by about one sd; without limit
-    # each counts 100 sd, and hides the curve.
+    # 2 % outliers of 100 sd, each down-weighted to 3 sd, shift the result by less than 1 sd.
     assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     used, used_with_outliers = (
@@ -248,7 +243,7 @@ def test_outliers_do_not_pull(calm):
 
 
 def test_means_of_few_values_are_no_knocks():
-    # A converter that carries its remainder: most means are equal, others differ by a count.
+    # With a converter that carries its remainder most means are equal, some differ by a count.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
     prior = prior_of(Truth(), (), offset_sd=1e-9)
@@ -291,8 +286,7 @@ def test_how_bags_begin_is_learnt(start_sd, lower, upper):
 
 @pytest.mark.parametrize('away', [0.0, 30.0])
 def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
-    # WHY: siblings, or the last calibration of a unit, may be nearer to this unit than they seem,
-    # or farther. WHAT: of a narrow and a wide prior the evidence selects the true one.
+    # Siblings may differ by less or more than their sd: the evidence selects the true prior.
     _, one, truth = calm
     state = one.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -311,7 +305,7 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
     chosen = fit_all(regression, state, prior, fixed, priors)
     assert chosen.posterior.prior.informative is priors[int(away > 0.0)]
     curve = unit_of(chosen.posterior.state, layout)[places]
-    # Both fits have the same data, so their results differ by less than their uncertainties.
+    # With the right prior the fitted curve agrees with the curve of the first fit.
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()
 
 
@@ -328,8 +322,7 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
     chosen, left = drift_left(windows)
     # Tilts of 12 positions x 2 angles x 2 columns determine their sd to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
-    # A tilt of 5 urad changes any axis by 5 ug; the noise of 720 windows is 0.1 ug for each
-    # weight.
+    # A tilt of 5 urad changes an axis by 5 ug; 720 windows give 0.1 ug of noise per weight.
     assert left < 0.5 * MICRO
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
@@ -359,11 +352,11 @@ def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting():
     for n in (9, 24):
         claim, fitted = claimed(n)
         assert np.linalg.eigvalsh(claim).min() > 0.0
-        # The bias of each axis follows its kappa.
+        # The parameters of `claim` are, per axis, kappa (relative scale) and then the bias.
         k = (len(claim) - 3) // 3
         at = 1 + k * np.arange(3)
         ratios.append(np.sqrt(np.diag(claim)[at].mean() / np.diag(fitted)[at].mean()))
-    # Nine positions leave no degree of freedom: a mounting of tens of ug is as likely as none.
+    # Nine positions leave no degree of freedom: mounting offsets of tens of ug cannot be excluded.
     assert ratios[0] > 3.0 * ratios[1]
     assert 0.8 < ratios[1] < 1.5
 

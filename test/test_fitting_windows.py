@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Windows, curves and the conversion to a file: the fit uses the corrections of the compensator.
-"""
+"""Windows, curves and the conversion to a file: the fit corrects as the compensator does."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -76,12 +74,12 @@ def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng):
             bank_.step(stamp, float(gradient[k]))
         row = memory.at(stamp, float(board[k]), [float(g[k]) for g in gradients])
         if k % 100 == 99:
-            # The results differ by rounding only, as both add the same terms in another order.
+            # Grid and stream add the same terms in different orders, so they differ by rounding.
             np.testing.assert_allclose(on_grid[k], row, atol=1e-9)
 
 
 def test_columns_are_those_of_the_tracker(bags):
-    # The second route is a tracker with full memory that gets readings and samples as online.
+    # The expected columns come from a tracker that gets readings and samples as online.
     windows = windows_of(bags)
     spec = memory_of(bank())
     table = ColumnTable(bank(), spec, 20.0)
@@ -109,8 +107,7 @@ def test_columns_are_those_of_the_tracker(bags):
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # The lags here follow the tracker's estimates, those of the fit its readings, so that plays
-    # turn up to a part of a window apart.
+    # Lags follow estimates in the tracker, readings in the fit: plays reverse at other times.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
@@ -140,8 +137,7 @@ def test_sets_and_start_states_by_hand(bags):
 @pytest.mark.parametrize('name', ['board', 'case'])
 @pytest.mark.parametrize('is_stuck', [False, True])
 def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
-    # The thermometer falls silent in the first ramp, or repeats its value, and comes back late in
-    # the second.
+    # The thermometer is silent or repeats a value from the first ramp until late in the second.
     bag, start, stop = bags[0], 900.0, 2200.0
     readings = bag.temperatures[name]
     age = (readings.stamp_ns - bag.start_ns) * 1e-9
@@ -153,8 +149,7 @@ def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     message = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([message])
-    # A silent thermometer is missing after the time-out of 60 s, five intervals of 4 s, and a
-    # window. A constant reading is detected when the other thermometer changes.
+    # A silent thermometer is missing after the time-out of 60 s, 5 intervals, and a window.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])
@@ -165,7 +160,7 @@ def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
 
 
 def test_the_lag_of_a_column_moves_it_as_its_slope_says():
-    # The second route shifts the lags by a microkelvin, and evaluates the columns again.
+    # The expected derivatives are differences of columns with lags shifted by a microkelvin.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
     layout, table = Layout(spec), ColumnTable(columns, spec, 20.0)
@@ -202,8 +197,7 @@ def test_curves(bags, options, static, dynamic, is_shared):
     weight = np.linspace(0.0, 1.0, 9)
     columns = sets.columns(t, weight)
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    # Columns are 0 at the reference temperature, and those of the dynamic set in the static
-    # regime.
+    # At the reference temperature only the level of the dynamic set is not 0.
     nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):
         expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0
@@ -250,8 +244,7 @@ def states_of(windows, calibration):
 
 
 def test_the_file_corrects_as_the_regression(fitted):
-    # Curves, sets and linear columns of the fit give the correction by the calibration. Windows
-    # are means over a minute; powers of means differ from means of powers by some ppm at 1 K/min.
+    # Powers of means over a minute differ from means of powers by some ppm at 1 K/min.
     result, _ = fitted
     windows, calibration = result.fit.windows, result.calibration
     state, prior = result.fit.posterior.state, result.fit.posterior.prior
@@ -299,7 +292,7 @@ def test_sections_and_kelvins_by_hand(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # The kelvins of column t are its RMS; those of t^2 are its RMS over the largest slope, 2 t.
+    # `kelvins` of a column is its RMS over its largest slope: 1 for t, 2 t for t^2.
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

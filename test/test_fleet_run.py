@@ -64,7 +64,7 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(client, fl
     def tell(_n, _total, row):
         if row is None:
             return
-        # Both workers are fitting a unit when the first result arrives.
+        # Two workers are fitting a unit each when the first result arrives.
         if not collected:
             os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
         collected.append(str(row['name']))
@@ -92,14 +92,14 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(client, fl
     assert again.rows == result.rows
     assert contents(out / 'units') == before
 
-    # Changed bags under the same names are another test.
+    # A test whose bags have changed under the same names is fitted again.
     os.utime(fleet / 'A/good/01.mcap', ns=(0, 0))
     touched = fit_fleet(str(fleet), out, OPTIONS, client=client)
     assert touched.n_done == 1
     after = contents(out / 'units')
     assert {Path(name).parts[1] for name in before if before[name] != after[name]} == {'good'}
 
-    # An edited result is not accepted.
+    # A result whose calibration file was edited counts as missing.
     (out / 'units/B/exchanged').rename(out / 'units/B/other')
     (out / 'units/A/torn/calibration.yaml').write_text('edited')
     results = Results(out)
@@ -157,7 +157,7 @@ def test_an_interrupted_run_goes_on_where_it_was(client, tmp_path):
         fit_fleet(str(fleet), out, OPTIONS, client=client, tell=stop)
     assert not (out / 'fleet.csv').exists()
     assert len(list(out.rglob('result.json'))) == 1
-    # A unit whose files were being written at a power failure.
+    # The files of this unit were cut off as by a power failure.
     (out / 'units/A/u0').mkdir(parents=True, exist_ok=True)
     (out / 'units/A/u0/result.json').write_text('{"format": 1,')
     result = fit_fleet(str(fleet), out, OPTIONS, client=client)
@@ -171,7 +171,7 @@ def children_of(pid):
 
 
 def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
-    # WHY: each starting worker, and then Dask, printed a traceback.
+    # WHY: on Ctrl-C each starting worker, and then Dask, printed a traceback.
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
     words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
     process = subprocess.Popen(
@@ -180,7 +180,7 @@ def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
         stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
     pause = threading.Event()
-    # The first worker is a child of the fork server.
+    # Wait for the first worker, a child of the fork server.
     while not any(map(children_of, children_of(process.pid))):
         assert process.poll() is None
         pause.wait(0.01)
@@ -189,7 +189,7 @@ def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
     printed, _ = process.communicate(timeout=60)
     assert process.returncode == 130
     printed = printed.splitlines()
-    # Whether Dask had started a worker is random.
+    # Ctrl-C may come before or after the first test has begun.
     assert printed in (
         [f'thermo_comp: interrupted: {state}, kept in out; the same command continues']
         for state in ('no test has begun', '0 of 1 test done')
@@ -220,7 +220,7 @@ class TestScheduler:
         refused = str(fleet / 'B')
         result = fit_fleet(refused, tmp_path / 'out', OPTIONS, scheduler=address)
         assert [row['verdict'] for row in result.rows] == ['refused']
-        # A worker of another version could give another fit under the same key.
+        # A worker with another version of thermo_comp could give another result for the same test.
         monkeypatch.setattr('thermo_comp.fleet.work.__version__', '9.9')
         with pytest.raises(ThermoCompError, match=r'runs thermo_comp \d+\.\d+\.\d+, not 9\.9'):
             fit_fleet(refused, tmp_path / 'other', OPTIONS, scheduler=address)
@@ -325,7 +325,7 @@ def test_siblings_help_a_unit_that_lacks_data(client, tmp_path):
     assert contents(tmp_path / 'out' / 'units') == before
     assert [bool(row['prior']) for row in helped.rows] == [True, False, False, False]
     (before_row, *_), (row, *_) = alone.rows, helped.rows
-    # The error of one axis may be small by chance, so all three are judged together.
+    # The error of one axis may be small by chance, so all three axes are judged together.
     scale = np.array(siblings[0].scale_factor)
     errors, sds = (
         [np.array([float(one[name.format(axis)]) for axis in 'xyz']) for one in (row, before_row)]

@@ -138,7 +138,7 @@ class TestDiscovery:
         assert {one.name: list(one.bags) for one in units} == {
             'mems-0001': ['a.mcap', 'd.mcap'],
             'mems-0002': ['b.mcap', 'c.mcap'],
-            # The serial follows from the folder only; one bag cannot be opened at all.
+            # The folder names a unit whose bags have no serial; one bag cannot be opened at all.
             tmp_path.name: ['e.mcap'],
             'f.mcap': ['f.mcap'],
         }

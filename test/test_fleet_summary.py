@@ -30,7 +30,7 @@ def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
                 before = float(like[i][quantity.name])
                 sd = float(like[i][quantity.sd]) if quantity.sd else 0.0
                 per_unit = abs(before) * 1e-6 if quantity.by == 'ppm' else 1.0
-                # The difference of two tests of a unit is the noise of the second, see `sds`.
+                # Two tests of a unit differ by the noise of the second test alone.
                 cells[quantity.name] = before + noise * sd * per_unit
             elif quantity.by == 'ppm':
                 cells[quantity.name] = 300.0 * (1.0 + 1e-3 * noise)

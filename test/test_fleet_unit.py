@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A unit's fit equals that of one process, and accounts for each of its bags."""
+"""The fit of a unit equals a fit in one process, and accounts for each bag of the unit."""
 
 import json
 from dataclasses import replace
@@ -76,7 +76,7 @@ class TestRow:
         assert (row['problem'], row['left_out'], row['chosen']) == ('', '', '')
         assert (row['n_bags'], row['n_left_out'], row['n_positions']) == (6, 0, 6)
         calibration = parse_calibration(outcome.calibration.encode())
-        # The bias of x at the reference temperature in the row follows from the file.
+        # The row's bias of x must equal the bias computed from the calibration file.
         x = calibration.axes.x
         bias = (x.bias + calibration.static.x.delta) / x.scale_factor
         assert row['bias_x_ug'] == pytest.approx(bias / 9.80665e-6)

@@ -69,7 +69,7 @@ def test_array_gives_the_bits_of_floats(function):
 def test_slope_is_the_derivative(function, t):
     step = 1e-4
     t = min(max(t, -15.0 + step), 15.0 - step)
-    # Central difference: third derivative * step^2 / 6 of functions of order 1 over 10 K.
+    # The error of a central difference, third derivative * step^2 / 6, is below 1e-8.
     expected = (function.value(t + step) - function.value(t - step)) / (2.0 * step)
     assert function.slope(t) == pytest.approx(expected, abs=1e-8)
 
@@ -121,9 +121,7 @@ def test_what_is_not_finite_is_no_curve_of_a_set(bad):
 
 
 def slope_and_lag(variances):
-    """
-    Make a unit with a slope and a lag of 600 s, and variances of some parameters of its x axis.
-    """
+    """Make a unit with a slope and a lag of 600 s; `variances` of parameters of its x axis."""
     unit = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
@@ -136,12 +134,11 @@ def slope_and_lag(variances):
 
 
 def test_sd_by_hand():
-    # x: level and slope of the static bias, level and slope of the dynamic bias, weight of the
-    # lag; then static and dynamic level of the scale.
+    # Parameters of x: level and slope of both biases, weight of the lag, two levels of scale.
     unit = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     bias, scale = sd_of_states(unit, states)
-    # sqrt(4e-4 + 100 * 1e-6) counts, 300 of them per m/s^2, and 30 um/s^2 of unexplained residual.
+    # sqrt(4e-4 + 100 * 1e-6) counts at 300 counts per m/s^2, and a residual of 30 um/s^2.
     expected = np.sqrt([4e-4, 5e-4]) / 300.0
     assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
@@ -161,7 +158,7 @@ def test_what_is_known_has_no_sd():
 
 @pytest.mark.parametrize('rate', [0.01, -0.02])
 def test_ramp_is_what_the_memory_makes_of_one(rate):
-    # Second route: the memory of the fit goes through a ramp after a soak, second by second.
+    # The expected state comes from the memory of the fit, stepped through a ramp after a soak.
     unit = replace(rich_calibration(), board_lag_s=100.0)
     spec = Correction(unit).memory
     first = Layout(spec).width - 2 * len(spec.lags) - len(spec.plays)
@@ -175,10 +172,10 @@ def test_ramp_is_what_the_memory_makes_of_one(rate):
         if isinstance(quantity, Gradient):
             assert state[place] == pytest.approx(100.0 * rate)
         elif isinstance(quantity, Lag):
-            # The gradient is reached within a second of the 900, not at once.
+            # Here the gradient rises within the first of 900 s, in `ramp_states` at once.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # Half an hour would also push the play on the lag to its end.
+            # A play on the lag would reach its end only after half an hour.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 

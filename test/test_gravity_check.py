@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The gravity check: a good calibration passes, an aged one is reported, motion is neither."""
+"""The gravity check: a good calibration passes, an aged one is reported, motion is ignored."""
 
 import math
 
@@ -30,10 +30,10 @@ def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
 
 def test_residual_of_a_good_calibration_is_within_its_sd(rng):
     result = watch(rng)
-    # A window of 99 samples (0.98 s) has 0.2 mm/s^2 of noise; 30 of them 0.04.
+    # The mean of a window of 99 samples has a noise of 0.2 mm/s^2, of 30 windows 0.04 mm/s^2.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
-    assert result.n_windows == 59  # there is no earlier window to compare the first one with
+    assert result.n_windows == 59  # the first of 60 windows has no predecessor
     assert result.is_still
 
 
@@ -80,7 +80,7 @@ def test_what_steps_away_at_rest_is_refuted_within_a_second(rng, rate_hz, offset
 
 
 def test_what_moves_away_is_not_refuted_at_once(rng):
-    # A lift, whose acceleration grows over 0.8 s, and a car that starts and shakes.
+    # Not refused at once: a lift, accelerating over 0.8 s, and a car that starts and shakes.
     assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
 
@@ -89,7 +89,7 @@ def test_the_message_gives_the_deviation_now(rng):
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     watch(rng, seconds=40, bias=0.001, monitor=monitor)
     assert not monitor.is_refuted
-    # Time starts anew, so that windows are tested and not a step.
+    # The stamps start again at 0: this is a restart, not a step of |f|.
     result = watch(rng, seconds=8, bias=0.5, monitor=monitor)
     assert monitor.is_refuted
     assert result.residual == pytest.approx(0.5, abs=1e-3)

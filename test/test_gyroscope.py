@@ -61,7 +61,7 @@ def rms(values):
 
 @pytest.fixture(scope='module')
 def unit():
-    # For lags of minutes a reading every four seconds suffices, with a quarter of the work.
+    # A temperature every 4 s suffices for lags of minutes, and saves 3/4 of the time.
     return unit_preset('mems', 2).with_thermometers(rate_hz=0.25)
 
 
@@ -69,7 +69,7 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; no single column equals the drift of its gyroscope."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # Groups of heat flows alone have half of the columns, and take half of the time.
+    # Only groups of lags and heat flows: half of the columns, half of the time.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -99,8 +99,7 @@ def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
         assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
         assert rms(changes) < 1.15 * FLOOR
         assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
-        # The level contains a turn-on of 2 mdeg/s and the Earth's rate, which cannot be separated,
-        # so it must be within the claimed sd of the bias plus the Earth's rate.
+        # The mean rate (turn-on, Earth's rate) is within 3 sd of claim and Earth's rate together.
         message = gyroscope.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
         claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
         assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
@@ -133,7 +132,7 @@ def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
         with_rate.calibration, gyroscope=None, provenance=without.calibration.provenance
     )
     assert same == without.calibration
-    # A bag with an invalid rate at rest has no rate.
+    # A bag with NaN rates at rest counts as a bag without rates.
     broken = [np.array(record.angular_rate) for record in records]
     broken[0][len(broken[0]) // 2 :] = np.nan
     sources = [
@@ -173,7 +172,7 @@ def test_file_and_triad_round_trip():
     np.testing.assert_array_equal(scale, 1.0)
     sd_bias, sd_scale = sd_of_states(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
-    # At the reference the bias is its level, and its variance that of level and turn-on.
+    # At the reference temperature the bias is the level, its variance that of level plus turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     np.testing.assert_allclose(
         sd_bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5
@@ -207,7 +206,7 @@ def test_a_file_is_refused_by_key():
 
 
 def test_the_rate_is_corrected_by_hand_numbers():
-    # At the reference without response only the constant remains; the force is unaffected.
+    # At the reference temperature the rate gets its constant bias, the force no correction.
     triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (triad, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))
@@ -256,14 +255,13 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     assert judged.exit_code == 0
     for name in ('static', 'dynamic', 'all'):
         section = rate.sections[name]
-        # The claimed sd is above the noise, and larger than necessary as lags have an unknown
-        # start.
+        # The claimed sd exceeds the noise, because the initial states of the lags are unknown.
         assert 0.7 < section.ratio < 1.2
         assert section.rms < 1.3 * FLOOR
         assert section.raw_rms > 50.0 * FLOOR
     assert judged.facts()['angular_rate']['reason'] == rate.reason
     assert 'angular rate: valid: 0.' in str(rate)
-    # A gyroscope of another unit is detected, also one without covariance.
+    # A gyroscope of another unit is detected, also if it states no covariance.
     gyro = calibration.gyroscope
     other = replace(gyro, response=(), static=gyro.dynamic, dynamic=gyro.dynamic, posterior=None)
     wrong = judge_bags(short, replace(calibration, gyroscope=other))
@@ -271,7 +269,7 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     assert wrong.rate.kind is Verdict.RECALIBRATE
     assert wrong.exit_code == 1
     assert judge_bags(short, replace(calibration, gyroscope=None)).rate is None
-    # A calibration without covariance, as an import, is not refuted.
+    # A gyroscope calibration without covariance, as after an import, gives no verdict.
     silent = replace(other, residual_sd_rad_s=(0.0, 0.0, 0.0))
     unknown = judge_bags(short, replace(calibration, gyroscope=silent))
     assert unknown.rate.kind is Verdict.NO_CLAIM

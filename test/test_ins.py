@@ -12,8 +12,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.mark.parametrize('axis', [0, 1])
 def test_a_bias_makes_schuler_s_oscillation(axis):
-    # A bias b of a level axis that begins after levelling gives the position error
-    # b R / g (1 - cos(w t)), w^2 = g / R.
+    # A bias b after levelling gives the position error b R / g (1 - cos(w t)), w^2 = g / R.
     bias, dt, minutes = 1e-4, 0.5, 84
     force = G * UP
     force[axis] += bias
@@ -24,7 +23,7 @@ def test_a_bias_makes_schuler_s_oscillation(axis):
         if k % 1200 == 0:
             angle = omega * k * dt
             expected = bias / omega**2 * (1.0 - np.cos(angle))
-            # One integration step; the amplitude is 130 m.
+            # Tolerance: the change of the position in an integration step; the amplitude is 130 m.
             assert navigator.position[axis] == pytest.approx(expected, abs=0.1)
             speed = bias / omega * np.sin(angle)
             assert navigator.velocity[axis] == pytest.approx(speed, abs=1e-4)
@@ -44,7 +43,7 @@ def test_levelling_makes_the_force_vertical(rng):
 
 
 def test_the_sigma_is_that_of_white_noise(rng):
-    # In a third of Schuler's period the error is noise of levelling and integrated noise.
+    # Expected sd of the position: Schuler oscillation of the levelling, plus integrated noise.
     density, dt = 1e-4, 0.5
     force = G * UP + rng.normal(0.0, density / np.sqrt(dt), (40_000, 3))
     free = fly(Model(force, density, 0.0), dt, UP, G, 0.0)
@@ -53,12 +52,12 @@ def test_the_sigma_is_that_of_white_noise(rng):
     by_integration = density**2 * (T / 2.0 - np.sin(2.0 * omega * T) / (4.0 * omega)) / omega**2
     expected = np.sqrt(2.0 * (by_levelling + by_integration))
     assert free.sigma[-1, 0] == pytest.approx(expected, rel=0.01)
-    # about eight of the 298 flights are independent
+    # only about eight of the 298 overlapping flights are independent
     assert 0.5 < np.sqrt(np.mean(free.position[-1] ** 2)) / expected < 1.5
 
 
 def test_updates_find_a_bias_that_levelling_has_not_seen():
-    # After 25 minutes of ZUPT little is left of an error at the start of the flight.
+    # A bias of 1e-3 m/s^2 appears after levelling; 25 minutes of ZUPT must remove most of it.
     dt, n_align = 0.5, 600
     force = np.tile(G * UP, (n_align + 3600 + 1, 1))
     force[n_align:, 0] += 1e-3
@@ -66,5 +65,5 @@ def test_updates_find_a_bias_that_levelling_has_not_seen():
     free = fly(Model(force, 1e-4, 1e-3), dt, UP, G, 0.0)
     assert free.position[-1, 0] > 1000.0
     coasted = message.position[-1, 0] - message.position[2999, 0]
-    # Without ZUPT the same five minutes would give 45 m.
+    # Without ZUPT a bias of 1e-3 m/s^2 would give 45 m in five minutes.
     assert abs(coasted) < 4.5

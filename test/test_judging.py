@@ -101,8 +101,7 @@ CLAIMING = corrected_by(SLOPE, 1e-5)
 class TestWindows:
     @pytest.mark.parametrize('reading_s', [30, 50])
     def test_a_slow_thermometer_leaves_all_windows(self, tmp_path, reading_s):
-        # WHY: at 2 Hz a sum lasts 20 s. It was dropped as a stamp that leaps ahead if no reading
-        # was within 15 s: `evaluate` found no window where `replay` corrected each sample.
+        # WHY: at 2 Hz, sums of 20 s without a temperature in 15 s were dropped as leaps of time.
         bag = resting(tmp_path / 'bag', 30.0, minutes=30.0, rate_hz=2.0, reading_s=reading_s)
         windows = judged(bag, corrected_by(SLOPE)).windows
         assert len(windows) >= 28
@@ -114,7 +113,7 @@ class TestWindows:
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
         judgements = evaluate([bag], models).judgements
         drift = SLOPE * 10.0 / K
-        # The estimate of a steady temperature is exact to 1e-7 K, which are 1e-9 m/s^2.
+        # The estimate of a constant temperature is exact to 1e-7 K, an error of 1e-9 m/s^2.
         for name, expected in (('right', 0.0), ('half', drift / 2)):
             windows = judgements[name].windows
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
@@ -122,7 +121,7 @@ class TestWindows:
             np.testing.assert_allclose(windows.board, 30.0, rtol=0.0, atol=1e-6)
 
     def test_a_window_is_the_mean_of_what_the_node_publishes(self, tmp_path):
-        # A ramp of 1 K/min, in which a wrong time or reading would show.
+        # In this ramp of 1 K/min a wrong time or reading would change the correction.
         bag = resting(tmp_path / 'bag', (15.0, 33.0), minutes=18.0, noise=0.2)
         unit = corrected_by(SLOPE)
         windows = judged(bag, unit).windows
@@ -134,13 +133,13 @@ class TestWindows:
         for start_ns, mean in zip(windows.start_ns, windows.force, strict=True):
             inside = (stamps >= start_ns) & (stamps < start_ns + 60 * 10**9)
             assert inside.sum() == 600
-            # The correction is linear over ten seconds: accurate to a thousandth of a micro-g.
+            # A window is corrected along lines of 10 s, accurate to a thousandth of a micro-g.
             np.testing.assert_allclose(mean, force[inside].mean(axis=0), atol=1e-8)
 
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
     @pytest.mark.parametrize('window_s', [60.0, 120.0])
     def test_windows_are_as_long_as_stated(self, tmp_path, rate_hz, window_s):
-        # WHY: 32 samples at 4 Hz are 8 s, and "ten seconds" were sixteen.
+        # WHY: cells of 32 samples at 4 Hz are 8 s long, so windows of "ten seconds" had sixteen.
         bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
         windows = judged(bag, calibration(), window_s=window_s).windows
         assert windows.window_s == window_s
@@ -161,11 +160,11 @@ class TestWindows:
         assert not inside.any()
         assert len(windows) >= 55
         assert np.unique(windows.position).tolist() == [0, 1]
-        # 0.3 counts of noise over 100 samples are 0.1 mm/s^2 per window.
+        # A noise of 0.3 counts, averaged over 100 samples, is 0.1 mm/s^2 per window.
         assert np.sqrt(np.mean(windows.residual**2)) < 3.0 * 0.3 / K / 10.0
 
     def test_noise_is_claimed_as_it_is(self, tmp_path):
-        # White noise of sd 0.3 counts at 10 Hz, which the calibration states.
+        # The calibration states the bag's white noise: an sd of 0.3 counts at 10 Hz.
         density = 0.3 / K * np.sqrt(0.1)
         unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
         knows = calibration(unit=unit, noise_density_m_s2_sqrt_hz=(density,) * 3)
@@ -243,8 +242,8 @@ class TestVerdict:
     @pytest.mark.parametrize(
         ('residual', 'raw', 'claimed', 'verdict'),
         [
-            (90.0, 1000.0, 10.0, 'valid'),  # nine times its claim, but within the tolerance
-            (110.0, 1000.0, 200.0, 'recalibrate'),  # as claimed, but beyond the tolerance
+            (90.0, 1000.0, 10.0, 'valid'),  # 9 times the claimed sd, within the tolerance
+            (110.0, 1000.0, 200.0, 'recalibrate'),  # within the claimed sd, beyond the tolerance
             (90.0, 1000.0, 200.0, 'valid, but it only claims 200 ug'),
             (90.0, 80.0, 60.0, 'no better than raw'),
         ],
@@ -255,8 +254,7 @@ class TestVerdict:
         assert '100 ug tolerated' in judgement.reason
 
     def test_headline_of_seen_windows_is_what_was_left_out(self):
-        # WHY: a fit left 59 ug in sample, 61 ug held out in the same positions, 1091 ug in a new
-        # attitude.
+        # WHY: a fit left 59 ug in sample, 61 ug held out in its attitudes, 1091 ug in a new one.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -267,7 +265,7 @@ class TestVerdict:
         assert seen.reason.startswith(
             '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
         )
-        # The claimed sd is that of the fitted positions; the tolerance applies to a new attitude.
+        # Claims refer to the error in sample, tolerances to the error of left-out positions.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
@@ -330,11 +328,10 @@ class TestVerdict:
         _, upper = CLAIMING.static.temperature_range_c
         judgement = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
         assert judgement.kind is Verdict.OUTSIDE
-        # WHY: windows outside the calibrated rates alone were said to lie `at 6.7 to 29.0 degC`,
-        # without the rates and without the calibrated ranges.
+        # WHY: of windows outside the calibrated rates the message named only temperatures.
         assert '+0.00 K/min; calibrated at 5.0 to 35.0 degC and -1.00 to +1.00' in judgement.reason
         assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in judgement.reason
-        # Noise of the thermometer does not put a soak at the edge of the range outside of it.
+        # A soak 0.01 K beyond the range counts as inside: the thermometer's noise may cause this.
         edge = judged(resting(tmp_path / 'edge', upper + 0.01), CLAIMING)
         assert edge.sections['outside'].n == 0
 
@@ -355,8 +352,7 @@ class TestShifts:
     @pytest.mark.parametrize('n', [6, 18])
     def test_what_moved_is_named(self, n):
         moved = around(n, (20.0 * MICRO_G, 0.0, 0.0), (0.0, 30e-6, 0.0), noise=0.5 * MICRO_G)
-        # The noise of a window, half a micro-g, gives a claim of 2 ug with 12 windows per
-        # position.
+        # 12 windows per position with 0.5 ug of noise determine shifts far below 20 ug and 30 ppm.
         judgement = judge(moved, corrected_by(SLOPE, 1e-5), None)
         assert judgement.n_positions >= min(n, 12)
         assert judgement.shifts[0].bias / MICRO_G == pytest.approx(20.0, abs=1.0)
@@ -387,12 +383,7 @@ class TestShifts:
 
 
 def test_thermometers_in_doubt_are_told_offline_too(root, tmp_path):
-    """
-    WHY: replay did not report exchanged thermometers, and evaluate called them valid.
-
-    WHAT: replay and evaluate print the node's message and give no verdict, nor outside the
-    calibrated range.
-    """
+    """Exchanged thermometers, or a temperature outside the calibrated range, give no verdict."""
     exchanged = Topics(board='temperature/case', case='temperature/board')
     for topics, text in ((Topics(), []), (exchanged, [SWAPPED])):
         bag = root / 'bags' / 'held_out.mcap'

@@ -37,7 +37,7 @@ def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
 
 
 def test_changes_and_their_sd_by_hand():
-    # The later calibration is given first, but dates decide. Sd of 3 and 4 ug make 5.
+    # The later calibration is given first, but dates decide. Sd of 3 and 4 ug combine to 5 ug.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
     assert [drift.constant for drift in drifts] == [
         *('bias x', 'bias y', 'bias z', 'scale x', 'scale y', 'scale z')
@@ -117,7 +117,7 @@ def test_evaluate_and_report_agree(cli, folder, options):
         assert ours[name] == theirs[name], name
     assert printed.returncode == other.returncode == (0 if ours['is_valid'] else 1)
     assert ours['window_s'] == float(options[3] if options else 60)
-    # The page shows the same figures, with the same length of windows.
+    # The report's page shows the figures of `evaluate`, for windows of the same length.
     text = page.read_text(encoding='utf-8')
     assert f'means over {ours["window_s"]:g} s' in text
     assert ours['verdict'].replace(' ug', ' µg') in text

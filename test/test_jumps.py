@@ -28,15 +28,13 @@ def test_jump_along_gravity(rng, with_gyro):
     rest = Rest(rng)
     rest.add((2.0 * MG, 0.0, 20.0 * MG), from_s=301.0)
     (event,) = look(rest, with_gyro=with_gyro)
-    # The jump is located by the single sample between the levels.
+    # The jump happens within one sample interval, which `find_jumps` locates.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # Samples of 3 mg for 10 s at 25 Hz on each side of the step determine the step, with a free
-    # drift, to 2 * 3 mg * sqrt(2 / 250) = 0.5 mg; the tolerance is 4 sd.
+    # 250 samples of 3 mg on each side determine a step to 2 * 3 mg * sqrt(2 / 250); 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
-    # The board keeps cooling; 20 readings of 20 mK on each side determine its step to 2 * 0.02 *
-    # sqrt(2 / 20).
+    # 20 readings of 20 mK on each side determine a jump to 2 * 0.02 * sqrt(2 / 20).
     assert event.temperature_change_sd == pytest.approx(0.0126, rel=0.4)
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 
@@ -113,7 +111,7 @@ def test_drift_with_temperature_is_no_step(rng):
 
 
 def behind_a_low_pass(rng, rest, tau_s, sd):
-    """Replace the noise by first-order noise with this time constant and standard deviation."""
+    """Replace the noise by first-order noise with time constant `tau_s` and sd `sd`."""
     r = np.exp(-1.0 / (rest.rate_hz * tau_s))
     white = sd * np.sqrt(1.0 - r * r) * rng.standard_normal(rest.accel.shape)
     rest.accel[:] = np.array(rest.level) + lfilter([1.0], [1.0, -r], white, axis=0)
@@ -121,8 +119,7 @@ def behind_a_low_pass(rng, rest, tau_s, sd):
 
 @pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0, 3.0])
 def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
-    # WHY: phones filter their samples; a rest of ten minutes became 8 .. 37, many with a supposed
-    # jump, because the variance of a mean was computed for independent samples.
+    # WHY: filtered samples of phones counted as independent: a rest was cut into 8 .. 37 rests.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
     bag = reduce_source(rest.source(), full_scale=None)
@@ -134,7 +131,7 @@ def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
 def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
-    # WHY: in such noise means over 10 s determine a level to 3 mg, so jumps of 20 mg were missed.
+    # WHY: coloured noise of 3 mg remains in means over 10 s: jumps of 20 mg were missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)

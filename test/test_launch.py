@@ -16,8 +16,7 @@ FILES = sorted((ROOT / 'launch').glob('*.launch.xml'))
 OURS = ROOT / 'launch' / 'thermo_comp.launch.xml'
 BESIDE = ROOT / 'launch' / 'beside_ins.launch.xml'
 
-# Parameters that the example sets in packages by others, from their sources for Jazzy. Nodes of
-# other packages ignore a misspelt parameter silently, so the spelling is tested here.
+# Nodes of other packages ignore a misspelt parameter: the names are from sources of Jazzy.
 OTHERS = {
     ('tf2_ros', 'static_transform_publisher'): set(),
     ('imu_filter_madgwick', 'imu_filter_madgwick_node'): {

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rooms import from lower layers only, and each heavy library is imported in one room only."""
+"""Packages import from lower layers only; each heavy library is imported in one package only."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from conftest import ran
 
 PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
 
-# One line per room (a folder, or a module in the package's root). A room that is missing here
-# fails the test, so that its layer must be decided.
+# One line per package: a folder, or a module in the root. Each package needs a line.
 LAYERS = {
-    '__init__': 0,  # public names, for type checkers
+    '__init__': 0,  # public names, imported for type checkers
     'errors': 0,
     'typing': 0,
     'files': 0,
@@ -43,7 +42,7 @@ LAYERS = {
     '__main__': 6,
 }
 
-# Rooms that may import a library. Any room may import a library that is missing here.
+# Packages that may import a library; other libraries may be imported anywhere.
 ROS = ['rclpy', 'rcl_interfaces', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs']
 HOMES = {
     **{name: {'ros'} for name in ROS}, 'rosgraph_msgs': {'ros'}, 'builtin_interfaces': {'ros'},
@@ -136,9 +135,7 @@ def own_file(name):
 
 
 def circle(uses):
-    """
-    Remove the leaves of a graph repeatedly; return the rest, which is empty without a circle.
-    """
+    """Remove the leaves of a graph repeatedly; return the rest, empty if there is no circle."""
     while True:
         leaves = {file for file, targets in uses.items() if not targets & uses.keys()}
         if not leaves:
@@ -148,8 +145,7 @@ def circle(uses):
 
 @pytest.mark.parametrize('by', ['room', 'file'])
 def test_no_circle(by):
-    # Within a layer a room may use another, but not mutually, and no two files may use each other.
-    # Imports for type annotations do not count.
+    # Neither two packages nor two files may import each other, except for type annotations.
     uses = {}
     for path in SOURCES:
         text = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)
@@ -169,8 +165,7 @@ def loaded_after(statement, *watched):
 
 
 def test_node_starts_without_the_offline_libraries():
-    # The node runs on the robot's computer for weeks: libraries for fits or plots would cost
-    # memory and start-up time.
+    # Libraries for fits or plots would cost the node memory and start-up time.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     offline = ('rosbags', 'mcap', 'matplotlib', 'scipy', 'scipy.optimize', 'typer', 'rich')
     assert loaded_after('import thermo_comp.ros.node', *offline) == []

@@ -93,7 +93,7 @@ def test_foxglove_paths_lead_to_numbers(topics):
         else:
             assert field_kind(topics[topic], fields) in ('float64', 'bool')
         used.add(topic)
-    # The stamped flag equals the plain flag; a viewer shows either at its time.
+    # `regime/stamped` has the same flags as `regime/dynamic`, and viewers show both at one time.
     assert used == {output, *topics} - {'/regime/stamped'}
 
 
@@ -147,9 +147,8 @@ def test_plotjuggler_splitters_count_what_they_hold():
 @pytest.mark.parametrize(
     ('name', 'expected'),
     [
-        # T = 20 + 0.5 m + 0.01 m^2 with m in minutes: at m = 60 its rate is 1.7 K/min; two lags of
-        # 30 s earlier it is 1.68 (within the sampling of the lags at 1 Hz); its second derivative
-        # is 0.02.
+        # T = 20 + 0.5 m + 0.01 m^2 with m in minutes: the rate is 1.7 K/min at 60 min, and 1.68 as
+        # delayed by two lags of 30 s (sampled at 1 Hz); the second derivative is 0.02.
         ('/thermo_comp/board_k_min', 1.68),
         ('/thermo_comp/case_k_min', 1.68),
         ('/thermo_comp/case_k_min2', 0.02),

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The thermal memory against closed forms: lags of ramps and steps, loops of plays, unknown starts.
-"""
+"""The thermal memory against closed forms: lags of ramps and steps, plays, unknown starts."""
 
 import math
 
@@ -26,8 +24,7 @@ TAUS = (60.0, 900.0, 7680.0)
 
 @pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
 def test_a_lag_of_a_ramp(step_s):
-    # A ramp u = r t from rest gives u - L = r tau (1 - exp(-t / tau)) for any reading interval, as
-    # the input is linear between readings.
+    # A ramp u = r t from rest gives u - L = r tau (1 - exp(-t / tau)) for any interval.
     rate, n = 0.01, 200
     bank = LagBank(TAUS)
     for k in range(n + 1):
@@ -61,7 +58,7 @@ def test_a_value_at_the_same_stamp_replaces_the_last_one():
 def test_what_is_not_known_of_a_lag():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
-    # 50 s without a reading are more than a tenth of 100 s, not of 1000 s.
+    # A gap of 50 s is more than a tenth of the time constant 100 s, but not of 1000 s.
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
@@ -139,7 +136,7 @@ def test_a_part_between_board_and_sensor(rng):
     # An error of the case's lag moves the part in the opposite direction.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
-    # A part with two inputs starts unknown at the first value of the later input.
+    # The unknown initial state of a part of two inputs begins with the later first value.
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)
@@ -147,7 +144,7 @@ def test_a_part_between_board_and_sensor(rng):
 
 
 def test_the_unknown_start_of_a_lag_of_two_stages(rng):
-    # The board is in a long random walk, and then stands still.
+    # The board temperature walks at random for 90 min, then is constant.
     D, step, n = 0.005, 6.0, 4000
     tau = np.array([900.0, 150.0])
     parts = np.zeros((n, 2))
@@ -157,7 +154,7 @@ def test_the_unknown_start_of_a_lag_of_two_stages(rng):
         parts[:, 0] *= math.exp(-step / tau[0])
         parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
     P = start_covariance([TWO_STAGES])
-    # A variance from n draws has a relative sd of sqrt(2 / n) = 2.2 %; a step is 4 % of 150 s.
+    # Variances from n draws scatter by sqrt(2 / n) = 2.2 %; the step of 6 s is 4 % of 150 s.
     assert np.mean(parts[:, 1] ** 2) == pytest.approx(P[0, 0], rel=0.11)
     for age in (150.0, 900.0, 2700.0):
         first = parts[:, 0] * math.exp(-age / tau[0])
@@ -172,7 +169,7 @@ def test_a_second_stage_adds_the_errors_of_both():
     memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
-    # At most (900 + 150) / (900 - 150), if the errors of both stages had opposite signs.
+    # Factor 1.4 = (900 + 150) / (900 - 150): the errors of the two stages may have opposite signs.
     assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
 
 
@@ -181,8 +178,7 @@ def plays(*widths):
 
 
 def test_the_loop_of_a_play():
-    # A play of half-width 1 is v - 1 while v rises, v + 1 while v falls, and constant over 2 K
-    # after each reversal.
+    # A play of half-width 1 is v - 1 if v rises, v + 1 if v falls, constant for 2 K in between.
     memory = plays(1.0)
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []
@@ -205,7 +201,7 @@ def test_a_play_on_a_lag_follows_the_lag():
     lagged = 23.6 - 0.002 * 900.0 * -math.expm1(-2.0)
     state = memory.at(1800 * SECOND_NS, 23.6, [0.0])
     assert 23.6 - state[0] == pytest.approx(lagged)
-    # The play was pushed up from 20, and ends 0.4 K below the lagged temperature.
+    # The lagged temperature rises from 20 degC, so the play follows 0.4 K below it.
     assert lagged - 20.0 > 0.4
     assert state[2] == pytest.approx(-0.4)
 
@@ -234,7 +230,7 @@ def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
         e = np.exp(-step / tau)
         m = m * e + walk * (tau / step) * (1.0 - e)
     P = start_covariance([('board', t) for t in tau])
-    # A variance from n draws has a relative sd of sqrt(2 / n) = 2.2 %; a step is a tenth of 60 s.
+    # Variances from n draws scatter by sqrt(2 / n) = 2.2 %; the step of 6 s is 10 % of 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
 
 

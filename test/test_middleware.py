@@ -100,7 +100,7 @@ def wakes_per_sample(peer, drivers, node_arguments):
     """Run the node with a reliable subscriber; count the wake-ups of its event thread."""
     with NodeProcess(*node_arguments) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
-        # One driver for all nodes, as samples of two sources are not published.
+        # All nodes get the same driver, because a node ignores a topic with two publishers.
         drivers[:] = drivers or [Driver(peer)]
         first = 0
         while not heard:
@@ -115,21 +115,19 @@ def wakes_per_sample(peer, drivers, node_arguments):
 
 
 def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, monkeypatch):
-    # The user's profile leaves Fast DDS at its default: an event is due with each sample, or with
-    # the first of several that a busy machine handles together.
+    # By the user's profile Fast DDS has a timed event with each sample, or group of samples.
     other = tmp_path / 'other.xml'
     other.write_text(OTHER)
     monkeypatch.setenv(VARIABLE, str(other))
     drivers = []
     by_default = wakes_per_sample(peer, drivers, node_arguments)
-    # With the node's profile an event is due 50 times a second, not with each of 700 samples.
+    # With the node's profile timed events are due 50 times, samples 700 times a second.
     monkeypatch.delenv(VARIABLE)
     assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
 
 
 def test_what_is_lost_on_the_way_is_repeated(peer, node_arguments, monkeypatch):
-    # The receiver is stopped while twice as many samples are sent as its shared memory queue holds
-    # (512).
+    # The receiver is stopped during twice as many samples as its shared memory holds (512).
     monkeypatch.delenv(VARIABLE, raising=False)
     command = [sys.executable, '-c', RECEIVER]
     with (
@@ -158,7 +156,7 @@ def test_what_is_lost_on_the_way_is_repeated(peer, node_arguments, monkeypatch):
 
 def test_where_the_profile_comes_from(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    # The previous setting is restored at the end.
+    # A profile that the user has set stays.
     monkeypatch.setenv(VARIABLE, 'mine.xml')
     use_profile()
     assert os.environ[VARIABLE] == 'mine.xml'

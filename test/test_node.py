@@ -92,8 +92,7 @@ def test_imu_input_with_frame_and_switch_of_the_input(peer, saved):
         assert heard[0].orientation == sent.orientation
         assert heard[0].orientation_covariance.tolist() == sent.orientation_covariance.tolist()
         assert heard[0].linear_acceleration.z == pytest.approx(0.4, rel=1e-12)
-        # Vectors are counts for a calibration in counts; the node switches the input while it
-        # runs.
+        # While it runs, the node changes from Imu messages in m/s^2 to vectors of counts.
         assert 'unit.input: must be' in peer.set_atomically(input='counts').reason
         file = saved(calibration())[1].removeprefix('calibration_file:=')
         both = peer.set_atomically(input='counts', frame_id='', calibration_file=file)
@@ -133,7 +132,7 @@ def test_flag_is_latched_and_not_there_while_unknown(peer, saved):
         late = peer.listen(Bool, 'regime/dynamic', LATCHED)
         peer.wait_for(lambda: late, 'the latched flag')
         assert not late[0].data
-        # The flag with the stamp of the deciding reading is latched, too.
+        # `regime/stamped`, the flag with the stamp of the deciding reading, is latched, too.
         latched = peer.listen(DiagnosticArray, 'regime/stamped', LATCHED)
         # A late subscriber gets the latched messages, the newest last.
         peer.wait_for(
@@ -179,12 +178,11 @@ def test_diagnostics_name_what_is_wrong(peer, saved):
         assert (values['samples in'], values['samples out']) == ('4', '1')
         assert values['sample stamp [ns]'] == str(stamp_ns)
         assert [m.linear_acceleration.x for m in heard] == [1.0 / 300.0]
-        # The level is ERROR only while the saturation lasts.
+        # After the saturation the report no longer mentions it.
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
         driver.counts(stamp_ns + CYCLE_NS, 1.0, 2.0, 3.0)
-        # A stamp that is more than a second older is a jump of time; one slightly older is out of
-        # order.
+        # A stamp older by over 1 s is a jump of time, a less old stamp is out of order.
         driver.counts(stamp_ns - 5, 1.0, 2.0, 3.0)
         _, status, _ = wait(lambda s, _: 'out of order' in s.message)
         driver.counts(START_NS - 10 * SECOND_NS, 1.0, 2.0, 3.0)
@@ -199,7 +197,7 @@ def test_diagnostics_tell_noise_and_bias_apart(peer, saved):
         driver.counts(START_NS + 1, *standing(0))
         _, _, values = wait(lambda _, values: values['samples out'] == '1')
         for axis in 'xyz':
-            # What an INS needs in addition to the covariance: noise density and bias sd.
+            # An INS needs noise density and bias sd in addition to the covariance.
             density, whole, bias = (
                 float(values[f'{name} {axis} {of}'])
                 for name, of in (
@@ -215,7 +213,7 @@ def test_diagnostics_tell_noise_and_bias_apart(peer, saved):
             assert bias > 0.0
             of_rate = float(values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'])
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
-            # The regime is unknown: the two sets of the gyroscope differ by about 30 urad/s.
+            # In an unknown regime the bias sd contains the sets' difference, about 30 urad/s.
             assert 1e-5 < float(values[f'bias sd of rate {axis} [rad/s]']) < 1e-3
 
 
@@ -236,7 +234,7 @@ def test_a_case_is_missed_only_by_a_calibration_that_knew_one(peer, saved, was_f
 
 def test_diagnostics_of_temperatures(peer, saved):
     wait = diagnosis(peer)
-    # The terms are of a fit to forces below 1 g.
+    # The nonlinear terms of this unit were fitted to forces below 1 g.
     unit = replace(thermal_calibration(), nonlinearity=Nonlinearity((1.0, 5.0), 1e-4))
     with node_in_thread(*saved(unit, 'temperature_timeout:=20', 'case_timeout:=10')) as node:
         driver = drive(peer, node)
@@ -271,9 +269,9 @@ def test_constants_need_no_thermometer(peer, saved):
         for k in range(20):
             driver.counts(START_NS + k * CYCLE_NS, *standing(k))
         _, status, values = wait(lambda _, values: values['samples out'] == '20')
-        # The report and the samples come on different topics, in any order.
+        # The report may arrive before the last samples, which come on another topic.
         peer.wait_for(lambda: len(heard) == 20)
-    # 100 samples a second as calibrated, but sent at once: their number per report depends on DDS.
+    # Samples are sent at once, so the rate in the report depends on DDS and may cause a warning.
     assert 'not corrected for temperature' in status.message or 'samples/s' in status.message
     assert status.level != DiagnosticStatus.ERROR
     assert (values['board age [s]'], values['board temperature sd [K]']) == ('inf', '10.0000')
@@ -314,7 +312,7 @@ def test_namespace_and_remapping(peer, saved):
         assert '/accel/counts' not in topics
         names = {name for name, _ in node.node.get_service_names_and_types()}
         assert '/imu0/thermo_comp/set_parameters' in names
-        # Two units have two entries, both in the aggregator's group.
+        # Two nodes give two diagnostic entries in the group of the aggregator's configuration.
         _, status, _ = diagnosis(peer)(lambda *_: True)
         assert status.name == '/imu0/thermo_comp: compensation'
         config = ROOT / 'config' / 'diagnostic_aggregator.yaml'

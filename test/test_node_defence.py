@@ -85,7 +85,7 @@ def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
             assert result.reason == one_line(result.reason)
             assert len(result.reason) < 10_000, message.name[:60]
         samples.go_on()
-        # A bad value among good ones: all good ones are set, or none.
+        # If one value of a request is bad, all other values are set, or none of them.
         good = Parameter('frame_id', value='body').to_parameter_msg()
         answer = peer.call(kind, name, kind.Request(parameters=[STRANGE[1], good]))
         config = node._config
@@ -128,7 +128,7 @@ def test_questions_of_any_length_are_answered(peer, unit, kind, field):
 
 
 def test_a_callback_that_fails_is_logged_counted_and_survived(peer, unit):
-    # WHY: the class of fault: unexpected failures in a service, a call or the relay itself.
+    # WHY: an unexpected exception in a service, a timer or the relay must not end the node.
     with node_in_thread(*node_arguments(unit)) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)

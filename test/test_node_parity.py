@@ -39,12 +39,7 @@ def _collected():
 
 
 def thermal_test(path, imu=False, has_case=True):
-    """
-    Write a soak, a ramp and a soak with late readings; return the number of samples.
-
-    A late reading has an earlier stamp than the samples before it in the bag, so that only a node
-    that keeps the order of arrival gives the result of the replay.
-    """
+    """Write a soak, a ramp, a soak with late temperatures; return the number of samples."""
     rng = np.random.default_rng(11)
     n = MINUTES * 60 * RATE_HZ
     stamps = START_NS + np.arange(1, n + 1) * (1_000_000_000 // RATE_HZ)
@@ -100,7 +95,7 @@ def assert_same(live, offline):
     assert expected.imu is not None
     for name in ImuColumns._fields:
         assert getattr(out.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
-    # The k-th flag belongs to the k-th case reading: equal flags mean equal switch times.
+    # Each case reading gives a flag, so equal lists of flags mean equal times of the switches.
     assert (len(flags), flags) == (len(expected_flags), expected_flags)
     assert False in flags
     assert True in flags
@@ -123,7 +118,7 @@ def run(calibration, bag, folder, *node_args, **keys):
 def test_counts(tmp_path):
     n = thermal_test(tmp_path / 'bag')
     unit = replace(rich_calibration(), unit=UNIT)
-    # All samples after the first board temperature, which is not late.
+    # The first board temperature arrives in time, so every sample is corrected.
     assert run(unit, tmp_path / 'bag', tmp_path) == n
 
 
@@ -149,7 +144,7 @@ def test_imu_in_another_frame(tmp_path):
     published, _, _ = output_of(tmp_path / 'live.mcap')
     given = given.imu.take(np.flatnonzero(np.isin(given.accel_stamp_ns, published.accel_stamp_ns)))
     is_rate = given.angular_velocity_covariance[:, 0] != -1.0
-    # An existing rate is corrected, a missing one passes unchanged.
+    # The node corrects an existing angular rate and passes a missing rate unchanged.
     moved = np.abs(published.imu.angular_velocity - given.angular_velocity)
     assert moved[~is_rate].max() == 0.0
     # The biases of `rich_gyroscope` at the reference temperature are 10 mrad/s and more.

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The node as a process: its calibration is changed through the real services while samples flow.
-"""
+"""The node as a process: its calibration changes through ROS services while samples flow."""
 
 import sys
 import threading
@@ -101,7 +99,7 @@ def test_reload_while_samples_flow(peer, tmp_path):
         (value,) = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert value.string_value == str(second)
 
-        # A file with other parameters: all are set, or none.
+        # A file set together with other parameters: all are applied, or none.
         result = peer.set_atomically(transition_time=5, calibration_file=str(broken))
         assert not result.successful
         result = peer.set_atomically(transition_time=5, calibration_file=str(tmp_path / 'none'))
@@ -112,14 +110,14 @@ def test_reload_while_samples_flow(peer, tmp_path):
         assert values[0].double_value == 30.0
         assert flow.bias(flow.more() - 1) == 2.0
 
-        # Setting the same name again reads the file again; an integer is accepted as a number.
+        # Setting the same path reads the file again; an integer is accepted for a float parameter.
         save_calibration(of_bias(3.0), second)
         result = peer.set_atomically(transition_time=5, calibration_file=str(second))
         assert result.successful, result.reason
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 5.0
 
-        # A file and a set serial that differ are refused, whichever of the two is set last.
+        # A file of another serial is refused, as is a serial that differs from the file in use.
         save_calibration(of_bias(4.0, unit=Unit('T-2', 'counts', 32767.0, 0.01)), third)
         (result,) = peer.set_parameters(serial='T-9')
         assert "unit.serial: must be 'T-9'" in result.reason
@@ -131,7 +129,7 @@ def test_reload_while_samples_flow(peer, tmp_path):
         save_calibration(of_bias(4.0, unit=Unit('T-1', 'm/s^2', 160.0, 0.01)), third)
         (result,) = peer.set_parameters(calibration_file=str(third))
         assert "must be 'counts' (parameter `input` is counts), got 'm/s^2'" in result.reason
-        # Other thermometers, which this node does not subscribe to.
+        # A file that names thermometers to which this node does not subscribe is refused.
         save_calibration(of_bias(5.0, sensors=('case', 'lid')), third)
         (result,) = peer.set_parameters(calibration_file=str(third))
         assert 'sensors: must be case, which this node listens to, got case, lid' in result.reason
@@ -141,24 +139,21 @@ def test_reload_while_samples_flow(peer, tmp_path):
         assert node.stop() == 0
         assert 'Traceback' not in node.said
 
-    # No sample lost or repeated, all in order from the first one on.
+    # From the first output on no sample is lost, repeated or out of order.
     stamps = [stamp_of(message) for message in flow.heard]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
-    # One calibration after the other, and each sample is corrected by exactly one of them.
+    # The calibrations apply one after the other; exactly one corrects each sample.
     biases = [flow.bias(index) for index in range(len(stamps))]
     changes = [b for a, b in pairwise(biases) if a != b]
     assert (biases[0], changes) == (1.0, [2.0, 3.0])
 
 
 class _Stop(BaseException):
-    """The exception raised at a line."""
+    """The exception that `raising_at` raises."""
 
 
 def raising_at(number, call):
-    """
-    Call a function and raise at the n-th executed line of this package; return whether it was
-    reached.
-    """
+    """Call a function and raise at its n-th executed line; return whether the line was reached."""
     n_lines = 0
 
     def trace(frame, event, _):
@@ -184,7 +179,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
     # WHY: a calibration was refused, and its bias was applied all the same.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    # The second calibration has another detector, so that everything is rebuilt.
+    # For another detector the node must rebuild all parts of the correction.
     save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
     context = Context()
     rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)
@@ -218,7 +213,7 @@ def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # The failure was raised at each executed line of the change, which are over 150.
+        # The loop must have raised the failure at each executed line (over 150) of the change.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
             change.name: change.value for change in changes

@@ -70,7 +70,7 @@ def test_samples_of_a_second_publisher_never_go_out(peer, unit):
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
         peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
-        # The first samples after the end of the other driver may still be from that driver.
+        # Right after one of two drivers has ended, samples of this driver may still arrive.
         samples.send(20)
         before = len(samples.heard)
         peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
@@ -78,8 +78,7 @@ def test_samples_of_a_second_publisher_never_go_out(peer, unit):
         assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
 
 
-#: A driver as a separate process: 100 Hz from its first subscriber on, with its name in each
-#: sample.
+#: A driver process: 100 Hz from its first subscriber on, with its name in each sample.
 DRIVER = """
 import sys, time, rclpy
 from geometry_msgs.msg import Vector3Stamped
@@ -124,7 +123,7 @@ def driver_process(name):
 
 
 def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer, unit):
-    # WHY: nothing was published for the 20 s of the dead driver's lease.
+    # WHY: after a driver was killed the node was silent for 20 s, until the DDS lease ended.
     with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -135,7 +134,7 @@ def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer, unit):
         with driver_process('first'):
             peer.wait_for(lambda: len(of('first')) > 100, 'samples of the first driver')
         killed = time.monotonic()
-        # The test waits for the clock, as the driver is restarted a second later.
+        # Restart the driver a second after it was killed, as a supervisor would.
         peer.poll(lambda: time.monotonic() - killed > 1.0, 'a second')
         with driver_process('second') as (_, began_ns):
             peer.wait_for(lambda: of('second'), 'samples of the second driver')
@@ -162,7 +161,7 @@ def numbered(begin, period_s, until_s, start_s=0.0):
 @pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
 def test_two_that_send_are_never_mixed(offset, period_s):
     first = [(*message, 'own') for message in numbered(500, 0.01, 12.0)]
-    begins = 500 + 200 + offset  # about as many as the first driver has sent by then
+    begins = 500 + 200 + offset  # numbers near those of the first driver
     other = [(*message, 'other') for message in numbered(begins, period_s, 8.0, start_s=2.003)]
     sources, used = Sources(), []
     for at_s, number, name in sorted(first + other):
@@ -170,7 +169,7 @@ def test_two_that_send_are_never_mixed(offset, period_s):
         if not sources.of_one(n_known, [number], [round(at_s * 1e9)]):
             used.append((at_s, name))
     assert {name for _, name in used} == {'own'}
-    # The other driver is listed but silent: samples of the first count after a second of silence.
+    # A second after one of two drivers fell silent, samples of the first driver are used again.
     assert sum(at_s < 2.0 for at_s, _ in used) >= 199
     assert sum(at_s > 10.0 for at_s, _ in used) >= 199
 
@@ -249,7 +248,7 @@ def test_a_reading_far_ahead_is_forgotten(peer, unit):
         samples = Samples(peer, node)
         samples.go_on()
         samples.driver.temperatures(START_NS + 86_400 * SECOND_NS, 25.0)
-        samples.n_sent += 1  # without the readings at every tenth sample
+        samples.n_sent += 1  # samples alone, without temperature readings
         samples.send(5)
         status_with(peer, heard, 's ahead of the samples')
         samples.go_on()

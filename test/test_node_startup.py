@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node as a process: bad starts end at once with one clear line, good ones end cleanly."""
+"""The node as a process: bad starts end at once with one clear line, good starts end cleanly."""
 
 import signal
 import subprocess
@@ -92,8 +92,7 @@ def test_an_environment_that_ros_cannot_use(name, value, text, unit, monkeypatch
 
 
 def test_closed_streams_are_no_signal(unit):
-    # WHY: the signals' pipe got the descriptor of stderr, and the first letter of the log was
-    # taken for a signal.
+    # WHY: if stderr was closed, the signal pipe got its descriptor, and log text was a signal.
     peer = Peer()
     shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
     words = [*shell, '-m', 'thermo_comp.ros.node', *arguments(f'calibration_file:={unit}')[1:]]
@@ -117,7 +116,7 @@ ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 
 
 
 def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path, monkeypatch):
-    # The interpreters of the node and of its child processes import this first.
+    # Python imports sitecustomize first, in the node and in its child processes.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
         'class Absent:\n'
@@ -144,7 +143,7 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path,
             return bool(heard)
 
         peer.poll(is_heard, 'a sample')
-        # The file is read by another process.
+        # A child process of the node reads the calibration.
         (result,) = peer.set_parameters(calibration_file=str(unit))
         assert result.successful, result.reason
         del heard[:]
@@ -183,7 +182,7 @@ def test_misspelt_parameters_are_said(unit, capfd):
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_during_start_up_ends_it_cleanly(unit, number):
-    # A signal during the construction of the node, once the middleware has a thread.
+    # Send the signal while the node is built: once the middleware has started a thread.
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         tasks = Path(f'/proc/{node.process.pid}/task')
         deadline = time.monotonic() + TIMEOUT

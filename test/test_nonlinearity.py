@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Nonlinear axes in the correction: closed forms of the inverse, bits of stream and batch, variance.
-"""
+"""Nonlinear axes: closed forms of the inverse, bits of stream and batch, variance."""
 
 from dataclasses import replace
 
@@ -44,7 +42,7 @@ def with_covariance(unit, rng, size=1e-5):
     return replace(unit, posterior=posterior_of(root @ root.T + size**2 * np.eye(n)))
 
 
-# At 10 g the remainder of Halley's step is 1e-14 g, of MEMS with 1 mg/g^2 2e-8 g.
+# Remainder of Halley's step at 10 g: 1e-14 g for 10 ug/g^2, 2e-8 g for a MEMS with 1 mg/g^2.
 @pytest.mark.parametrize(('k2', 'tolerance'), [(1e-5, 1e-12), (-1e-4, 1e-12), (1e-3, 3e-8)])
 def test_the_inverse_of_a_square_is_the_root_of_a_quadratic(k2, tolerance):
     x = np.linspace(-10.0, 10.0, 41)
@@ -156,7 +154,7 @@ def test_a_file_keeps_the_terms_and_refuses_those_that_no_axis_has():
 
 
 def test_rests_in_the_field_feel_every_coefficient():
-    # The second route is a difference of two evaluations.
+    # The expected derivatives are differences of two evaluations.
     unit = with_covariance(calibration(nonlinearity=BENT), np.random.default_rng(1))
     logged = rests(unit, any_way, lambda _days: np.zeros(3), days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
@@ -168,5 +166,5 @@ def test_rests_in_the_field_feel_every_coefficient():
             unit, scale, values + step * (np.arange(len(values)) == k), covariance
         )
         slope = (series.miss - series_of(logged, moved).miss) / step
-        # The derivative of the correction itself, 2 K2 of 1 g, is left out.
+        # The analytic derivatives neglect the slope of the nonlinear terms, 2 K2 times 1 g.
         assert np.allclose(slope, series.by_parameter[:, k], atol=1e-3 * abs(slope).max() + 1e-7)

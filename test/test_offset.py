@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Raw words with an offset: the same calibration, with the offset in its bias."""
+"""Raw words with an offset give the same calibration, with the offset in its bias."""
 
 from dataclasses import replace
 
@@ -60,7 +60,7 @@ def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declar
     bias, scale = constants(result)
     np.testing.assert_allclose(bias - offset, constants(plain)[0], atol=0.02)
     np.testing.assert_allclose(scale, constants(plain)[1], rtol=1e-6)
-    # Tolerance: noise of 14 means of 2000 samples of 12 counts.
+    # Tolerance: 14 means of 2000 samples with a noise of 12 counts.
     np.testing.assert_allclose(bias - offset, BIAS, atol=1.0)
     np.testing.assert_allclose(scale, K, rtol=3e-4)
     np.testing.assert_allclose(result.calibration.misalignment, M, atol=3e-4)
@@ -70,7 +70,7 @@ def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declar
 
 
 def test_a_bag_for_each_position_needs_none_of_the_others(rng):
-    # All axes down, all up, or mixed: only some 16-bit words show that they are unsigned.
+    # Bags differ in the signs of their axes: only some show that 16-bit words are unsigned.
     ups = positions(10, 3)
     ups[0] = -np.full(3, 3.0**-0.5)
     bags = [source(words_of([up], rng) + 32768.0, f'bag{k}') for k, up in enumerate(ups)]
@@ -84,7 +84,7 @@ def test_a_bag_for_each_position_needs_none_of_the_others(rng):
 def test_one_attitude_of_16_bits_has_the_right_scale(rng):
     result = fit([source(words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0)], OPTIONS)
     bias, scale = constants(result)
-    # Norm of one reading with the bias at its prior: 1 m/s^2, about 400 counts.
+    # One attitude leaves scale and bias at their priors, 5 % and 1 m/s^2 (some 400 counts).
     np.testing.assert_allclose(scale, 4200.0 / GRAVITY, rtol=0.05)
     np.testing.assert_allclose(bias, 32768.0, atol=400.0)
     assert result.calibration.unit.full_scale == 65535.0
@@ -108,7 +108,7 @@ def test_a_centre_is_found_only_where_there_is_one(rng):
     ups = positions(12, 5)
     assert not rough_centre(4096.0 * ups + (800.0, -900.0, 700.0)).any()
     np.testing.assert_allclose(rough_centre(100.0 * ups + 338.0), 338.0, atol=1e-6)
-    # Positions in a plane, or too few positions, do not determine the centre across the plane.
+    # Positions in one plane do not determine the centre of the sphere across the plane.
     flat = ups * (1.0, 1.0, 0.0)
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     assert not rough_centre(100.0 * flat + 338.0).any()

@@ -85,8 +85,7 @@ def test_no_source_is_too_long_to_read():
 
 
 def test_the_manifest_asks_for_the_node_alone():
-    # Other dependencies of the commands come from PyPI: test_node_startup.py runs the node without
-    # them.
+    # Other dependencies of the commands come from PyPI; the node needs none of them.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     assert {key for key in keys if key and key.startswith('python3-')} == {
         'python3-numpy',
@@ -109,8 +108,7 @@ def test_hosted_ci_does_what_the_readme_says():
 
 
 def test_share_holds_what_ros_looks_for(tmp_path):
-    # colcon installs a package in this way: setup.py's install command into a prefix. Only the
-    # data files are tested here, not scripts and code.
+    # As by colcon: setup.py's install command into a prefix; only data files are tested.
     words = (*('build', '--build-base', tmp_path / 'build'), 'install_data', '--install-dir')
     environment = {**os.environ, 'PYTHONWARNINGS': 'ignore'}
     command = (sys.executable, 'setup.py', '-q', *words, tmp_path / 'prefix')

@@ -75,8 +75,7 @@ def test_overrides_arrive_and_whole_numbers_are_numbers():
         ('transition_time:=.nan', 'parameter `transition_time` must be between 0 and 3600'),
         ('temperature_timeout:=0', 'parameter `temperature_timeout` must be between 0.1'),
         ('input:=both', "parameter `input` must be one of counts, imu, got 'both'"),
-        # A serial that looks like a number would lose its zeros; the message tells the user to
-        # quote it.
+        # A serial that looks like a number would lose its zeros; the message says to quote it.
         ('serial:=0042', 'parameter `serial` must be a string, got .*quote it'),
     ],
 )

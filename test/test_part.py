@@ -54,7 +54,7 @@ def test_what_is_inside_is_there_and_nothing_else(bag, begin, end, n_messages, m
     got = np.concatenate([b.temperatures['board'].celsius for b in blocks])
     np.testing.assert_array_equal(got, board.celsius[own])
     assert since == (begin or 0.0)
-    # A reading applies from the same sample on as in the whole bag.
+    # In a part of a bag each reading applies from the same sample on as in the whole bag.
     after = [np.sum(inside[:n]) for n in board.after[own]]
     begins = np.cumsum([0, *map(len, blocks)])
     places = [b.temperatures['board'].after + n for b, n in zip(blocks, begins, strict=False)]

@@ -67,8 +67,7 @@ def judged(calibration, study):
 
 def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
     unit, study, calibration = parts
-    # A lag of 10 K that is wrong by 1 % moves a bias of 10 ug/K by 1 ug, twice its noise of a
-    # minute; some hundred minutes of ramps determine a lag better than 1 %.
+    # 1 % of a time constant is 1 ug (10 ug/K, lag of 10 K), twice the noise of a minute.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # 0.65 ug is the noise of a mean of a minute.
     assert judged(calibration, study).norm < 2.0
@@ -81,15 +80,14 @@ def test_a_part_between_board_and_case():
     parts = {one.part for one in calibration.response if one.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares = np.array(sorted(parts)).T
-    # Ramps determine a lag to 1 %, and therefore the share of the case to 0.01.
+    # Ramps determine a time constant to 1 %, and therefore the share of the case to 0.01.
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert judged(calibration, study).norm < 2.0
 
 
 def test_a_noisy_sensor_in_one_warm_up():
-    # WHY: a spline of 60 nodes over 50 K explained the drift with twice the time constant of an
-    # axis, and left 80 ug; a curve of few nodes determines the time constants.
+    # WHY: a spline of 60 nodes gave twice the time constant of an axis, and left 80 ug.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
     rng = rng_of('noisy thaw', 2)
     unit = navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
@@ -101,8 +99,7 @@ def test_a_noisy_sensor_in_one_warm_up():
 
 
 def test_bags_of_one_warm_up_predict_another():
-    # Every bag is the same thaw from a freezer, in which the board's temperature determines its
-    # lags.
+    # In the thaw of all bags the lags are a function of the board's temperature.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
     rng = rng_of('thaw')
     unit = navigation(rng, part_s=PARTS_S / 4.0)
@@ -149,18 +146,17 @@ def test_a_unit_without_lags_gets_none():
 
 
 def test_a_bump_is_no_disturbance_and_no_motion():
-    # At 0.5 Hz a cell of 30 samples is a minute, and the bump passes within two of them.
+    # At 0.5 Hz a cell of 30 samples takes a minute, and the unit passes the bump within two cells.
     bump = np.array([450.0, -400.0, 500.0])
     _, study = study_of('bump', bump=bump, bump_c=17.0)
     judgement = judged(strangers.fitted(study), study)
-    # The bends are a polygon with corners every 0.5 K in a bell of 0.85 K sd.
+    # The fit approximates a bell with an sd of 0.85 K by lines between knees every 0.5 K.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 
 
 def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
-    # Another simulator: heads that lag the board, pendulums that lag the heads, and an error
-    # proportional to the stress between board and pendulum.
+    # Heads lag the board, pendulums lag the heads; the error is the stress board - pendulum.
     unit = second_simulator.unit_of('products', 2)
     # Two equal stages of the x axis are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
@@ -176,7 +172,7 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     least, _ = second_simulator.floor_of(tests)
     assert errors(result.specific_force, result.sd, tests).norm < 2.0 * least
     stages = {(one.tau_s, one.second_tau_s) for one in result.calibration.response if one.tau_s}
-    # The network is integrated in steps of 2 s, which adds a second to a time constant.
+    # The simulator's steps of 2 s add a second to each time constant.
     near = pytest.approx(2.0 * unit.head_s[0], rel=0.01)
     assert any(tau + second == near for tau, second in stages)
     for head, pendulum in zip(unit.head_s[1:], unit.pendulum_s[1:], strict=True):
@@ -197,7 +193,7 @@ def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
     score = judged(strangers.fitted(study), study)
     means = [minutes(bag) for bag in held]
     forces = [strangers.by_hand(study)['constants'](mean) for mean in means]
-    # A part of the error remains: the ramps of the held-out bags have lags that soaks do not show.
+    # A part of the error remains, because soaks do not show the lags of the held-out ramps.
     assert score.norm < 0.5 * strangers.error_of(forces, means, is_drift=False).norm
     assert score.ratio < 1.5
 
@@ -217,8 +213,7 @@ def test_six_faces_in_three_soaks(given):
 
 
 def test_a_curve_between_two_soaks_is_claimed():
-    # WHY: the powers of the curve that two temperatures do not show were claimed to be zero, an
-    # eighth of the error.
+    # WHY: the claimed sd was an eighth of the error, without the powers that the bags do not show.
     rng = rng_of('two soaks')
     unit = cheap(rng)
     bags = positions(unit, SOAKS[::2], spread(18, rng), rng, rate_hz=10.0)
@@ -228,9 +223,7 @@ def test_a_curve_between_two_soaks_is_claimed():
 
 
 def test_a_curve_that_the_soaks_do_not_show_is_claimed():
-    # Each axis is vertical at a temperature of its own: the constants explain all norms, whatever
-    # the curve. WHY: the curve was claimed to be zero, and the error was
-    # fifteen times the claim.
+    # WHY: with each axis vertical at another temperature the error was 15 claimed sd.
     rng = rng_of('confounded soaks')
     unit = navigation(rng)
     faces = np.vstack((np.eye(3), -np.eye(3), np.eye(3)))
@@ -241,8 +234,7 @@ def test_a_curve_that_the_soaks_do_not_show_is_claimed():
 
 
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
-    # WHY: bags of soaks do not show the lags, and their unchanged left-out drift refused the
-    # columns that the bag of ramps needs: 325 ug instead of 260 ug with the soaks alone.
+    # WHY: left-out soaks, which show no lags, refused the columns of the bag of ramps.
     rng = rng_of('soaks and a ramp')
     unit = navigation(rng)
     ramps = positions(unit, HALF, spread(1, rng), rng)
@@ -277,7 +269,7 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
     (bags,) = study.tests.values()
     for bag in bags:
         off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
-        # The lags of 10 K at 20 ug/K differ by some percent from one unit to the next.
+        # The units' lags, 10 K at 20 ug/K, differ by up to 7 % from their mean.
         assert np.sqrt(np.mean(off**2)) < 5.0 * UG
 
 

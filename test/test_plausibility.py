@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Impossible readings of a thermometer are rejected, possible ones never."""
+"""Impossible readings of a thermometer are rejected, possible readings never."""
 
 import math
 from functools import cache
@@ -44,11 +44,7 @@ def soak(tracker, celsius=20.0, seconds=60, start_s=0):
 
 
 def test_what_a_sensor_says_first_may_be_wrong():
-    """
-    WHY: a DS18B20 reads 85 degC before its first conversion.
-
-    WHAT: the correct readings after it are not taken for an impossible step.
-    """
+    """After the 85 degC of a DS18B20 without a conversion correct readings are accepted."""
     tracker = tracker_of()
     tracker.read('board', 0, 85.0)
     tracker.read('board', SECOND_NS, 85.0)
@@ -85,8 +81,7 @@ def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # When the fault is detected the error is the change of the other sensor: some quanta and a
-    # kelvin. A frozen case is detected by the board, which lags by 10 K.
+    # A frozen board is wrong by some quanta + 1 K, a frozen case by the board's lag of 10 K.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead
@@ -101,7 +96,7 @@ def test_a_ramp_does_not_end_because_a_sensor_stands_still():
     tracker = tracker_of()
     soak(tracker, seconds=1500)
     for second in range(1500, 2500):
-        # The ramp stops in the readings only.
+        # Both readings freeze in the middle of a ramp.
         flicker = 0.004 * (-1) ** second
         ramp = min(second, 1900) - 1500
         tracker.read('board', second * SECOND_NS, 20.0 + ramp / 90.0 + flicker * (ramp < 400))
@@ -119,7 +114,7 @@ def test_a_standstill_within_the_quantum_is_no_fault():
 
 
 def test_readings_that_chance_may_repeat():
-    # Noise of half a quantum: the same reading follows with 68 %, 54 times in a row with 1e-9.
+    # With noise of half a quantum a reading repeats with p = 0.68, 54 times with p = 1e-9.
     assert still_readings(ThermometerSettings(0.005, 0.01)) == 54
     assert still_readings(ThermometerSettings(0.005, 0.0)) == STILL_READINGS
 
@@ -173,9 +168,9 @@ def test_swapped_topics_are_doubted(preset, sensor):
 
 
 def test_a_unit_that_was_switched_on_heats_itself_and_is_not_swapped():
-    # WHY: every start in the field looks like a ramp in which the board leads; taken for exchanged
-    # topics, the claimed sd was twenty times too large for the whole run. WHAT: a warm-up by 4 K
-    # in 20 min, a third of it in the case, and then a ramp in which the case leads.
+    # WHY: every start in the field looks like a ramp in which the board leads; it was taken for
+    # exchanged topics, with a claimed sd twenty times too large for the whole run. WHAT: a warm-up
+    # by 4 K in 20 min, a third of it in the case, and then a ramp in which the case leads.
     tracker = tracker_of(memory=LAG)
     for second in range(3 * 3600):
         warm = 4.0 * (1.0 - math.exp(-second / 500.0))

@@ -112,8 +112,7 @@ print(digest.hexdigest())
 
 
 def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng):
-    # More messages than the middleware holds (5000), sent faster than an rclpy callback takes
-    # them.
+    # More messages than the middleware holds (5000), faster than an rclpy callback takes them.
     with BagWriter(tmp_path / 'bag.mcap') as writer:
         stamps = START_NS + np.arange(7000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (7000, 3)), 'imu_link')
@@ -179,7 +178,7 @@ def test_refusals(tmp_path, rng):
 def test_a_subscriber_that_takes_nothing_is_not_waited_for_without_end(
     peer, tmp_path, rng, monkeypatch
 ):
-    # The middleware accepts 5000 messages and then refuses.
+    # The middleware accepts 5000 messages and then refuses further messages.
     with BagWriter(tmp_path / 'bag') as writer:
         stamps = START_NS + np.arange(8000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (8000, 3)))

@@ -37,7 +37,7 @@ def test_variances_stay_and_correlations_miss_by_the_tolerance(seed, n, toleranc
     posterior = posterior_of(covariance, tolerance)
     sd = np.sqrt(np.diag(covariance))
     error = (posterior.covariance() - covariance) / sd / sd[:, np.newaxis]
-    # The factor has single precision.
+    # The factor is stored in single precision.
     np.testing.assert_allclose(np.diag(error), 0.0, atol=1e-6)
     np.testing.assert_allclose(error, 0.0, atol=tolerance + 2e-6)
     assert (posterior.variances <= (tolerance + 1e-6) * sd**2).all()
@@ -135,7 +135,7 @@ def test_what_no_reader_would_read_is_not_written():
         dump_calibration(whole_bank(('case', 'frame', 'window')))
 
 
-#: The repeatability of the mounting is given, as six faces do not determine it.
+#: The sd of mountings is given, because six faces do not determine it.
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), mounting_sd=1e-6)
 FACES = np.vstack((np.eye(3), -np.eye(3)))
 
@@ -153,18 +153,17 @@ def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
     result = fitted(rng, FACES)
     least = result.least_known
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
-    # The attitude is a corner, or a neighbour of a corner in the grid, as the variance is flat.
+    # The variance is flat near a corner, so the attitude may be the grid point beside the corner.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
-    # Three angles of 1 %, the prior of a MEMS, change |f| by g times (xy, xz, yz); noise and
-    # curves add a little.
+    # Three angles of 1 % (a MEMS prior) change |f| by g (xy, xz, yz); noise adds a little.
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-2 / 3.0**0.5, rel=0.2)
 
 
 def test_a_side_that_was_never_up_is_named(rng):
     ups = positions(30, 4)
     result = fitted(rng, ups[ups[:, 2] > 0.2])
-    # The attitude may also be a neighbour in the grid.
+    # The attitude may be the grid point beside -z.
     np.testing.assert_allclose(result.least_known.up, (0.0, 0.0, -1.0), atol=0.06)
     assert '-z up' in said(result)
     assert said(result) in ' '.join(result.calibration.provenance.notes)

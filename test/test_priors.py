@@ -26,12 +26,12 @@ from thermo_comp.unit.posterior import Posterior
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: Only the groups of the unit's physics, a third of all columns, take half of the time.
+#: Only the groups of the unit's physics, a third of all columns, which halves the time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
 def source(record):
-    # Readings every eight seconds are enough for ramps of 1 K/min, and take an eighth of the time.
+    # A reading every eight seconds suffices for ramps of 1 K/min, and saves most of the time.
     arrays = arrays_of(record, 8)
     later = [array + 10**18 if array.dtype == np.int64 else array for array in arrays]
     return source_of(*later)
@@ -79,7 +79,7 @@ def test_population_is_the_mean_unit_and_its_scatter():
     variance = np.diag(prior.posterior.covariance())
     at = parameter_layout(prior).bias[0].static + 1
     sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
-    # Scatter of three units and of their mean, and parameters that are not determined in any.
+    # Variance of the prior: scatter of three units times 4/3 (their mean), plus their variance.
     scatter = []
     for unit in siblings():
         variance = np.diag(unit.posterior.covariance())
@@ -91,8 +91,8 @@ def test_population_is_the_mean_unit_and_its_scatter():
 
 def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch):
     # WHY: a fit started with the narrow prior of three units attributed 190 ug of their
-    # differences to the mounting offset and stayed there: 271 ug held out instead of 0.9. WHAT: no
-    # prior is wider anywhere than the prior of the start.
+    # differences to the mounting offset and stayed there: 271 ug held out instead of 0.9. WHAT: in
+    # no direction is another prior wider than the prior of the start.
     seen = []
 
     def fitted_with(*given):
@@ -114,8 +114,7 @@ def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch):
 
 
 def test_siblings_make_one_position_worth_more():
-    # WHY: one position in the chamber does not determine the scale over temperature. WHAT: with
-    # the prior of siblings the fit is better than alone, in positions that were left out.
+    # One position does not determine the scale over temperature, but the siblings' prior does.
     few = [source(record) for record in test_of(9, 0, 1)]
     options = replace(OPTIONS, serial='unit-9')
     alone = fit(few, options).calibration
@@ -139,8 +138,7 @@ def test_new_rests_make_an_old_calibration_better():
     later = [source(record) for record in test_of(9, 9, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5)
     new = fit(later, options).calibration
-    # Three positions measure three combinations of the six levels, which aged by 10 ug (bias) and
-    # 20 ug (scale): on average half of the variance due to ageing must be removed.
+    # Three positions measure three of six levels: half of the ageing variance is removed.
     grown = np.mean(sd_of_levels(old) ** 2 + options.ageing_bias**2)
     assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
     bias = [(a.bias - b.bias) / a.scale_factor for a, b in zip(new.axes, old.axes, strict=True)]
@@ -148,9 +146,7 @@ def test_new_rests_make_an_old_calibration_better():
 
 
 def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
-    # WHY: an update in the field has an hour at the temperature of the day, and no data sheet.
-    # WHAT: biases that changed by 200 ug are estimated although no change was stated; the
-    # calibration is valid where the old one was, with the same residual.
+    # An hour at one temperature shows a change of the biases by 200 ug, without a data sheet.
     moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
     old = fitted(9).calibration
 
@@ -172,8 +168,7 @@ def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
         for calibration, changed in ((old, lambda record: record), (old, aged), (new, aged))
     ]
     assert left[1] > 10.0 * left[0]
-    # Parts with a lag of an hour started at an unknown temperature, which ten minutes do not
-    # separate from a bias: the claimed sd includes some ug for this error.
+    # In rests of ten minutes a lag of an hour with an unknown start resembles a bias.
     sd = float(sd_of_levels(new).max())
     assert sd < 10e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
@@ -241,7 +236,7 @@ def test_another_units_calibration_is_no_prior():
     messages = [finding.message for finding in allowed.findings if finding.name == 'prior']
     assert any('allowed: ' in text for text in messages)
     assert any('bags contradict the prior' in text for text in messages)
-    # A model without regimes does not determine the two curves of a prior.
+    # A prior has a curve for each regime, so there is no residual of one set.
     assert not allowed.residuals[-1].one_set.n
 
 

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Properties: for any input the output is finite, valid, in order and within physical limits.
-
-The suite tries each property a few times; `make nightly` ten thousand times.
-"""
+"""For any input the output is finite, in order, physical; `make nightly` tries 10 000 inputs."""
 
 import base64
 import json
@@ -68,7 +64,7 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place, value):
     if refusal is not None:
         text = str(refusal)
         assert '\n' not in text
-        # An error of valid YAML names a key, any other a line.
+        # The error of a file that is valid YAML names a key.
         assert refusal.key or 'not valid YAML' in text or 'nested deeper' in text, text
         if refusal.key:
             assert refusal.key.split('.')[0].split('[')[0] in TREE, text
@@ -76,7 +72,7 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place, value):
 
 EXAMPLE = Path(__file__).parents[1] / 'config' / 'calibration.example.yaml'
 TREES = (TREE, yaml.safe_load(dump_calibration(unit())), yaml.safe_load(EXAMPLE.read_text()))
-#: Every number, text and list of numbers of the file.
+#: Every number, text and list of numbers of the three calibrations.
 EDITS = [(k, place) for k, tree in enumerate(TREES) for place in leaves(tree)]
 magnitudes = st.builds(
     lambda sign, digits, power: sign * digits * 10.0**power,
@@ -84,7 +80,7 @@ magnitudes = st.builds(
     st.floats(1.0, 9.99),
     st.integers(-308, 307),
 )
-#: The bounds themselves, and the next values to them.
+#: The bounds of all quantities, and values just inside and outside of them.
 edges = st.sampled_from(
     [
         near
@@ -120,7 +116,7 @@ def edited(draw):
                 branch = branch[key]
             value = branch[last]
         except (KeyError, IndexError, TypeError):
-            continue  # an earlier change has removed its place
+            continue  # an earlier change has removed this key
         if isinstance(value, str) and last in ('factor', 'rest'):
             shape = np.frombuffer(base64.b64decode(value), '<f4')
             factor = draw(factors)
@@ -152,7 +148,7 @@ def whole_range(of):
     now_ns = START_NS
     for k, (celsius, step_s) in enumerate(zip(temperatures, steps_s, strict=True)):
         for m in range(6):
-            # Each temperature is read six times, so that it is not taken for a wrong reading.
+            # Six readings of each temperature, so that it does not count as a wrong reading.
             now_ns += round(step_s / 6.0 * 1e9)
             sent.append(('board', now_ns, celsius))
             sent += [(name, now_ns, celsius + 0.1 * m) for name in of.sensors]
@@ -167,8 +163,7 @@ def whole_range(of):
 @settings(deadline=None, max_examples=max(120, settings.default.max_examples))
 @given(edited())
 def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree):
-    # WHY: a delta of 1e300, a lag of 1e-300 s and a weight of 1e160 were accepted; the output was
-    # not finite, or its covariance invalid.
+    # WHY: deltas of 1e300, lags of 1e-300 s or weights of 1e160 gave output that is not finite.
     content = yaml.dump(dict(tree), Dumper=yaml.CSafeDumper, allow_unicode=True).encode()
     try:
         of = parse_calibration(content, 'unit.yaml')
@@ -193,7 +188,7 @@ def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tre
             assert min(rate[3:]) > 0.0
     counters = compensator.counters
     assert counters.n_unsound == 0
-    # Samples are dropped only if faster than the converter, or with stale temperatures.
+    # No sample is published only if samples are too fast or temperatures stale or missing.
     assert n_sound or counters.n_too_fast or counters.n_stale or counters.n_no_temperature
     status = compensator.status()
     assert all(map(math.isfinite, status.state))
@@ -225,11 +220,9 @@ configs = st.builds(
 
 
 def largest(axis, regime, of):
-    """
-    Bound an axis' |bias| without that of the reference, and the distance of its scale from 1.
-    """
+    """Bound the change of an axis' bias, and the relative change of its scale."""
     edges = (*of.static.temperature_range_c, *of.dynamic.temperature_range_c)
-    # Curves continue along their tangents for a quarter of the span, or of the other set's.
+    # Curves continue along their tangents for up to a quarter of both ranges together.
     t = max(abs(edge - of.reference_temperature_c) for edge in edges)
     t += 0.25 * (max(edges) - min(edges))
     curves = regime.axes()[axis]

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Recordings by other people through `fit`, with the figures of docs/real_data.md.
-
-Skipped with a reason if the recordings are absent.
-"""
+"""Other people's recordings through `fit`, with docs/real_data.md's figures; skipped if absent."""
 
 import re
 from contextlib import suppress
@@ -44,7 +40,7 @@ def means_of(result):
 
 def test_handheld_units_leave_what_their_noise_is(unit):
     assert 21 <= len(unit.positions) <= 23
-    # Windows of 0.5 s have more noise than the 0.48 to 0.57 mg of 1 s.
+    # The noise is 0.48 to 0.57 mg in windows of 1 s, and higher in these windows of 0.5 s.
     assert 0.5 < unit.residuals[-1].fitted.rms / MG < 0.9
     assert unit.residuals[-1].left_out.rms < 1.15 * unit.residuals[-1].fitted.rms
 
@@ -62,7 +58,7 @@ def test_handheld_units_agree_with_a_direct_solution(unit):
     direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
     calibration = unit.calibration
     axes = calibration.axes
-    # The weights of positions differ slightly: a fraction of the sd of 1 mg, and of 1e-3.
+    # Fit and scipy weight positions slightly differently: less than the sd, 1 mg and 1e-3.
     np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
     M = np.array(calibration.misalignment)
@@ -75,9 +71,9 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     calibration = result.calibration
     assert len(result.positions) == 6
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-6)
-    # The prior sd of a MEMS: 1 %.
+    # The prior sd of the misalignment of a MEMS is 1 %.
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-2, rtol=0.01)
-    # The second route: bias and scale are half the sum and half the difference of opposite faces.
+    # Bias and scale by hand: half the sum and half the difference of opposite faces.
     means = means_of(result)
     high, low = means.max(axis=0), means.min(axis=0)
     axes = calibration.axes
@@ -88,7 +84,7 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
 
 
 def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
-    # A plot of |a| shows jumps by +20 mg at 366 s and +17 mg at 468 s; a third is across gravity.
+    # |a| jumps by +20 mg at 366 s and +17 mg at 468 s; a third jump is across gravity.
     sources, _ = fit_sources([freezer_bag(real_data, work)])
     with pytest.raises(FitError, match='not a function of temperature') as refused:
         fit(sources, OPTIONS)
@@ -129,24 +125,22 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
         ]
         calibration = fit(seen, OPTIONS).calibration
         for part in held_out:
-            # In some parts the freezer was knocked, so that no minute of them is at rest.
+            # The freezer was knocked in some parts, which then have no minute at rest.
             with suppress(RecordingError):
                 judged = evaluate([bag], [('unit', calibration)], topics=Topics(part=part))
                 windows = judged.judgements['unit'].windows
                 raw += np.linalg.norm(windows.mean, axis=1).tolist()
                 left += windows.residual.tolist()
     assert len(raw) >= 17 * len(sets) // n_sets
-    # Drifts are about their mean, as a single attitude does not determine the constants.
+    # Compare drifts about their mean, because one attitude does not determine the constants.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # White noise of 1.5 mg per root hertz leaves 0.19 mg in a minute; longer parts are
-    # interpolated over a wider range, and the first of five parts is extrapolated.
+    # 1.5 mg/sqrt(Hz) leaves 0.19 mg in a minute; the first of five parts is extrapolated.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 
 def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
     bag = freezer_bag(real_data, work)
-    # The parts are after the last jump; times count from the first sample, 1.5 s after the zero of
-    # the log. The freezer was knocked near 860 and 1134 s.
+    # The parts are after the last jump; the freezer was knocked near 860 and 1134 s.
     parts = [Part(518.5, 638.5), Part(860.5, 1130.5), Part(1134.5, 1938.5)]
     seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts]
     calibration = fit(seen, OPTIONS).calibration
@@ -158,13 +152,12 @@ def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
     assert section.raw_rms > 1.7 * floor
     assert section.rms < 1.3 * floor
     assert 0.3 < section.ratio < 2.0
-    # The datasheet of the MPU6050 states 5 mdeg/s/sqrt(Hz); 12.7 samples a second without a filter
-    # also contain the noise above 6 Hz.
+    # MPU6050 datasheet: 5 mdeg/s/sqrt(Hz); samples at 12.7 Hz without a filter have more noise.
     assert 30.0 < np.degrees(density) * 1e3 < 45.0
 
 
 def test_no_recording_is_in_the_project():
-    # Only plots and numbers: no file of the project contains rows of the freezer run.
+    # The project may show plots and numbers of the recordings, but not contain their files.
     tracked = ran('git', 'ls-files').stdout.split()
     names = ('temp-calibration.csv', 'mk_imu', 'annotated_session.csv')
     assert not [path for path in tracked if path.rsplit('/', 1)[-1].startswith(names)]

@@ -77,13 +77,13 @@ def check_positions(result):
         assert np.array(position['up']) @ up > np.cos(np.radians(1.0))
         assert position['reason'] == ''
         assert set(position['thermometers']) == {'board', 'case', 'lid'}
-        # Cells next to a motion, of three seconds at this sample rate, do not count as still.
+        # Cells beside a motion, three seconds long at this rate, do not count as rest.
         assert position['still_s'] == pytest.approx(SOAK_S, abs=20.0)
 
 
 def check_fit(result, cli, folder):
     """Run the printed command, and compare the calibration with the truth."""
-    # Only the constants are tested; the thermal response takes ten times as long.
+    # Fit the paper's model: only constants are compared; a response takes ten times as long.
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))
     assert words.pop(0) == 'thermo_comp'
@@ -95,7 +95,7 @@ def check_fit(result, cli, folder):
     scale = np.array([axis.scale_factor for axis in axes])
     bias = np.array([axis.bias for axis in axes]) / scale
     sd = np.array([place['sd_g'] for place in result['positions']]).max() * 9.80665
-    # The sd before the fit includes the noise of the positions only; constants are at 20 degC.
+    # `record` computes the sd from the noise of the positions alone, for constants at 20 degC.
     assert scale / UNIT.scale_factor == pytest.approx(1.0, abs=5.0 * max(result['scale_sd']))
     true_bias = np.array(UNIT.bias_at_reference) / UNIT.scale_factor
     assert bias == pytest.approx(true_bias, abs=5.0 * max(9.80665 * max(result['bias_sd_g']), sd))
@@ -186,7 +186,7 @@ class TestGrowing:
 
 
 def test_what_a_crash_has_left_is_told_and_finished(session, cli, tmp_path):
-    # WHY: the hours of a killed run were in a hidden file without any message.
+    # WHY: the hours that a killed run had recorded were left in a hidden file without any message.
     bags = tmp_path / 'bags'
     killed = subprocess.run(
         [sys.executable, '-c', CRASH, session, bags, str(START_NS + 200 * 10**9)], check=False
@@ -208,7 +208,7 @@ def test_what_a_crash_has_left_is_told_and_finished(session, cli, tmp_path):
     with open_recording(first, require=()) as reader:
         assert reader.info.truncated is None
         assert reader.info.metadata['serial'] == 'lab-7'
-    # An unreadable file stays in place.
+    # `--finish` leaves an unreadable file in place.
     broken = bags / '.07.999999999-abcdef.partial.mcap'
     broken.write_bytes(b'no bag')
     printed = cli(*arguments, '--finish', code=None).stderr

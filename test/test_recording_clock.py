@@ -45,7 +45,7 @@ def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path, jump_ns):
     blocks = blocks_of(
         tmp_path / 'bag.mcap', true_ns + jump_ns * after, (true_ns + jump_ns * after)[::100]
     )
-    # A reading is before the sample of its log time: the jump is before reading 5.
+    # At equal log times the reading comes first, so the jump is before the sixth reading.
     hour = LONGEST_PAUSE_NS * after
     offsets = joined(blocks, 'accel') - true_ns
     assert offsets[:500].tolist() == [0] * 500
@@ -78,8 +78,7 @@ def test_a_message_an_hour_is_no_recording(tmp_path):
 
 @pytest.mark.parametrize(('zone_s', 'n'), [(3600, 40000), (-3600, 1000), (1800, 1000), (20, 1000)])
 def test_thermometers_of_another_time_zone_are_named(tmp_path, zone_s, n):
-    # WHY: the only message was the number of days, or none, and `replay` wrote samples corrected
-    # with the temperatures of another hour.
+    # WHY: `replay` silently corrected samples with the temperatures of another hour.
     true_ns = START_NS + STEP_NS * np.arange(n)
     text = f'board is stamped {zone_s:+} s from the samples around it: two clocks?'
     with suppress(RecordingError):

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A damaged bag: a truncated one is read to its last complete message and reported; a corrupt one is
-one clear error; no crash, no hang, no memory beyond the file's content.
-"""
+"""A truncated bag is read to its last complete message; a corrupt bag is one clear error."""
 
 import resource
 import struct
@@ -60,7 +57,7 @@ def small_bag(compression, use_chunking=True):
 
 
 def every_cut(content, position, length):
-    """Every byte of the last chunk, and every 17th of the indexes and the summary after it."""
+    """List cuts: at every byte of the last chunk, at every 17th byte after the chunk."""
     end = position + length
     return [*range(position, end), *range(end, len(content), 17), len(content) - 1]
 
@@ -68,7 +65,7 @@ def every_cut(content, position, length):
 def test_cut_at_every_byte_of_the_last_chunk(tmp_path):
     content, position, length = small_bag('none')
     messages = regular_messages(24)
-    # The end of each message in the file, computed by hand from the layout of a chunk.
+    # `last`: the end of each message of the last chunk, by hand from the layout of a chunk.
     at = position + 9 + 40
     last = []
     while at < position + length:
@@ -93,9 +90,7 @@ def test_cut_at_every_byte_of_the_last_chunk(tmp_path):
 
 
 def test_most_of_a_large_torn_chunk_is_saved(tmp_path):
-    """
-    A streaming decompressor gives the content before the cut: a block is lost, not the chunk.
-    """
+    """Content before a cut is decompressed: a block is lost, not the chunk."""
     n = 60_000
     stamps = np.arange(n) * 2_500_000
     xyz = np.random.default_rng(3).integers(-30_000, 30_000, (n, 3))
@@ -107,8 +102,7 @@ def test_most_of_a_large_torn_chunk_is_saved(tmp_path):
         ((position, length),) = chunk_places(path)
         path.write_bytes(content[: position + length // 2])
         columns = read(path).columns
-        # Incompressible numbers: half of the bytes contain nearly half of the messages. A block of
-        # zstd has 128 KiB of content, 1700 messages.
+        # Numbers are incompressible: half of the bytes hold half of the messages (- a zstd block).
         assert 0.4 * n < len(columns) < 0.6 * n
         assert (columns.accel == xyz[: len(columns)]).all()
 
@@ -131,11 +125,7 @@ def test_cut_anywhere(data, compression):
 
 
 def test_zeros_at_the_end_are_no_messages(tmp_path):
-    """
-    WHY: after a power failure a file may have its full length and zeros in its last pages.
-
-    PROMISE: no message with a zeroed part is returned.
-    """
+    """No message with a part zeroed by a power failure is returned from a file of full length."""
     messages = regular_messages(24)
     path = tmp_path / 'bag.mcap'
     for is_chunked in (True, False):
@@ -253,7 +243,7 @@ def test_claims_are_not_believed(tmp_path, record, reason):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(RecordingError, match=reason):
         read(path)
-    # In KiB: whatever length is stated, the reader takes no more than a usual chunk (64 MiB).
+    # Whatever length a record states, the reader takes less than 100 MB (ru_maxrss is in KiB).
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 
@@ -266,7 +256,7 @@ def test_a_damaged_compressed_end_is_left_out(tmp_path):
     recording = read(path)
     assert str(recording.info.truncated).endswith('; its last chunk is damaged and left out')
     assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
-    # A truncated chunk gives its content before the damage.
+    # If the damaged chunk is also cut off, the message names the cut.
     path.write_bytes(damaged[:-5])
     assert 'ends inside a chunk' in str(read(path).info.truncated)
 
@@ -276,7 +266,7 @@ def test_a_summary_that_is_nonsense(tmp_path):
     path = tmp_path / 'bag.mcap'
     footer = len(content) - 37
     (summary,) = struct.unpack_from('<Q', content, footer + 9)
-    for at in (summary, summary + 9):  # opcode of the first record; number and name of its schema
+    for at in (summary, summary + 9):  # opcode, then schema, of the summary's first record
         changed = bytearray(content)
         changed[at : at + 8] = b'\xff' * 8
         path.write_bytes(changed)

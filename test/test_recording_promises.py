@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The stated and the actual content of a bag; the cost of opening one."""
+"""A bag that contains less than it states is reported; opening a bag costs little."""
 
 import os
 import sqlite3
@@ -49,7 +49,7 @@ def test_rows_deleted_from_a_database_are_missed(tmp_path, cli):
 def test_a_conversion_tells_what_the_bag_lacks(tmp_path, cli):
     messages = regular_messages(400, accel=IMU_IN)
     for message in messages:
-        if message.topic == IMU_IN:  # as gravity, since another magnitude at rest is refused
+        if message.topic == IMU_IN:  # at rest: `convert` refuses another magnitude
             message.numbers = (*message.numbers[:25], 0.0, 0.0, 9.81, *message.numbers[28:])
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     with sqlite3.connect(tmp_path / 'bag' / 'bag.db3') as database:

@@ -39,9 +39,7 @@ WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}
 
 @st.composite
 def bags(draw, accel=ACCEL, lowest=-3):
-    """
-    Messages in order of writing, with equal and decreasing log times, mixed frames and orders.
-    """
+    """Messages in order of writing: equal and falling log times, mixed frames and byte orders."""
     frames = draw(st.lists(st.text('abcxyz_/é', max_size=24), min_size=1, max_size=3))
     topics = (accel, BOARD, CASE, OTHER)
     messages = []
@@ -96,9 +94,7 @@ def test_any_file_gives_its_messages_in_order_of_log_time(messages, **options):
             and options['index_types'] == IndexType.ALL
             and options['repeat']
         ):
-            # The second route to the order is the order of rosbags for the same file. The versions
-            # of rosbags differ for equal log times in different chunks, so that these may be in
-            # either order.
+            # Order of rosbags for the same file; its versions order equal log times differently.
             order = [(log_ns, topic) for topic, log_ns, _ in read_with_rosbags(path)]
             wanted = [(m.log_ns, m.topic) for m in in_reading_order(messages)]
             assert [log_ns for log_ns, _ in order] == [log_ns for log_ns, _ in wanted]
@@ -148,8 +144,7 @@ def test_directories_written_by_rosbags(messages, storage, compression):
 @settings(max_examples=10, deadline=None)
 @given(messages=bags(lowest=1))
 def test_ros_1_bags(messages):
-    # No equal log times: a ROS 1 bag has an index per topic, and no order between topics for equal
-    # times.
+    # Log times differ, because a ROS 1 bag has no order between topics for equal times.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.bag')
         write_rosbag1(path, messages)
@@ -187,7 +182,7 @@ def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path):
     assert [frame for block in blocks for frame in [block.frame_id] * len(block)] == frames
     before, n_accel = 0, 0
     for block in blocks:
-        # The place of each reading counts within its block, so that it never exceeds the block.
+        # `after`, the place of a reading among the samples, counts within the block.
         after = block.temperatures['board'].after
         assert ((after >= 0) & (after <= len(block))).all()
         before += len(after)
@@ -197,18 +192,13 @@ def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path):
 
 
 def test_overlapping_chunks_of_single_topics_are_merged(tmp_path):
-    """
-    WHY: a tool that writes a chunk per topic puts the temperatures after the samples that they
-    belong to; in file order each would apply a chunk too late.
-
-    PROMISE: log-time order.
-    """
+    """Chunks per topic, with temperatures after their samples, are merged in log-time order."""
     messages = regular_messages(200)
     by_topic = sorted(
         messages, key=lambda m: ((m.log_ns - START_NS) // 100_000_000, ALL_TOPICS.index(m.topic))
     )
     write_mcap(tmp_path / 'bag.mcap', by_topic, chunk_size=400)
-    # For equal log times the order of the file counts, so here the counts come first.
+    # Messages with equal log times keep the order of the file: here counts before temperatures.
     assert_columns(read(tmp_path / 'bag.mcap').columns, in_reading_order(by_topic))
 
 
@@ -343,7 +333,7 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
             '/imu/ticks, its only Vector3Stamped, is taken for counts; '
             '/imu/die, its only Temperature, is taken for board'
         )
-    # No topic is chosen if the user named another, if there are two, or for a case as the board.
+    # No board topic is chosen if the user names one, among two topics, or from a case topic.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):
@@ -353,7 +343,7 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
 
 
 def test_two_thermometers_of_other_names_are_offered(tmp_path):
-    # WHY: `fit` read neither, and the only message was that no temperature was recorded.
+    # WHY: `fit` read neither thermometer, and said only that no temperature was recorded.
     path = written(tmp_path / 'two', 'imu/die', 'baro/air')
     with open_recording(path, require=('accel',)) as reader:
         assert 'board' not in reader.topics
@@ -369,7 +359,7 @@ def test_reading_twice_gives_the_same(tmp_path, monkeypatch):
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:
-        first = next(iter(reader.blocks()))  # the reading is abandoned before its end
+        first = next(iter(reader.blocks()))  # reading stops after one block
         again = next(iter(reader.blocks()))
     assert first.accel.tobytes() == again.accel.tobytes()
 

@@ -222,14 +222,14 @@ def driver_bag(path, *topics, metadata=None):
     [
         # The driver's topic of REP 145 is chosen; the vector of the magnetometer is not a force.
         ([('imu/data_raw', 'imu'), ('imu/mag', 'vector')], '/imu/data_raw'),
-        # The free acceleration and the rate of an Xsens are vectors, but not its force.
+        # Free acceleration and angular rate of an Xsens are vectors, but no specific force.
         ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
         ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
-        # With a filter's output in the bag, the filter's input is chosen.
+        # Of a filter's input (imu/data_raw) and output (imu/data) the input is chosen.
         ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
         ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
         ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),
-        # Two equivalent topics, and vectors that are not forces.
+        # No choice among two equivalent topics, nor among vectors that are not forces.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
         # A topic is the node's output if it has the regime topics beside it.

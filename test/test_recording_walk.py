@@ -23,10 +23,7 @@ def other(content):
 
 
 def one_by_one(data):
-    """
-    Scan in a plain loop: place, size, channel and log time of each message; other records; the
-    end.
-    """
+    """Scan in a plain loop: place, size, channel, log time of messages; other records; the end."""
     at, messages, others = 0, [], []
     while at + 9 <= len(data):
         opcode, length = struct.unpack_from('<BQ', data, at)
@@ -46,7 +43,7 @@ def listed(messages):
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
-#: Contents that look like records, with the lengths of real ones.
+#: Contents of messages that look like records, with the lengths of real records.
 DECEITFUL = [
     b'\x05' * 40, message(1, 5, b'\x05' * 9), (message(1, 7, b'') * 3)[:40],
     struct.pack('<BQ', MESSAGE, 22 + 40) * 4, bytes(40),

@@ -59,7 +59,7 @@ def test_rosbags_and_mcap_read_back_what_was_written(
                 bag.write_bool('regime/dynamic', log_ns, linear[:, 0] > 0)
                 bag.write_raw('diagnostics', 'std_msgs/msg/String', log_ns, raw)
                 bag.flush()
-                for name in 'ctibr':  # in the order of the calls
+                for name in 'ctibr':  # order of calls
                     written += [(group, time, name) for time in log_ns.tolist()]
                 expected = dict.fromkeys('cti', (stamp_ns, linear))
         file = path if is_file else path / 'bag_0.mcap'
@@ -67,7 +67,7 @@ def test_rosbags_and_mcap_read_back_what_was_written(
             '/accel/counts': 'c', '/temperature/board': 't', '/imu/data_raw': 'i',
             '/regime/dynamic': 'b', '/diagnostics': 'r',
         }  # fmt: skip
-        # Order in the file: by group of calls, then log time, then order of the calls.
+        # Messages are in the file by flush, then log time, then order of the calls.
         wanted = [
             (log_ns, name) for _, log_ns, name in sorted(written, key=lambda entry: entry[:2])
         ]
@@ -134,7 +134,7 @@ def test_metadata_comes_back(tmp_path, name):
     pairs = {'serial': 'Ünit 7', 'git': 'a: b\n- c'}
     small(tmp_path / name, metadata=pairs)
     assert read_recording(tmp_path / name, require=()).info.metadata == pairs
-    if name == 'bag.mcap':  # a truncated file keeps its metadata, too
+    if name == 'bag.mcap':  # a truncated file keeps its metadata
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content[: len(content) // 2])
         assert read_recording(tmp_path / name, require=()).info.metadata == pairs
@@ -214,7 +214,7 @@ def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path, name):
     with pytest.raises(KeyError):
         fail()
     assert value() == 1.0
-    assert [p.name for p in tmp_path.iterdir()] == [name]  # no file remains
+    assert [p.name for p in tmp_path.iterdir()] == [name]  # no temporary file remains
     small(path, 3.0, overwrite=True)
     assert value() == 3.0
     assert [p.name for p in tmp_path.iterdir()] == [name]

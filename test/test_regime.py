@@ -46,9 +46,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """
-    Run n ramps; return the switches after the start of each, and the number of static starts.
-    """
+    """Run n ramps; return the switches after each start, and the number of static starts."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -80,9 +78,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # Two edges must be crossed: with the second at 62.5 to 125 mK from the start the median is
-        # at least the time in which the case changes by 94 mK, 146 s; the median of 12 runs
-        # scatters by 6 s.
+        # A coarse sensor must cross two edges of its quantum: median 146 s (94 mK), +-6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -124,7 +120,7 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
         (0.01, 0.0, 0.5, 900.0, 0.1, 900.0),
         (0.001, 0.0625, 0.2, 1200.0, 1.0, 3600.0),
         (0.01, 0.0625, 3.0, 300.0, 10.0, 3600.0),
-        (0.01, 0.0625, 0.2, 180.0, 10.0, 2400.0),  # slower than the baseline could follow
+        (0.01, 0.0625, 0.2, 180.0, 10.0, 2400.0),  # the baseline could not follow faster ramps
         (0.01, 1.0, 0.2, 900.0, 10.0, 7200.0),
         (0.01, 1.0, 3.0, 180.0, 1.0, 2400.0),
     ],
@@ -133,15 +129,13 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # The slowest detection is that of a ramp of 0.2 K/min by a thermometer with steps of 1 K
-        # behind a lag of 15 min: it needs two changes of the reading, 5 min apart.
+        # Slowest: 0.2 K/min in steps of 1 K behind a lag of 15 min, as two steps are needed.
         assert each[-1][0] < 0.5 * end_s
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_soaks_stay_static(sensor):
-    # The run is 15 h of ripple and self-heating. At the required 0.05 switches an hour 0.4
-    # openings are expected; more than 2 have a probability below 1 %.
+    # At the required 0.05 switches an hour more than 2 openings in 15 h have p < 0.01.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -164,9 +158,8 @@ def test_soaks_stay_static(sensor):
 
 def test_false_alarms_keep_to_the_setting():
     # The signal is noise without ripple, and 20 alarms an hour are permitted. Rice's formula
-    # counts crossings; those of one filter come in groups and coincide with those of the other, so
-    # that the formula is an upper bound: at most 2000 separate departures in 100 h. A lower limit
-    # checks that the test is not inactive.
+    # counts crossings, which come in groups and coincide between the filters, so it is an upper
+    # bound of separate alarms: 2000 in 100 h. The lower limit checks that the detector is active.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -187,9 +180,9 @@ def test_false_alarms_keep_to_the_setting():
 
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_threshold_is_that_of_the_filters_noise(dt):
-    # The second route: gain by the Riccati equation, noise and correlation by the impulse
-    # response, alarms by Rice's formula. The closed forms are first order in the pace, which is at
-    # most 0.3 here: within 4 %.
+    # Expected: filter gain by the Riccati equation, noise and correlation by the impulse response,
+    # alarms by Rice's formula. The detector's closed forms are first order in its pace: within 4
+    # %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -209,7 +202,7 @@ def test_threshold_is_that_of_the_filters_noise(dt):
         noise = 1e-4 * np.sum(response**2)
         correlation = np.sum(response[1:] * response[:-1]) / np.sum(response**2)
         per_reading = math.acos(correlation) / (2.0 * math.pi)
-        allowed = 0.02 / 3600.0 / 4.0 * dt  # per reading, two filters, two signs
+        allowed = 0.02 / 3600.0 / 4.0 * dt  # alarms per reading, filter and sign
         squared = 2.0 * math.log(per_reading / allowed)
         assert threshold * covariance[1, 1] == pytest.approx(squared * noise, rel=0.04)
 
@@ -227,9 +220,7 @@ def test_unknown_until_the_windows_are_filled():
 
 
 def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=8000.0, **parts):
-    """
-    Run once; `parts` may replace the readings of case or board by a function of (t, reading).
-    """
+    """Run once; `parts` may change the readings of case or board: functions of (t, reading)."""
     rng = np.random.default_rng(8)
     t = np.arange(begin, end)
     truths = dict(zip(('case', 'board'), case_and_board(t, corners, lag), strict=True))
@@ -248,8 +239,7 @@ RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
 def test_dynamic_ends_when_the_lag_has_died():
-    # The board's true rate falls below the relaxed 0.05 K/min about 50 min after the chamber's
-    # stop; the dwell adds 60 s, and the noise of the rate needs a margin of 10 %.
+    # The board relaxes to 0.05 K/min 50 min after the stop; dwell adds 60 s, noise 10 %.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
     t = np.arange(3600.0, 12000.0)
@@ -266,7 +256,7 @@ def test_the_relaxed_rate_moves_the_end():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # The slower of two lags decides: half the rate takes one lag times ln 2 longer.
+    # The slower of two lags decides: half the rate is reached one lag times ln 2 later.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 
@@ -293,7 +283,7 @@ def test_it_closes_with_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # The same bits as without a board; if the case is lost, the board decides.
+    # `closes: case` gives the bits of a run without a board; without a case the board decides.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
@@ -305,8 +295,7 @@ TRIANGLE = [(0.0, 0.5), (3600.0, -0.5), (7200.0, 0.5), (10800.0, 0.0)]
 @pytest.mark.parametrize('lost', [None, 'case', 'board'])
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
 def test_a_reversal_is_no_rest(lost, quantum):
-    # WHY: at the top of a triangle the rate is near zero for minutes, and a coarse reading is
-    # constant. WHAT: one dynamic state from the first onset to the last relaxation.
+    # At the top of a triangle a coarse reading is constant for minutes, but the state is dynamic.
     parts = {lost: gone} if lost else {}
     changes = run_once(TRIANGLE, quantum=quantum, end=16000.0, **parts)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
@@ -340,8 +329,7 @@ def test_direction_follows_a_reversal():
 
 
 def test_a_held_reading_does_not_turn_the_direction():
-    # WHY: a sensor that measures every 30 s and is published every second gives a staircase, whose
-    # constant parts and steps look like reversals.
+    # WHY: the staircase of measurements every 30 s published every second looks like reversals.
     rng = np.random.default_rng(1)
     t = np.arange(-2400.0, 6000.0)
     truths = case_and_board(t, [(0.0, 2.0), (3000.0, 0.0)], 300.0)
@@ -383,7 +371,7 @@ def test_cooling_is_heating_upside_down(quantum):
 
 
 def test_switches_do_not_depend_on_the_origin_of_time():
-    # Whole nanoseconds in both cases, so the bits are the same.
+    # A shift of the stamps by whole nanoseconds must not change a bit.
     rng = np.random.default_rng(8)
     t = np.arange(0.0, 3000.0)
     settings = detector_settings(0.001)

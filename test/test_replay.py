@@ -29,9 +29,7 @@ SECOND_NS = 1_000_000_000
 
 
 def thermal_test(path, minutes=30.0, rate_hz=10.0, serial='', imu=False):
-    """
-    Write a recording with a ramp between two soaks and a lagging board, in several write groups.
-    """
+    """Write a ramp between two soaks with a lagging board, in several write groups."""
     rng = np.random.default_rng(7)
     n = round(minutes * 60.0 * rate_hz)
     stamps = START_NS + np.rint((np.arange(n) + 1.0) * (1e9 / rate_hz)).astype(np.int64)
@@ -193,7 +191,7 @@ def test_inputs_are_copied_as_they_are(tmp_path):
             if connection.topic in messages:
                 copies.setdefault(connection.topic, []).append(bytes(data))
                 stamp = after.deserialize(data, connection.msgtype).header.stamp
-                # One clock in the whole output: the log time is the stamp.
+                # The log time of every output message is its stamp.
                 assert log_ns == stamp.sec * SECOND_NS + stamp.nanosec
     assert copies == messages
 
@@ -218,8 +216,7 @@ def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path):
 
 
 def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
-    # The short bag has many blocks, too; the unit converts at this rate, or its samples would be
-    # dropped as too fast.
+    # Small blocks, so that the short bag has many; a cycle of 2 ms, so that 500 Hz are allowed.
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 12)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)
@@ -239,8 +236,7 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
         parts, held_bytes = zip(*held, strict=True)
         assert list(parts) == sorted(parts)
         assert parts[-1] == 1.0
-    # With three times the messages the memory grows by the flags of the bag alone, one per case
-    # reading.
+    # Three times the messages only add memory for the regime flags, one per case reading.
     assert peaks[1] < 1.1 * peaks[0]
     third = len(parts) // 3
     assert max(held_bytes[-third:]) < 1.15 * max(held_bytes[:third])

@@ -89,7 +89,7 @@ def page():
 
 
 def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
-    assert not page.open  # every tag is closed
+    assert not page.open  # the page closes every tag
     for fact in (
         'Unit thermostatted-0001',
         evidence().calibration.provenance.created,
@@ -168,8 +168,7 @@ def test_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):
 
 
 def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
-    # WHY: a certificate is opened in a browser, and a bag may come from anybody. WHAT: names,
-    # serials, notes and hashes stay text.
+    # A browser shows names, serials, notes and hashes of a certificate as text, not as HTML.
     evil = '<script>alert("x")</script>'
     bag = write_bag(
         tmp_path / "a'b<img src=x onerror=alert(1)>$\\frac{.mcap", frame_id=evil, serial=evil
@@ -191,7 +190,7 @@ def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
 
 
 def test_hours_of_bag_stay_a_small_page():
-    # A day of readings at 2 Hz, and of windows at rest: hundreds of them per pixel.
+    # The bag has a day of readings at 2 Hz and of windows: hundreds of points per pixel.
     shown, windows = evidence().shown, evidence().windows
     time = np.arange(0.0, 86400.0, 0.5)
     value = 20.0 + 15.0 * np.sin(time / 9000.0) + np.random.default_rng(1).normal(size=len(time))
@@ -221,7 +220,7 @@ def test_bag_is_read_in_bounded_memory(tmp_path):
     finally:
         tracemalloc.stop()
     assert opened.n_samples == n_times * len(one.counts)
-    # All columns of this bag would take 32 bytes a sample and more; a block takes a part of it.
+    # All samples and stamps in memory would take more than 32 bytes a sample, a block takes less.
     assert peak < 64 * opened.n_samples
 
 
@@ -231,7 +230,7 @@ def test_calibration_alone_makes_a_page_and_its_figures_as_png(tmp_path):
     assert 'no recording was judged' in page.text
     assert '01.mcap' in page.text
     assert f'{1:064x}' in page.text
-    # Figures that need no bags; all others are drawn for the page.
+    # Without bags, only the figures of the calibration are drawn.
     names = [figure.name for figure in figures_of(evidence())]
     without_bags = [name for name in names if name in ('functions', 'step', 'hysteresis')]
     files = sorted(folder.iterdir())

@@ -66,7 +66,7 @@ def test_rounding_moves_neither_by_more_than_half_a_digit(value, expanded):
     text, of_it = rounded(value, expanded)
     assert float(of_it) == pytest.approx(expanded, rel=0.0501)
     assert len(of_it.replace('.', '').strip('0')) <= 2
-    # Half of the second digit of an uncertainty is at most a twentieth of it.
+    # Rounding an uncertainty to two digits changes it by at most a twentieth.
     assert abs(float(text.replace('−', '-')) - value) <= 0.0501 * expanded + 1e-9 * abs(value)
 
 
@@ -131,7 +131,7 @@ def test_a_mistake_in_the_statements_is_one_sentence(tmp_path, text, said):
 def test_the_example_is_accepted_and_is_what_the_page_shows():
     example = ROOT / 'config' / 'lab.example.yaml'
     info = load_certificate_info(example)
-    # All fields except the serial, which the calibration contains, and the remarks.
+    # The example file states all fields except the remarks and the serial of the unit.
     assert info.gravity.source == 'national gravity network'
     assert [instrument.name for instrument in info.instruments] == ['chamber', 'thermometers']
     page = (ROOT / 'docs' / 'recording.md').read_text(encoding='utf-8')
@@ -158,7 +158,7 @@ def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
     parts = [standards[name] for name in ('noise', 'attitude', 'model')]
     assert float(np.linalg.norm(parts)) == pytest.approx(claim)
     assert standards['repeatability'] == 0.0
-    # The budget has 1 ug of gravity, and the effect of a kelvin for the thermometers.
+    # The laboratory states uncertainties of gravity and thermometers, which join the budget.
     info = load_certificate_info(lab(tmp_path))
     stated = budget(evidence(), info)
     by_name = {contribution.name: contribution.standard for contribution in stated}
@@ -205,8 +205,7 @@ def test_table_over_temperature(tmp_path):
             at = float(row.temperature.replace('−', '-'))
             bias, sd, scale, scale_sd = in_a_soak(calibration, at)
             numbers = [float(cell.replace('−', '-')) for cell in row[2:]]
-            # The tolerance is half a digit of each value, and half a tenth of a kelvin at either
-            # end.
+            # Tolerance: half a digit of each value, and slope times rounding of the temperature.
             slack = 0.06 * abs(table.bias_slope) + 0.06 * numbers[1]
             assert numbers[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)
             assert numbers[1] == pytest.approx(2.0 * sd[k] / MICRO_G, rel=0.06)
@@ -233,7 +232,7 @@ def test_gravity_in_doubt_is_the_scale_factors_doubt(tmp_path):
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
     rows = {result.quantity: result for result in results(evidence(), info, ())}
     scale = fitted().calibration.axes.x.scale_factor
-    # Twice the uncertainty of gravity, a thousandth, is much more than that of the fit.
+    # U is twice the uncertainty of gravity, 1e-3 of it, which is far above that of the fit.
     assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
     assert (
         rows['bias x']

@@ -30,8 +30,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 
 def test_bias_and_scale_curves_by_hand():
-    # 3 counts per 10 K in a soak; after heating at 1 K/min for 10 min a lag of 600 s is 10 (1 -
-    # exp(-1)) K behind, with a weight of 0.3 counts per K; 300 counts per m/s^2.
+    # Bias: 0.3 counts/K, and 0.3 counts/K times the lag, 10 (1 - exp(-1)) K after 10 min.
     static, dynamic = (
         regime_set(*[axis_set((0.0, 0.3), (1.0, 7e-5), delta=delta)] * 3, rate_range_k_min=(0, 2))
         for delta in (0.0, 0.5)
@@ -54,7 +53,7 @@ def test_bias_and_scale_curves_by_hand():
 
 
 def test_a_soak_measures_what_the_calibration_lacks():
-    # The scale is wrong by 30 ppm in all soaks, in any direction of gravity.
+    # Make the scale of all axes wrong by 30 ppm in every soak.
     windows = evidence().windows
     up = np.array([position.up for position in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
@@ -63,13 +62,13 @@ def test_a_soak_measures_what_the_calibration_lacks():
     assert len(temperature) >= len(wrong.positions)
     bias, scale = errors[:, :3], errors[:, 3:]
     known = np.isfinite(scale)
-    assert known.any(axis=1).all()  # one of three axes has more than half of gravity
+    assert known.any(axis=1).all()  # some axis always has half of gravity
     assert scale[known] == pytest.approx(30.0, rel=1e-4)
     assert np.linalg.norm(bias, axis=1) == pytest.approx(30.0, rel=1e-4)
 
 
 def test_metres_of_a_navigator_by_hand():
-    # 1 mg gives 9.80665e-3 * 1800 m in 60 s; one micro-g gives at most 2 R 1e-6 by Schuler.
+    # An error of 1 mg gives 9.80665e-3 * 1800 m in 60 s; 1 ug at most 2 R 1e-6 m (Schuler).
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
 
@@ -77,8 +76,7 @@ def test_metres_of_a_navigator_by_hand():
 def test_map_of_the_sphere_keeps_areas():
     assert of_bags.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert of_bags.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 degrees is 1 - sin 45 of a hemisphere, and its disc the same part of the
-    # unit disc.
+    # The cap above 45 degrees is 1 - sin 45 of a hemisphere, and maps to this part of the disc.
     x, y = of_bags.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
@@ -160,7 +158,7 @@ def test_rates_are_those_of_the_gyroscope():
         celsius, drawn = np.array(soak.get_data(), dtype=float)
         bias = np.degrees(curve.bias_function.value(celsius - 20.0)) * 1e3
         slope = np.polyfit(celsius, bias, 1)[0]
-        # The drawn values equal the bias less a line, in mdeg/s and not in micro-g.
+        # The figure shows the gyroscope's bias less a line, in mdeg/s.
         np.testing.assert_allclose(drawn, bias - slope * (celsius - 20.0), atol=1e-9)
         assert f'{slope:+.3g}'.replace('-', '\u2212') in axes.get_title(loc='left')
     names = [figure.name for figure in figures_of(replace(evidence(), calibration=unit))]
@@ -223,5 +221,5 @@ def test_no_printed_page_is_empty(tmp_path):
     assert 5 <= len(pages) <= 12
     for page in pages:
         drawn = re.search(rb'\n%s 0 obj.*?stream\r?\n' % page, printed, re.DOTALL)
-        # The margin takes some lines.
+        # A page with content has over 200 lines of drawing commands; an empty page has few.
         assert zlib.decompressobj().decompress(printed[drawn.end() :]).count(b'\n') > 200

@@ -29,7 +29,7 @@ from thermo_comp.thermal.memory import MemorySpec
 from thermo_comp.unit.calibration_file import save_calibration
 
 RATE_HZ, CYCLE_NS = 50, 20_000_000
-NOISE = 0.01  # noise of a sample [m/s^2]: 3 counts of the unit of 300 per m/s^2
+NOISE = 0.01  # noise of a sample [m/s^2]: 3 counts at 300 per m/s^2
 START = Start(START_NS, 'T-1', 'counts', 9.80665, 'abc', MemorySpec(('case',), (('board', 60.0),)))
 
 
@@ -80,8 +80,7 @@ def finder():
 
 
 def test_windows_are_means_of_ten_seconds_at_rest():
-    # A rest of 25 s, 1 s of handling, and a rest of 21 s in another attitude give two windows
-    # each.
+    # Rests of 25 s and, in another attitude after 1 s of handling, 21 s give two windows each.
     first, second = standing(25 * RATE_HZ), standing(21 * RATE_HZ, 2)[:, [2, 1, 0]]
     handled = first[:RATE_HZ] + np.linspace(0.0, 900.0, RATE_HZ)[:, None]
     samples = np.concatenate((first, handled, second))
@@ -105,13 +104,15 @@ def test_what_is_no_rest_is_not_kept(fault):
     samples = standing(12 * RATE_HZ)
     stamps = START_NS + np.arange(len(samples)) * CYCLE_NS
     if fault == 'moves':
-        samples[300:] += 30.0  # 0.1 m/s^2
+        samples[300:] += 30.0  # step of 0.1 m/s^2
+
     elif fault == 'shakes':
         samples += 60.0 * np.sin(np.arange(len(samples)))[:, None]
     elif fault == 'stuck':
         samples[:] = samples[0]
     elif fault == 'tilts':
-        samples[:, 0] += np.linspace(0.0, 100.0, len(samples))  # 3 mrad/s
+        samples[:, 0] += np.linspace(0.0, 100.0, len(samples))  # tilt by 3 mrad/s
+
     elif fault == 'saturated':
         samples[:, 0] = 32767.0
     else:
@@ -120,8 +121,7 @@ def test_what_is_no_rest_is_not_kept(fault):
 
 
 def test_a_rest_that_lasts_a_day_is_kept_ever_more_rarely():
-    # Of a long rest all 60 windows of ten minutes are kept, then a window a minute up to the hour,
-    # then one in five minutes.
+    # Of a rest are kept: 60 windows in 10 min, one a minute up to 1 h, then one in 5 min.
     kept, one = 0, finder()
     samples = standing(6 * 60)
     for minute in range(71):
@@ -142,7 +142,7 @@ def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
     changed = bytearray(content)
     changed[place % len(content)] = value
     left = [one for _, one in decode(bytes(changed))[0]]
-    # A rest without its start does not count; a lost newline joins at most two lines.
+    # A changed byte loses one rest, two by a lost newline, or all by a damaged start line.
     assert all(one in [rest(k) for k in range(9)] for one in left)
     assert len(left) >= 7 or place % len(content) < len(encode(START))
 
@@ -191,7 +191,7 @@ def test_a_log_is_bounded_by_day_and_in_all(tmp_path, monkeypatch):
     assert len(sizes) == 6
     assert max(sizes) <= 2000
     assert sum(sizes) <= 5000 + 2000
-    # The oldest days are the thinnest, and no day is gone.
+    # The oldest days have been thinned most, and no day has been removed.
     assert sizes[0] < sizes[-1] / 2
     assert log.n_rests == len(logged(tmp_path))
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')
@@ -235,7 +235,7 @@ def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(tmp_path, unit, pee
     with file.open('ab') as torn:
         torn.write(encode(rest(9))[:40])
     before = logged(folder)
-    # Started again in the same folder, the node goes on after the torn line.
+    # Restart the node in the same folder: it appends after the torn line.
     with node_in_thread(*words) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         peer.join(node)

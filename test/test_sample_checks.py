@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Invalid samples (stuck, zero, too fast, of another unit) are treated alike in streams and blocks.
-"""
+"""Invalid samples (stuck, zero, too fast) are treated alike in streams and in blocks."""
 
 import math
 
@@ -76,8 +74,7 @@ def test_few_equal_samples_are_chance_however_long_they_take(rng):
 )
 @settings(max_examples=300, deadline=None)
 def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_values):
-    # Runs of equal samples, whose value differs from the next run's in one axis; with few values
-    # distant samples are equal by chance.
+    # Runs of equal samples; successive runs differ in one axis, distant runs may be equal.
     values = np.repeat(np.arange(len(lengths)) % n_values, lengths)
     samples = np.stack([values * (k == values % 3) for k in range(3)], axis=1) + 1.0
     stamps = np.arange(len(values), dtype=np.int64) * 20_000_000
@@ -99,7 +96,7 @@ def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_v
         begin = end
     assert collected == expected
     assert many.n_same == one.n_same
-    np.testing.assert_array_equal(many.run, one.run)  # NaN before the first sample
+    np.testing.assert_array_equal(many.run, one.run)  # NaN, before the first sample, equals NaN
 
 
 def test_a_user_may_believe_any_sample():
@@ -131,8 +128,7 @@ def test_an_acceleration_at_another_rate_has_another_noise(rng):
         recording(8000, 400.0, lambda _: tuple(GRAVITY * u + rng.normal(0.0, 1e-3) for u in UP)),
     )
     assert len(rows) == 8000
-    # Four times as fast samples average over a quarter of the time, and have four times the
-    # variance.
+    # At four times the rate samples average over a quarter of the time: four times the variance.
     assert rows[-1][3] / rows[0][3] == pytest.approx(4.0, rel=1e-6)
 
 
@@ -141,8 +137,7 @@ def test_gravity_is_that_of_the_place_or_of_the_calibration(rng):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
         run(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
         gravity = compensator.status().gravity
-        # 0.3 counts of noise and 0.29 of rounding: 1.4 mm/s^2 per probe, about 110 probes; and
-        # fractions of a count that this noise does not average, a tenth of 0.5.
+        # Tolerance: noise of 1.4 mm/s^2 over some 110 probes, plus rounding errors of 0.05 counts.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
 
 

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Plain values to dataclasses: every type hint accepts its values and refuses others by the key.
-"""
+"""Plain values to dataclasses: each type hint accepts its values, refuses others by the key."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal

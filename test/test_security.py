@@ -59,7 +59,7 @@ BOMB = '\n'.join(
 
 
 def test_metadata_of_a_bag_is_no_bomb(tmp_path):
-    # WHY: merge keys of aliases multiply: 30 lines of them to 10^28 entries.
+    # WHY: merge keys with aliases multiply: 30 lines of YAML expand to 10^28 entries.
     bag = tmp_path / 'bag'
     with BagWriter(bag) as writer:
         writer.write_temperature('temperature/board', [1], [20.0])

@@ -53,11 +53,10 @@ def test_a_perfect_model_leaves_the_noise(kind):
         norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # The mean square of the walk over 7.3 h is 9 * 7.3 / 2 per axis; three runs scatter
-        # widely.
+        # The walk's mean square over 7.3 h is 9 * 7.3 / 2 per axis; three runs scatter widely.
         assert 4.0 < vector < 20.0
     else:
-        # 1311 means scatter by 2 % and 1.2 %; the limits are five times as large.
+        # The RMS of 1311 means scatters by 2 % (norm) and 1.2 % (vector); the limits are 5 sd.
         assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
         assert vector == pytest.approx(1.12, abs=0.07)
 
@@ -75,7 +74,7 @@ def test_plans_are_what_their_names_say():
         ups = np.array([p.up for p in plan(name, 1)])
         np.testing.assert_allclose(np.linalg.norm(ups, axis=1), 1.0)
         assert np.any(ups != np.array([p.up for p in plan(name, 2)]))
-    # In the chamber positions of a bench tumble no axis has the same gravity throughout.
+    # In the three chamber positions of tumble-3 gravity along each axis varies by 0.5 g or more.
     assert np.ptp(np.array([p.up for p in plan('tumble-3', 1)][18:]), axis=0).min() > 0.5
     fitted = np.array([p.up for p in plan('chamber-18', 1)])
     held_out = np.array([p.up for p in plan('held-out', 1)])
@@ -92,10 +91,10 @@ def test_a_joint_that_slips_goes_round_a_loop():
         quick, _ = effect.change(_history(there_and_back))
         slow, _ = effect.change(_history(np.repeat(there_and_back, 7), 60.0))
         np.testing.assert_array_equal(slow[::7], quick)
-        # The play slips at its width in each direction.
+        # The joint slips at its width, in either direction.
         assert quick[199, 0] == pytest.approx(2.0, rel=0.01)
         assert quick[-1, 0] == pytest.approx(-2.0, rel=0.02)
-        # A second cycle closes the loop.
+        # A second cycle ends where the first ended: the loop is closed.
         twice, _ = effect.change(_history(np.concatenate([there_and_back] * 2)))
         assert twice[-1, 0] == pytest.approx(quick[-1, 0], rel=0.02)
 
@@ -118,7 +117,7 @@ def test_a_limited_flow_is_a_matter_of_on_and_off():
 
 
 def test_a_switched_load_heats_its_part():
-    """The warming equals the heat balance of an endless spell, and is zero before it is on."""
+    """The warming equals the heat balance of an endless load, and is zero before the load."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
@@ -130,7 +129,7 @@ def test_a_switched_load_heats_its_part():
     )
     warmer = of_part(on, 'board') - of_part(off, 'board')
     np.testing.assert_allclose(warmer[: int(spell)], 0.0, atol=1e-9)
-    # 0.5 W flow through 0.4 W/K to the case and about 4 W/K to the air.
+    # The load's 0.5 W flow through 0.4 W/K to the case and about 4 W/K to the air.
     to_air = next(link.conductance for link in unit.network.links if link.a == 'air')
     assert warmer[-1] == pytest.approx(0.5 / 0.4 + 0.5 / to_air, rel=1e-6)
 
@@ -189,10 +188,7 @@ def test_constants_hold_at_the_reference(name):
 
 @pytest.mark.parametrize('seed', range(8))
 def test_bare_quartz_has_the_published_slopes(seed):
-    """
-    Q-Flex class: scale slope 68..87 ppm/K from 5 to 35 degC with 0.31 ppm/K^2 of curvature, bias
-    slope 0.3..5 ug/K.
-    """
+    """Q-Flex class: scale 68..87 ppm/K at 5..35 degC, 0.31 ppm/K^2; bias 0.3..5 ug/K."""
     unit = unit_preset('bare-quartz', seed)
     board = np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5])
     bias, scale = _static(unit, board)
@@ -221,26 +217,19 @@ def test_specimens_differ_and_return():
     with pytest.raises(ValueError, match=r"`name` must be one of thermostatted, .*, got 'laser'"):
         unit_preset('laser')
 
-    # Noise of the reference: 5 ug/sqrt(Hz) over 60 s is 0.65 ug; a count per minute at 10 Hz adds
-    # 0.23.
-
 
 def test_sum_of_counts_is_the_integral_within_one_count(rng):
     charge = rng.uniform(-3000.0, 3000.0, (200_000, 3))
     start = first_charge(7)
     counts, _ = balanced(charge, start)
-    # The sums agree at every cycle, not only at the end; 1e-6 is the rounding of the float sum.
+    # Sums of charge and counts agree at every cycle; 1e-6 is the rounding of the float sum.
     short = np.cumsum(charge, axis=0) + start / 2.0**40 - np.cumsum(counts, axis=0)
     assert short.min() > -1e-6
     assert short.max() < 1.0 + 1e-6
 
 
 def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing():
-    """
-    WHY: a float sum of 1e9 counts has no digits left for the fraction.
-
-    WHAT: integer and fraction are separate, so that a day ends at the exact count.
-    """
+    """A day ends at the exact count; a float sum of 1e9 counts has no digits for fractions."""
     charge = np.full((400_000, 1), 2978.0 + 1.0 / 3.0)
     remainder = np.zeros(1, dtype=np.int64)
     total, n_cycles = 0, 0
@@ -249,7 +238,7 @@ def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing():
         total += int(counts.sum())
         n_cycles += len(counts)
     exact = n_cycles * Fraction(8935, 3)
-    # The fraction is kept to 2^-40 count: 8.8e6 of them could be off by 8e-6 count.
+    # The remainder has steps of 2^-40 count, which add to at most 8e-6 count in 8.8e6 cycles.
     assert abs(total - exact) < 1 + 1e-4
 
 

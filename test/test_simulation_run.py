@@ -49,7 +49,7 @@ def test_blocks_are_the_whole_bit_for_bit(name, block_size):
         np.testing.assert_array_equal(
             _joined(blocks, column, is_truth=True), getattr(whole.truth, column)
         )
-    # A reading is in the block that contains the cycle of its time.
+    # A block has the readings up to the end of its last cycle.
     for block in blocks[:-1]:
         assert block.board_stamp_ns[-1] <= block.accel_stamp_ns[-1]
 
@@ -74,9 +74,7 @@ def test_stamps_are_the_ends_of_the_cycles(unit):
 
 
 def test_an_error_source_more_leaves_the_others_numbers(unit):
-    """
-    Noise of the thermometer does not change the rest; a drifting bias is added to the same noise.
-    """
+    """Thermometer noise changes nothing else; a drifting bias is added to the same noise."""
     plain = simulate(unit, SHORT, UP)
     noisy = simulate(replace(unit, board=replace(unit.board, noise_sd=0.05)), SHORT, UP)
     assert np.all(noisy.board != plain.board)
@@ -87,14 +85,12 @@ def test_an_error_source_more_leaves_the_others_numbers(unit):
         plain.truth.scale - 1.0
     ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
-    # Two converters with the same starting phase: each is within one count of its integral.
+    # Either converter is within one count of its integral, and both start with the same phase.
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
 def test_counts_follow_the_truth(unit):
-    """
-    Without noise the running sum of the counts equals that of ``bias + K scale inverse(M) f``.
-    """
+    """Without noise the sum of the counts equals that of ``bias + K scale inverse(M) f``."""
     run = simulate(noiseless(unit), DEMO, UP, rate_hz=50.0)
     truth = run.truth
     s = truth.specific_force @ np.linalg.inv(unit.M).T
@@ -105,10 +101,7 @@ def test_counts_follow_the_truth(unit):
 
 
 def test_white_noise_has_its_density(unit):
-    """
-    Second route: Welch's spectrum is flat at ``2 density^2`` (one-sided), and the scatter of
-    60 s means is ``density / sqrt(60)``.
-    """
+    """Welch's spectrum is ``2 density^2``; 60 s means scatter by ``density / sqrt(60)``."""
     still = replace(unit, drift=())
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
@@ -145,8 +138,7 @@ def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
         (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, of_part(run.truth, 'case')
     )
     error = run.case - true
-    # At least 540 readings of 5 mK: the mean is good to 0.2 mK, the deviation to 3 %; the limits
-    # are five times as large.
+    # 540 readings of 5 mK determine the mean to 0.2 mK and the sd to 3 %; limits: 5 sd.
     assert error.mean() == pytest.approx(0.0, abs=1.1e-3)
     assert error.std() == pytest.approx(0.005, rel=0.16)
 
@@ -155,10 +147,7 @@ def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
     ('n', 'least'), [(6, 0.0), (9, 0.4), (12, 0.6), (18, 0.7), (24, 0.8), (26, 1.2), (40, 2.0)]
 )
 def test_positions_tell_the_nine_terms_apart(n, least):
-    """
-    Six faces determine the products of axes only by their tilts of a few degrees; nine and more
-    positions determine all terms of a quadric (bias, scale, misalignment).
-    """
+    """Nine or more positions determine all terms of a quadric: bias, scale, misalignment."""
     up = positions(n, 5)
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0)
     x, y, z = up.T
@@ -180,7 +169,7 @@ def test_run_refuses_what_cannot_be(unit):
         simulate(unit, SHORT, UP, gravity=float('nan'))
 
 
-# The two solutions are closed forms, so only rounding differs; temperatures are tens of degrees.
+# Both solutions of a thermal network are closed forms: they differ by rounding of tens of degC.
 ROUNDING = 1e-9
 
 
@@ -189,10 +178,7 @@ def response_of(network, time, air):
 
 
 def test_two_parts_follow_a_ramp_as_solved_by_hand():
-    """
-    Air - case - board with heat flow back: eigenvalues from the quadratic formula, lags from the
-    heat balance of an endless ramp, amplitudes from the start at rest.
-    """
+    """Air - case - board with heat flow back: closed forms of eigenvalues, lags, amplitudes."""
     c0, c1, g0, g1, rate = 700.0, 300.0, 3.0, 0.4, 1.0 / 60.0
     network = ThermalNetwork(
         {'case': c0, 'board': c1}, (Link(AIR, 'case', g0), Link('case', 'board', g1))
@@ -200,7 +186,7 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand():
     trace, determinant = -(g0 + g1) / c0 - g1 / c1, g0 * g1 / (c0 * c1)
     root = math.sqrt(trace * trace - 4.0 * determinant)
     modes = np.array([(trace + root) / 2.0, (trace - root) / 2.0])
-    # In a ramp the path to the air heats both capacities, the inner path the board's.
+    # In a ramp the link to the air carries the heat of case and board, the inner link the board's.
     lag = np.array([(c0 + c1) / g0, (c0 + c1) / g0 + c1 / g1])
     shapes = np.array([modes + g1 / c1, [g1 / c1, g1 / c1]])
     amplitude = np.linalg.solve(shapes, lag)
@@ -230,17 +216,17 @@ def test_presets_agree_with_a_numerical_integrator(name):
         (0.0, program.duration_s), states[0], method='LSODA', t_eval=time, rtol=1e-10, atol=1e-10,
         max_step=60.0,
     )  # fmt: skip
-    # The integrator steps over the corners of the program, which is its error.
+    # The numerical integrator errs by 2e-5 K, as it steps over the corners of the program.
     np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
 
 
 def test_creep_relaxes_towards_its_part():
-    """The creep after a step of a part lags it by its time constant."""
+    """After a step of the part's temperature the creep decays with its time constant."""
     step = np.full((7201, 1), 10.0)
     step[0] = 0.0
     history = PartHistory(('case',), step, np.zeros(1), 1.0)
     bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
-    # The step takes 1 s, 1.4e-4 of the time constant.
+    # The step lasts one interval of 1 s, 1.4e-4 of the time constant.
     np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)
     np.testing.assert_array_equal(scale, 0.0)
 

@@ -36,10 +36,7 @@ def ground(rng, seconds):
 
 
 def hover(rng, seconds, vibration):
-    """
-    Make a flight: thrust of about g, a slow sway by some degrees at some deg/s, and propeller
-    vibration.
-    """
+    """Make a flight: thrust of about g, a slow sway by some degrees, propeller vibration."""
     time = time_of(seconds)
     tilt = np.radians(3.0) * np.sin(2.0 * np.pi * time[:, None] / np.array((5.0, 7.0)))
     thrust = GRAVITY * (1.0 + 0.03 * np.sin(2.0 * np.pi * time / 11.0))
@@ -93,7 +90,7 @@ def test_a_gyroscope_that_drifts_with_temperature_rests(rng):
 
 
 def by_hand(rng, n_rests, rest_s, shaky, misalignment=0.0):
-    """Make hand-held rests with turns between; the shaky ones scatter four times as much."""
+    """Make hand-held rests with turns between; shaky rests scatter four times as much."""
     ups = positions(n_rests, 4)
     matrix = np.eye(3)
     matrix[1, 0] = matrix[2, 1] = misalignment
@@ -116,14 +113,14 @@ def test_each_short_rest_is_found(rng, rest_s, shaky):
     result = fit([source(accel)], OPTIONS)
     assert len(result.positions) == 10
     axes = result.calibration.axes
-    # 350 samples of 3 to 12 mg give a mean of 0.2 to 0.6 mg in each of ten rests.
+    # The mean of a rest, 350 samples with 3 to 12 mg of noise, is good to 0.2 to 0.6 mg.
     np.testing.assert_allclose([axes.x.bias, axes.y.bias, axes.z.bias], (0.3, -0.2, 0.1),
                                atol=1.5 * MG)  # fmt: skip
     assert result.residuals[-1].fitted.rms < 2.0 * MG
 
 
 def test_motion_does_not_pass_for_a_rest_in_the_scan(rng):
-    # Two more stretches with the noise of the shaky rests, in which the unit is pushed.
+    # At the end the unit is pushed for 10 s, with the noise of a shaky rest but 1.04 g.
     accel = by_hand(rng, 14, 6.0, (3,), misalignment=5e-3)
     time = time_of(10.0)
     push = GRAVITY * np.array((0.0, 0.6, 0.8)) * 1.04 + 0.0 * time[:, None]
@@ -144,9 +141,8 @@ def test_the_shortest_rest_is_yours_to_say(rng):
 
 
 def test_a_ramp_moves_no_unit_at_rest(rng):
-    # WHY: a quiet unit with 60 ug/K in a ramp of 2 K/min changes by 60 ug between cells of 30
-    # samples at 1 Hz, 60 times the noise of their means, without moving. WHAT: the rest is one
-    # position; a knock of 0.1 mrad within the ramp still makes two.
+    # A drift of 60 ug per cell, 60 times the noise, is one position; a knock of 0.1 mrad makes
+    # two.
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG

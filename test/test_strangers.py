@@ -65,8 +65,7 @@ def test_the_integration_is_exact_on_the_way():
 
 
 def test_still_air_is_another_law_of_the_hidden_node():
-    # In still air the hidden node has another temperature between case and board than in the
-    # chamber, so that a prediction from the board in the chamber is wrong outside.
+    # In still air the hidden node has another temperature than chamber data predict.
     shares = []
     for environment in (units.CHAMBER, units.STILL_AIR):
         _, states = ramp(unit(), 0.01, 12, environment)
@@ -89,7 +88,7 @@ def test_noise_bias_scale_and_misalignment_follow_their_definition():
     n = len(error)
     sd = 5.0 * UG * np.sqrt(0.5)
     assert np.abs(error.mean(axis=0)).max() < 4.0 * sd / np.sqrt(n)
-    # The sd of an sd over n samples is 1 / sqrt(2 n); gain and M change it by 3 %.
+    # An sd from n samples has a relative sd of 1 / sqrt(2 n); gain and M change the noise by 3 %.
     assert error.std(axis=0) == pytest.approx([sd] * 3, rel=0.03 + 4.0 / np.sqrt(2 * n))
 
 
@@ -98,8 +97,7 @@ def test_a_support_tilts_with_the_square_of_temperature():
     bag = record(unit(), units.program(20, 10, (35, 1, 60)), LEVEL, rng_of('tilt'), tilt=axis)
     case = np.interp(bag.time_s - 1.0, *bag.temperatures['case'])
     angle = np.arctan2(-bag.force[:, 1], bag.force[:, 2])
-    # Readings are 5 s apart and interpolated linearly; half a micro-radian is 1/450 of the largest
-    # tilt.
+    # Tolerance: the case is interpolated between readings 5 s apart; the largest tilt is 225 urad.
     assert angle == pytest.approx(1e-6 * (case - 20.0) ** 2, abs=5e-7)
     assert np.linalg.norm(bag.force, axis=1) == pytest.approx(GRAVITY)
 
@@ -110,8 +108,7 @@ def test_cold_start_is_as_cold_as_the_air_and_then_warms_up():
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
     for bag, heat in ((cold, 0.0), (warm, 2.0)):
         board, case = bag.temperatures['board'][1][0], bag.temperatures['case'][1][0]
-        # The chamber's control oscillates by 0.03 K, and the first reading is 0.3 s after the
-        # switch-on.
+        # Tolerance: the chamber's ripple of 0.03 K, and self-heating for 0.3 s at the start.
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
@@ -165,7 +162,7 @@ def test_turn_on_draws_its_positions_and_its_shifts(recorded):
     assert set(collected) == expected
     for (_, label), shifts in collected.items():
         sd, n = float(label.split()[2]), np.size(shifts)
-        # The sd of an sd over n draws is 1 / sqrt(2 n).
+        # An sd from n draws has a relative sd of 1 / sqrt(2 n).
         assert np.std(shifts) == pytest.approx(sd, rel=5.0 / np.sqrt(2 * n), abs=1e-12)
 
 
@@ -179,7 +176,7 @@ def test_the_bound_falls_with_noise_and_with_data():
     assert louder == pytest.approx(2.0 * sd, rel=1e-6)
     twice = cases.bias_bound(given, np.concatenate((up, up)), bags + bags)
     assert twice == pytest.approx(sd / np.sqrt(2.0), rel=1e-6)
-    # If only the bias is unknown, its sd is the noise of the mean over all samples.
+    # With nothing else unknown, the sd of the bias is the noise of the mean of all samples.
     least = UG * given.density / np.sqrt(sum(len(bag.time_s) for bag in bags) * 2.0)
     assert (sd > least).all()
     assert (sd < 100.0 * least).all()
@@ -215,13 +212,13 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
         strangers.error_of([by_norm([fit], order=order)(held)], [held], is_drift=False)
         for order in (3, 0)
     )
-    # The remaining errors are products of two small terms that the cubic does not contain.
+    # The cubic neglects products of small terms, such as misalignment times bias: below 5 ug.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
 
 
 def test_constants_by_hand_keep_the_scale_of_few_attitudes():
-    # With one attitude and much scatter the best fit is a scale that makes all forces equal.
+    # Without a bound on the scale, a fit to one noisy attitude makes all forces equal.
     rng = rng_of('few')
     samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
     few = Minutes(samples, np.full(200, 20.0), np.full((200, 3), np.nan))
@@ -230,7 +227,7 @@ def test_constants_by_hand_keep_the_scale_of_few_attitudes():
 
 
 def test_a_bias_at_the_reference_is_held_against_its_bound():
-    # A calibration in counts whose bias is wrong by 1 count, 1 / 300 m/s^2, on x.
+    # The bias of x in the calibration is wrong by 1 count, 1 / 300 m/s^2.
     bias = np.array([0.1, -0.2, 0.3])
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
     bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
@@ -361,6 +358,6 @@ def test_blocks_go_by_the_clock_and_share_no_sample():
     blocks = blocks_of(part(bag, slice(9000, 86400), 'rest'), 'rest')
     assert list(blocks) == list(range(8))
     times = np.concatenate([block.time_s for block in blocks.values()])
-    # The last sample alone would be a block.
+    # The recording's last sample would be a block of one sample, which is left out.
     assert times.tolist() == bag.time_s[9000:-1].tolist()
     assert all((block.time_s // 10800.0 == number).all() for number, block in blocks.items())

@@ -80,8 +80,7 @@ def test_what_a_fit_would_miss_is_named(tmp_path, temperature, options, text):
     ],
 )
 def test_a_clock_that_is_set_back(tmp_path, back_s, text):
-    # WHY: the survey counted steps: a clock set back by ten minutes in the middle of a recording
-    # was `1 stamps do not rise`, and a fit left out ten minutes of samples.
+    # WHY: if a clock was set back by 10 min, a fit left out 10 min; the survey named one stamp.
     result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0), gap_s=-back_s)
     assert any(text in finding for finding in result.findings)
 
@@ -93,7 +92,7 @@ def test_one_direction_only(tmp_path):
 
 
 def test_a_quantum_is_no_ramp(tmp_path):
-    # Whole degrees that alternate: 1 K within a second is a step of the sensor, not 60 K/min.
+    # Temperatures alternate between whole degrees: 1 K within 1 s is no ramp of 60 K/min.
     flips = 20.0 + (np.arange(3600) % 2)
     result = survey(tmp_path / 'bag', flips)
     board = result.thermometers['board']

@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Text from outside is shown and never interpreted; a serial is one printable line everywhere.
-
-WHY: serials, topics and metadata of a bag reached the terminal unchanged, with escape sequences
-and lines that looked like the program's; a Cyrillic serial ended a command on a latin-1 terminal.
-"""
+"""Text from outside (serials, topics, metadata) is printable, without escape sequences."""
 
 import io
 import json
@@ -145,7 +140,7 @@ def test_any_terminal_can_show_it(tmp_path, cli, monkeypatch, encoding):
         content = terminal.read()
         assert ('Блок' if encoding == 'utf-8' and not more else r'\u0411') in content
         assert r'not \udcff utf-8.yaml' in content
-    if encoding == 'latin-1':  # as the user wrote it
+    if encoding == 'latin-1':  # the name as the user wrote it
         assert r'\u0411' in cli('info', name, PYTHONIOENCODING=encoding).stdout
     absent = cli('info', tmp_path / os.fsdecode(b'no\xff.mcap'), code=1)
     assert r'no\udcff.mcap: ' in absent.stderr

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The thermometer against closed-form temperatures: error, claimed variance, outliers, invariance.
-"""
+"""The thermometer against closed-form temperatures: error, claimed variance, outliers."""
 
 import math
 
@@ -50,10 +48,7 @@ def settled(noise=0.001, n=600, **changes):
 
 @pytest.fixture(scope='module')
 def errors():
-    """
-    Return squared errors and variances of all sensors over a soak, a ramp and a soak, three runs
-    each.
-    """
+    """Return squared errors and variances of all sensors: soak, ramp and soak, three runs each."""
     collected = {}
     for name, (noise, quantum, dt) in SENSORS.items():
         runs = []
@@ -85,8 +80,8 @@ PARTS = {
 def test_variances_are_honest(errors, sensor, part):
     # The mean squared error over the claimed variance is ideally 1. In soaks and ramps the claim
     # includes changes that might have begun, and is up to a few times too large; at the onset and
-    # the end the change is real and not yet detected. Coarse sensors have few independent errors
-    # in three runs: their mean scatters by a factor of 2.
+    # the end the change is real and not yet detected. The mean of the few independent errors of a
+    # coarse sensor scatters by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -106,8 +101,7 @@ def test_variances_are_honest(errors, sensor, part):
     ],
 )  # fmt: skip
 def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
-    # The limits are about 1.5 times the measured errors, noise averaged over the filter's memory.
-    # A sensor with steps of 1 K crosses an edge every two minutes and determines the rate to 10 %.
+    # Limits: 1.5 times the errors found (averaged noise); steps of 1 K give the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
@@ -115,20 +109,19 @@ def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
 
 
 def test_a_crossed_edge_locates_the_temperature():
-    # A reading of 20.0 becomes 21.0 when the temperature passes 20.5: then the estimate is 20.5.
+    # A reading of 20.0 becomes 21.0 when the temperature passes 20.5, which is the estimate.
     thermometer = Thermometer(ThermometerSettings(0.01, 1.0))
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0)
     assert thermometer.var_temperature == pytest.approx(1.0 / 12.0, rel=0.2)
     thermometer.update(600 * SECOND_NS, 21.0)
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
-    # The edge is as precise as the noise and the change within one second, a few mK.
+    # The crossing locates the temperature to the noise, plus the change within one second.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
 def test_an_unchanged_coarse_reading_is_not_an_ever_better_one():
-    # WHY: a thousand equal readings only show that the temperature is within the cell. WHAT: the
-    # claimed sd stays that of a uniform distribution, 1 / sqrt(12) of a quantum.
+    # A thousand equal readings leave the sd of a uniform distribution, 1 / sqrt(12) quantum.
     thermometer = Thermometer(ThermometerSettings(0.001, 0.0625))
     for k in range(5000):
         thermometer.update(k * SECOND_NS, 20.0)
@@ -145,7 +138,7 @@ def test_a_constant_without_noise_is_exact():
 
 
 def test_a_straight_line_without_noise_is_found():
-    # The rate starts with an sd of 3 K/min and is measured by 5 mK over minutes.
+    # The prior sd of the rate, 3 K/min, is negligible after minutes of readings of 5 mK.
     thermometer = Thermometer(ThermometerSettings())
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0 + 0.01 * k)
@@ -218,7 +211,7 @@ def test_what_is_no_number_or_not_newer_changes_nothing(stamp_s, reading):
 
 
 def test_a_small_jump_counts_less_than_a_reading():
-    # 15 sigma are within five limits of 6 sigma, so the reading has the influence of one limit.
+    # A jump of 15 sigma is below five times the limit of 6 sigma: it counts like one of 6 sigma.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004
@@ -286,7 +279,7 @@ def test_extrapolation_is_linear_then_held():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # The thermometer cannot know whether the ramp continued for the other 55 s.
+    # Held after 5 s: the sd is the change if the ramp of 0.01 K/s went on for another 55 s.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 
@@ -305,7 +298,7 @@ def test_reset_forgets_the_readings():
     thermometer = settled()
     thermometer.reset()
     assert thermometer.stamp_ns is None
-    assert thermometer.update(0, 30.0)  # older than the previous reading: a jump of time
+    assert thermometer.update(0, 30.0)  # earlier than before the reset
     assert thermometer.temperature == 30.0
 
 

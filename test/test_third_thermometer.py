@@ -62,7 +62,7 @@ def record(path, run):
 
 def fitted(bags):
     sources, _ = fit_sources(bags)
-    # The effect follows the present temperature of the lid; these columns are a sixth of the bank.
+    # The lid's effect has no lag: the groups needed are a sixth of the bank of columns.
     groups = ('curve', 'gradient', 'board')
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups)).calibration
 
@@ -98,7 +98,7 @@ def test_a_third_thermometer_explains_what_the_others_do_not_see(runs, tmp_path)
         index = np.searchsorted(runs[-1].accel_stamp_ns, corrected.accel_stamp_ns)
         error = corrected.accel - truth.specific_force
         use = truth.cycle_s[index] > 600.0
-        # Means of a minute less their mean: noise and constants do not matter here.
+        # Compare the scatter of minute means, in which noise and constants do not matter.
         n = int(use.sum()) // 120 * 120
         means = error[use][:n].reshape(-1, 120, 3).mean(axis=1)
         errors[sees_lid] = float(np.sqrt(np.mean(np.var(means, axis=0)))) / MICRO_G

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The only file that uses undocumented parts of rclpy: these tests fail if rclpy changes them."""
+"""Undocumented parts of rclpy, used by waitloop.py only: a change in rclpy fails these tests."""
 
 import threading
 import time
@@ -97,7 +97,7 @@ def test_messages_come_serialized_in_order_with_their_time(node, peer):
         running.wait_for(lambda: len(running.messages) == 500)
     values = [deserialize_message(data, Vector3Stamped).vector.x for data in running.messages]
     assert values == [float(k) for k in range(500)]
-    # The reception times order several subscriptions, so they must exist and rise.
+    # The node orders messages of several topics by their reception times, which must rise.
     assert running.received_ns == sorted(running.received_ns)
     assert running.received_ns[0] > 0
 
@@ -141,7 +141,7 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node, peer):
         flooding = threading.Thread(target=flood, daemon=True)
         flooding.start()
         try:
-            # Samples must flow, as a waiting loop serves everything in any case.
+            # Wait until samples flow: only then services and timers compete with samples.
             running.wait_for(lambda: len(running.messages) > 100)
             n_ticks = len(ticks)
             ordinary.publish(Bool(data=True))
@@ -150,7 +150,7 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node, peer):
         finally:
             stop.set()
             flooding.join(TIMEOUT)
-    # A reload must take at most 100 ms, including the time of its client.
+    # Polling every 20 ms leaves time for a reload within 100 ms, including its client.
     assert OTHERS_PERIOD_NS <= 20_000_000
 
 
@@ -174,7 +174,7 @@ def test_a_regular_call_goes_on_with_and_without_samples(node, peer):
             publisher.publish(Vector3Stamped())
             running.wait_for(lambda n=n_sent: len(running.messages) == n)
         running.wait_for(lambda: len(called) > n_before and called[-1] == 50)
-        # Another timer replaces the first, and fires when it is due, not earlier.
+        # A second periodic call replaces the first, and is called when it is due, not earlier.
         again = []
         start = time.monotonic()
 
@@ -222,7 +222,7 @@ def test_quality_of_service_is_open_to_overrides(node):
     qos = QoSProfile(depth=7)
     loop.subscribe(Vector3Stamped, 'samples', qos)
     loop.subscribe(Vector3Stamped, 'others', qos)
-    # rclpy writes an override into the given profile, which another user must not see.
+    # rclpy writes overrides into the profile it gets, so each subscription needs a copy.
     assert qos.depth == 7
     depth = node.get_parameter('qos_overrides./samples.subscription.depth')
     assert depth.value == 7

@@ -14,10 +14,7 @@ BOARD_LAG_S = 600.0
 
 
 def lagged(t, corners, lag):
-    """
-    Return the response of a first-order lag to a chamber whose rate [K/min] changes at corners
-    [s].
-    """
+    """Return a first-order lag behind a chamber whose rate [K/min] changes at corners [s]."""
     out = np.zeros(len(t))
     before = 0.0
     for at, rate in corners:

@@ -3,8 +3,8 @@
 """
 Owns the progress of a test during recording: positions, resulting accuracy, what is missing.
 
-Blocks are added as they come. A rest in another direction than the present position begins the
-next position; knocks and handling in between belong to the previous position.
+Blocks of samples are added as they arrive. A rest in another direction than the present position
+begins the next position; knocks and handling in between belong to the previous position.
 """
 
 import math
@@ -23,7 +23,8 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s]; the wanted soak if that is shorter.
 _REST_S = 10.0
-# Minimum length of a cell [s], and number of samples from which it is chosen.
+# Minimum length of a cell (samples averaged together) [s], and number of samples from which the
+# length is chosen.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that are searched again for the begin of a rest.
 _LOOKED_BACK = 200
@@ -61,11 +62,11 @@ class Account:
     """
     State of a test, and what is missing.
 
-    The last position is unfinished. `worst_sd_g` is the sd of the force in the worst attitude,
-    `constants_sd` that of bias [g], relative scale and M [rad], as in `coverage`. `next_up` is the
-    recommended next direction, `next_deg` away from `now`, the direction of the newest reading
-    (NaN before any); `hole` is the direction farthest from all positions. `findings` are texts
-    about missing data.
+    The last of `positions` is unfinished. `worst_sd_g` is the sd of the force in the worst
+    attitude, `constants_sd` the sd of bias [g], relative scale and M [rad], as in `coverage`.
+    `next_up` is the recommended next direction, `next_deg` away from `now`, the direction of the
+    newest reading (NaN before any); `hole` is the direction farthest from all positions.
+    `findings` are texts about missing data.
     """
 
     positions: tuple[Position, ...]
@@ -106,7 +107,7 @@ class Acquisition:
         self._start()
 
     def _start(self) -> None:
-        """Restart, possibly with another clock."""
+        """Restart the search; the next samples may have another clock."""
         self._accumulator = CellAccumulator(_CELL_S, None)
         # Samples kept until there are enough to choose the length of a cell.
         self._held: list[tuple[Ints, Floats]] | None = []
@@ -118,7 +119,7 @@ class Acquisition:
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:
-        """Take a block; return the stamps [ns] at which further positions begin."""
+        """Take a block of samples; return the stamps [ns] at which further positions begin."""
         for name, readings in block.temperatures.items():
             self._readings.setdefault(name, []).append(readings)
         if not len(block):
@@ -161,14 +162,15 @@ class Acquisition:
         return cells.part(slice(int(np.searchsorted(cells.time, begin_s)), None))
 
     def _turn(self, cells: Cells) -> int | None:
-        """Find where the sensor first rests in another direction than before [ns]."""
+        """Find the stamp at which the sensor first rests in another direction [ns]."""
         # Search only the new cells and the last `_LOOKED_BACK` earlier cells.
         n_looked, self._n_looked = self._n_looked, len(cells.count)
         cells = cells.part(slice(max(n_looked - _LOOKED_BACK, 0), None))
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # After a quiet position, judge the rest of a noisier position by its own noise.
+        # Search the cells after the last rest alone: a noisier rest is still relative to its own
+        # noise.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [
@@ -201,7 +203,7 @@ class Acquisition:
         self._centre = coverage.rough_centre(means)
 
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
-        """Combine the rests of the position, up to the begin of the next."""
+        """Combine the rests of the position, up to the next position."""
         by_name = {
             name: survey_thermometer([_part(part, _EVER_NS, end_ns) for part in parts])
             for name, parts in self._readings.items()

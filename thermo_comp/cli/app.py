@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> None:
     hold_standard_streams()
     # With several BLAS threads small matrices take up to 16 times longer on busy cores.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that clean-up code runs
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM runs clean-up code
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -91,7 +91,7 @@ def run(arguments: list[str]) -> int:
     except _UsageMistake as mistake:
         context = getattr(mistake, 'ctx', None)
         command = 'thermo_comp' if context is None else context.command_path
-        if message := mistake.format_message():  # empty if typer has printed the help
+        if message := mistake.format_message():  # no message: typer printed the help
             output.error(f'{_plain(message, arguments)} (see: {command} --help)')
         return int(mistake.exit_code)
     except typer.Abort:
@@ -103,7 +103,7 @@ def run(arguments: list[str]) -> int:
         output.error(f'this command needs {failure.name}: pip install thermo_comp')
         return 1
     except BrokenPipeError:
-        # The reader closed the pipe (`... | head`): avoid the interpreter's message at its end.
+        # The reader has closed the pipe (`... | head`): avoid the interpreter's message at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as failure:
@@ -132,7 +132,7 @@ def _plain(message: str, arguments: list[str]) -> str:
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Split arguments into a command's and those of ROS (from ``--ros-args`` up to ``--``)."""
+    """Split arguments into the command's and ROS' (from ``--ros-args`` up to ``--``)."""
     for_command: list[str] = []
     for_ros: list[str] = []
     target = for_command

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..unit.calibration import Calibration
 
 _BAG = argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
-_AS_THE_NODE = "As the node's parameter of this name, in s."
+_AS_THE_NODE = "Value of the node's parameter of this name, in s."
 
 
 def info(

@@ -32,7 +32,7 @@ _FINDINGS = {
     'backwards': 'rows whose time goes back, kept',
     'repeated': 'rows whose time stands still, kept',
 }
-# Largest file [bytes]; all parameters of a vehicle are about 60 kB.
+# Largest parameter file [bytes]; all parameters of a vehicle are about 60 kB.
 _LIMIT = 4 << 20
 
 
@@ -60,9 +60,9 @@ def convert(
     A column map names the columns and their units; the readings at rest must
     agree with it. config/columns has examples. If no map is given, it is
     guessed from the headings and printed; a table of [t] ax ay az [wx wy wz]
-    needs no headings. The board temperature is the IMU's in a PX4 or ArduPilot
-    log, in a bag that of the thermometer in the namespace of the Imu topic; the
-    case temperature is that of the barometer.
+    needs no headings. The board temperature is the IMU's in a PX4 or ArduPilot log, and the
+    reading of the thermometer in the Imu topic's namespace in a bag; the case temperature is that
+    of the barometer.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -189,10 +189,9 @@ def export(
     """
     Write a calibration as a file of another tool.
 
-    PX4 and ArduPilot keep a cubic of temperature per axis' offset; imu_tk
-    (.calib), imu_calib and Kalibr (YAML) keep bias, scale and misalignment at
-    the reference temperature. The other parts of the calibration are lost;
-    they are listed with the resulting error.
+    PX4 and ArduPilot keep the offset of each axis as a cubic of temperature; imu_tk (.calib),
+    imu_calib and Kalibr (YAML) keep bias, scale and misalignment at the reference temperature.
+    Parts of the calibration that the file cannot hold are listed with the resulting error.
 
     Example:
       thermo_comp export unit42.yaml --to px4 -o unit42.params
@@ -238,8 +237,8 @@ def import_(
 
     Thermal parameters of PX4 and ArduPilot give the bias over temperature; the files of imu_tk,
     imu_calib and Kalibr give bias, scale and misalignment. The static and the dynamic regime get
-    the same set. The input unit is that of the file: m/s^2 (node: input:=imu), or counts. Parts
-    that the file lacks need a fit to bags of a thermal test.
+    the same set. The calibration's input unit is that of the file: m/s^2 (node: input:=imu), or
+    counts. Parts that the file lacks need a fit to bags of a thermal test.
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml

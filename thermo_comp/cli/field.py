@@ -30,8 +30,8 @@ def update(
 
     The calibration is the prior, aged as far as the rests show; rests may
     be in any attitude. Old and new calibration are compared on days left out
-    of the update. The new file is written only if it is better by more than
-    one standard error; otherwise the exit code is 3.
+    of the update. The new calibration is written only if its gain is above one standard error;
+    otherwise the exit code is 3.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -88,7 +88,7 @@ def evaluate_rests(
     tolerance: float | None,
     out: Output,
 ) -> None:
-    """Print the drift of a unit over a rest log; exit code 1 if it exceeds the claimed sd."""
+    """Print the drift over a rest log; exit code 1 if the drift exceeds the claimed sd."""
     from ..field.series import read_rests, series_of
     from ..field.watch import LIMIT, watch
     from ..unit.calibration_file import load_calibration

@@ -102,7 +102,7 @@ def evaluate(
 
 
 def _tell_axes(out: Output, judged: 'Judgement') -> None:
-    """Print the thermal movement of each axis, and its shift where the positions show it."""
+    """Print the thermal drift of each axis and, if determined, the shift since the fit."""
     columns = ['axis', 'static ug', 'dynamic ug']
     title = 'thermal drift of each axis at rest (RMS of its windows)'
     if judged.shifts:

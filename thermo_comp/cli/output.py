@@ -92,7 +92,8 @@ class Output:
             def show(
                 columns: Sequence[str], rows: Sequence[Sequence[Cell]], lines: Sequence[str]
             ) -> None:
-                # On a low terminal show all lines, and as many of the newest rows as fit.
+                # If the terminal is too short, show all lines, and as many of the newest rows as
+                # fit.
                 newest = rows[-max(1, console.height - len(lines) - 3) :]
                 shown = [*aligned(columns, newest), '', *lines]
                 view.update(Text('\n'.join(_shown(x, sys.stderr) for x in shown)), refresh=True)
@@ -142,8 +143,8 @@ def text(cell: Cell) -> str:
 
 
 def micro(value: float) -> str:
-    """Return a number of millionths as the tables show it."""
-    # Adding 0.0 turns -0.0 into 0.0.
+    """Return a number in ppm, micro-g or micro-rad as the tables show it."""
+    # Adding 0.0 turns a negative zero into 0.0.
     return f'{round(value, 1) + 0.0:.1f}' if abs(value) < 99.95 else f'{value:.0f}'
 
 
@@ -187,5 +188,5 @@ def _plainer(value: Any) -> Any:
         return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return dict(value)
-    # numpy's arrays and scalars, without importing it
+    # arrays and scalars of numpy, which need not be imported
     return value.tolist() if hasattr(value, 'tolist') else str(value)

@@ -83,7 +83,7 @@ def record(
             live = stack.enter_context(LiveTopics(topics=topics, ros_args=context.obj))
             news, problems = live.blocks(over.wait), lambda: live.problems
             out.line('listening; Ctrl-C ends the recording with complete bags')
-            sys.stdout.flush()  # the reader of a pipe waits for this line
+            sys.stdout.flush()  # a program that reads the pipe waits for this line
         show = stack.enter_context(out.live())
         for account in _accounts(out, news, test, bags):
             if show is None:
@@ -119,7 +119,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks as they come; yield the state of the test in each pause, until complete."""
+    """Write blocks as they arrive; yield the state of the test in each pause, until complete."""
     chosen: str | None = None
     for new in news:
         if new is not None:
@@ -203,7 +203,7 @@ def _tell(out: Output, account: 'Account', problems: Sequence[str], last: dict[s
     for number, position in enumerate(account.positions, 1):
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
-    # Ignore the reading after the semicolon, which always changes a little.
+    # Ignore the accelerometer reading after the semicolon, which changes with the noise.
     new = {name: text for name, text in news.items() if last.get(name) != text.partition(';')[0]}
     for name, text in new.items():
         last[name] = text.partition(';')[0]

@@ -34,7 +34,7 @@ def simulate(
         'Kind of unit: thermostatted, bare-quartz, mems, or demo (that of the sample bags).',
         'thermostatted',
     ),
-    unit_seed: int = option('Seed of the specimen of this kind of unit.', 1, min=0),
+    unit_seed: int = option('Seed of the specimen of the chosen kind of unit.', 1, min=0),
     plan: str | None = option(
         'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
         'tumble, tumble-3, tumble-1, held-out; on a rotation: centrifuge or rate-table.'
@@ -173,7 +173,7 @@ def _write_rate(writer: 'BagWriter', spin: 'Spin', duration_s: float) -> None:
 def _write(
     writer: 'BagWriter', runs: Iterator['SimulatedRun'], unit: 'UnitModel', is_imu: bool
 ) -> Iterator[dict[str, int]]:
-    """Write a run by blocks, from its first temperatures on; yield the numbers of messages."""
+    """Write a run block by block, temperatures first; yield the numbers of messages."""
     import numpy as np
 
     from ..recording.blocks import ImuColumns
@@ -188,7 +188,7 @@ def _write(
             ]
             start_ns = max(first) if len(first) == 2 else 0
         keep = run.accel_stamp_ns >= start_ns
-        # Temperatures first: at equal stamps a reading precedes the sample.
+        # Write temperatures first: at equal stamps a temperature precedes the sample.
         writer.write_temperature(topics.board, run.board_stamp_ns, run.board)
         writer.write_temperature(topics.case, run.case_stamp_ns, run.case)
         stamp_ns, counts = run.accel_stamp_ns[keep], run.counts[keep]

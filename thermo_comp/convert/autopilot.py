@@ -13,7 +13,7 @@ the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher
 temperature.
 
 ArduPilot's DataFlash (``.BIN``): a message type per IMU in old logs (``IMU``, ``IMU2``), a type
-with an instance number ``I`` in new ones; the IMU's temperature is ``T`` or ``Temp``. Samples
+with an instance number ``I`` in new logs; the IMU's temperature is ``T`` or ``Temp``. Samples
 logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected.
 While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets 1 at the end.
 
@@ -42,7 +42,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while drift is corrected: its changes, and advice to the user."""
+    """A parameter that is 1 while the autopilot corrects drift; its changes; advice."""
 
     parameter: str
     since_ns: Sequence[int]
@@ -104,7 +104,7 @@ def read_autopilot(
 
 
 def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
-    """Drop the samples logged while the parameter was 1; RecordingError if none is left."""
+    """Drop samples that the autopilot has corrected; RecordingError if none is left."""
     name, since_ns, values, advice = correction
     at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
@@ -203,7 +203,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate the rate to the accelerometer's stamps; None if it was logged sparsely."""
+    """Interpolate the angular rate to the accelerometer's stamps; None if logged sparsely."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
@@ -276,7 +276,7 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     """Read a message type: its columns, and the number of truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
-    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # numpy has struct's codes
+    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # numpy uses the codes of `struct`
     kinds = [f'S{size or 1}' if code == 's' else f'<{code}' for size, code in codes]
     if len({*layout.columns}) < len(layout.columns):
         raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)

@@ -44,7 +44,7 @@ _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: by some 0.1 K/s.
 _FASTEST_K_S = 0.5
 _RISING = 0.7  # smallest part of the rows with a later time than the row before; some are repeated
-#: Parts of a counter's range at its ends: from the last to the first it has begun again.
+#: Last and first part of a counter's range; a step from the last to the first is a new start.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
 _GIVE_MAP = f'give {_A_MAP}'
@@ -189,7 +189,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
 def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int, ...]]:
     """
     Continue the times of a counter of 32 bits that begins again at 0, as Arduino's micros() after
-    71.6 min; return the stamps and the lines where it does.
+    71.6 min; return the stamps and the lines at which the counter begins again.
     """
     stamp_ns, rows = table.stamp_ns.copy(), np.flatnonzero(table.stamp_ns != NO_STAMP)
     if unit not in ('ms', 'us') or not len(rows):
@@ -309,10 +309,11 @@ def _stamp(
     steps = np.diff(times)
     if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
         step, first = float(np.median(steps[steps > 0.0])), float(times[0])
-        # A slow log of a unit that never turns: the temperature shows that it took longer.
+        # In a slow log of a unit that never turns, the temperature shows that the log took longer.
         shortest_s = span / _FASTEST_K_S
         longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
-        # The largest unit with a plausible interval: 5 is not plausible in s, but in ms.
+        # Take the largest unit with a plausible interval of samples: 5 ms is plausible, 5 s is
+        # not.
         for unit, exponent in STAMP_EXPONENTS.items():
             size = 10.0 ** (exponent - 9)
             begin, step_s = first * size, step * size

@@ -4,8 +4,8 @@
 Owns the exchange with other tools: calibrations to the content of their files, and back.
 
 All tools correct a reading N by ``a = A (N - b)``. In autopilots b depends on temperature
-and A is 1; in tools for tumble tests both are constant. The notes of an export name the parts of a
-calibration that are lost, with the resulting error.
+and A is 1; in tools for tumble tests b and A are constant. The notes of an export name the parts
+of a calibration that are lost, with the resulting error.
 """
 
 from dataclasses import replace
@@ -213,7 +213,7 @@ def import_calibration(
 ) -> Calibration:
     """
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same set.
-    `number` chooses a set or IMU, None the only one. `full_scale` is in m/s^2.
+    `number` chooses a set or IMU of the file, None the file's only set. `full_scale` is in m/s^2.
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
     content = next((reading for reading in readings if reading is not None), None)
@@ -235,7 +235,7 @@ def import_calibration(
         )
     (_, _, _), (yx, _, _), (zx, zy, _) = (matrix * K).tolist()
     if not is_si:
-        # Samples in an offset code, as 32768, extend to both sides of the offset.
+        # Samples with an offset, as 32768, may reach beyond the offset by the full scale.
         full_scale = full_scale * float(K.max()) + float(np.abs(content.bias[:, 0]).max())
     unity = Polynomial((1.0,))
     x_set, y_set, z_set = (unit.AxisSet(curve, unity) for curve in _curves(content.bias))

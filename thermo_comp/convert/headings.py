@@ -32,8 +32,8 @@ _LONG_TIMES = {
 }
 _ACCEL = re.compile('acc|force|(^|_)ac?(_|$)')
 _GYRO = re.compile('gyr|omega|rot|rate|angular|(^|_)(g|gy|w)(_|$)')
-# The field of sensor_msgs/Imu; the same words are those of phones for |f| without gravity, which
-# the check of the reading at rest refuses.
+# `linear_acceleration` is the specific force in sensor_msgs/Imu, but the acceleration without
+# gravity on phones, which the check of |f| at rest refuses.
 _ROS_ACCEL = re.compile('(^|_)linear_acceleration$')
 # Words in headings of triads that are neither accelerometer nor gyroscope.
 _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|vel(?!ocity)')

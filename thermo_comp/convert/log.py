@@ -32,15 +32,15 @@ from ..unit.gravity import STANDARD_GRAVITY
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
 # |a| of a still sensor in each unit. Cheap sensors are off by a few per cent (bias and scale), a
-# thermal chamber adds some; 20 % is beyond both and far below the ratios between the units.
+# thermal chamber adds some; 20 % exceeds the sum and is far below the ratios between the units.
 PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12
-# Ratio of a cell's scatter to the quiet level, above which the unit is handled: the sd of 12
-# samples of noise stays within a factor of 2 of its mean.
+# Ratio of a cell's scatter to the quiet level, above which the unit is handled: the sd of a cell
+# of 12 noise samples stays within a factor of 2 of its mean.
 _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements
 
@@ -80,7 +80,7 @@ class ForeignLog:
 
 @dataclass(frozen=True)
 class Stillness:
-    """Rests of a recording and the readings there, in its unit; NaN without a rest."""
+    """Rests of a log, and its samples at rest in the unit of the log; NaN without a rest."""
 
     magnitude: float  # median |a| of the quiet cells
     noise: float  # median sd per axis of the quiet cells
@@ -90,7 +90,7 @@ class Stillness:
 
 @dataclass(frozen=True)
 class Finding:
-    """Number of rows of a log with some property, and the line numbers of the first few."""
+    """Number of rows of a log with some property, and the line numbers of the first few rows."""
 
     count: int
     lines: tuple[int, ...] = ()
@@ -222,7 +222,8 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never go back, as stamps may, and the shift after each restart of the
-    clock; a thermometer takes the `shifts` of the samples, so that its readings stay among them.
+    clock; the times of a thermometer get the `shifts` of the samples, so that the readings stay
+    among the samples.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():

@@ -54,7 +54,7 @@ _Rows = Iterator[tuple[int, list[str]]]  # line number and cells of each row
 
 @dataclass(frozen=True)
 class Format:
-    """Layout of a table of text; what is None is detected."""
+    """Layout of a table of text; an attribute that is None is detected."""
 
     delimiter: Literal[',', ';', '|', 'tab', 'blank'] | None = None
     header: bool | None = None
@@ -122,17 +122,19 @@ def read_text(
 def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
     Return the delimiter of a text table and the number of cells per row: the delimiter that splits
-    most lines into one number of cells (a blank is any run of white space). The last lines of
-    `head` decide, because a logger's preamble may come first; the very last line may be cut.
+    most lines into the same number of cells (a blank is any run of white space). Only the last
+    lines of `head` count, because a logger's preamble may come first; the very last line may be
+    cut.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = lines[:-1] if len(lines) > 2 else lines
     candidates: list[tuple[int, str, int]] = []
-    # The comma is late: it may be the decimal sign of a table with another delimiter.
+    # The comma is tried late, because it may be the decimal sign of a table with another
+    # delimiter.
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
-        # The last columns are blank in most rows if they are those of a slower thermometer.
+        # The last columns are blank in most rows if a slower thermometer writes them.
         whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
         is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
         candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))
@@ -284,7 +286,7 @@ def _iso_ns(text: str) -> int:
     year, month, day, hour, minute, second = (int(part or 0) for part in moment)
     try:
         seconds = timegm(datetime(year, month, day, hour, minute, second).timetuple())
-    except ValueError:  # for example a thirteenth month
+    except ValueError:  # an invalid date, as in month 13
         return NO_STAMP
     east_s = 3600 * int(hours or 0) + 60 * int(minutes or 0)
     seconds += east_s if sign == '-' else -east_s
@@ -297,7 +299,7 @@ def read_parquet(
     """
     Read columns of a Parquet file like `read_text`; Parquet's timestamps state their unit.
 
-    If `columns` is None all columns are read; those without numbers become NaN.
+    If `columns` is None all columns are read; columns without numbers become NaN.
     """
     pq = library('pyarrow.parquet', 'parquet', 'a Parquet file', path)
     import pyarrow as pa

@@ -17,7 +17,7 @@ triad at one temperature; with the reading N and the specific force a::
     Kalibr      N = M a + b          M lower triangular                               (YAML)
     here        a = M K^-1 (N - b)   M lower triangular, unit diagonal; K diagonal
 
-An upper triangle, or a full matrix, belongs to a frame that is rotated relative to ours.
+A tool whose matrix is not lower triangular has a frame that is rotated relative to ours.
 """
 
 import re
@@ -157,7 +157,7 @@ def _read_ardupilot(text: str, number: int | None) -> Content | None:
         return np.column_stack((-slopes @ powers, slopes))
 
     bias, range_c = cubics('ACC'), (values[f'{prefix}TMIN'], values[f'{prefix}TMAX'])
-    # Without a thermal calibration of the gyroscope its parameters are zeros.
+    # The parameters of a gyroscope are zeros if it has no thermal calibration.
     rate_bias = cubics('GYR') if values.has(f'{prefix}GYR') else None
     source, notes = f'ArduPilot {prefix}*', [_THERMAL_NOTE]
     reference = _ARDUPILOT_REFERENCE_C
@@ -253,7 +253,7 @@ def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
 
 
 def _read_imu_tk(text: str, _number: int | None) -> Content | None:
-    """Read imu_tk's ``.calib``: 21 numbers, with or without headings; None if not such a file."""
+    """Read imu_tk's ``.calib``: 21 numbers, with or without headings; None for another file."""
     lines = (line for line in text.splitlines() if not _HEADING.match(line))
     try:
         numbers = np.array([float(cell) for line in lines for cell in line.split()])

@@ -74,8 +74,8 @@ def fit_fleet(
     """
     Fit all units without results; raises ThermoCompError or OutputError if impossible.
 
-    `tell` is called with the number of finished tests and of all tests: before the first fit with
-    None, and after each fit with its row.
+    `tell` is called with the numbers of finished and of all tests, and None before the first fit,
+    or the row of the last fit.
     """
     _require_packages()
     storage = Storage(url)
@@ -245,7 +245,8 @@ class Results:
             texts = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
             return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, texts)))})
         if outcome.calibration:
-            # Until the record is written, its hash differs from the file's: the unit is not done.
+            # Write the record last: before, its hash differs from the calibration's, and the unit
+            # counts as missing.
             content = outcome.calibration.encode()
             files.write_atomically(folder / CALIBRATION, content, files.CALIBRATION)
             (folder / CERTIFICATE).unlink(missing_ok=True)

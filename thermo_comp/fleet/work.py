@@ -57,8 +57,8 @@ class UnitOutcome:
     """The result of a unit, small enough to send."""
 
     row: dict[str, Cell]
-    hashes: dict[str, str]  # of its bags
-    is_final: bool  # a second attempt would give the same result; False if the file system failed
+    hashes: dict[str, str]  # of the bags
+    is_final: bool  # False if the file system failed, so that a repetition may succeed
     calibration: str = ''
     certificate: str = ''
 
@@ -93,7 +93,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
                 how = replace(options.fit, input=_UNIT_OF[info.input])
                 bags[name] = reduce_bag(replace(source, sha256=hashes[name]), how)
         except RecordingError as error:  # noqa: PERF203 - a bad bag does not stop the others
-            # Name the bag by its path in the fleet, not by that of a local copy.
+            # Name the bag by its path in the fleet, not by the path of a local copy.
             problems.append(': '.join(part for part in (name, error.key, error.message) if part))
             is_final = is_final and not isinstance(error.__cause__, OSError)
         except OSError as error:

@@ -31,7 +31,7 @@ BLOCK_MESSAGES = 1 << 15
 
 #: Stamp of a message without stamp: before any real stamp, and within the range of a header.
 NO_STAMP_NS = -(2**31) * 10**9
-_JUMP_NS = 10**9  # a larger backward step is a jump of time, as for the compensator
+_JUMP_NS = 10**9  # a larger backward step of the stamps is a jump of time [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # a longer jump of the stamps is shortened to this [ns]
 #: Largest number of jumps in a recording with a valid clock.
 _MOST_JUMPS = 100
@@ -40,7 +40,8 @@ _MOST_JUMPS = 100
 _FEWEST_READINGS, _APART_S = 10, 10.0
 #: An unchanged reading is kept after this time [ns], so that the sensor does not seem lost.
 _REPEAT_NS = 10_000_000_000
-#: A recording longer than the first needs a mean message interval below the second [ns].
+#: Length of a recording above which the mean interval of its messages is limited, and the limit
+#: [ns].
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
@@ -153,10 +154,10 @@ class Readings(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class Block:
     """
-    Consecutive messages in reading order, as columns; it ends where `frame_id` changes.
-    `accel`, shape (n, 3), is in counts per cycle, or m/s^2 if the input is sensor_msgs/Imu;
-    `imu` holds the other fields of that message. `temperatures` are by thermometer; `log_ns` and,
-    if requested, the serialized messages `raw` are by role.
+    Consecutive messages in reading order, as columns; a block ends where `frame_id` changes.
+    `accel`, shape (n, 3), is in counts per cycle, or m/s^2 if the input is sensor_msgs/Imu; `imu`
+    holds the other fields of that message. `temperatures` are by thermometer; `log_ns` and, if
+    requested, the serialized messages `raw` are by role.
     """
 
     accel_stamp_ns: Ints

@@ -10,7 +10,8 @@ from ..unit.gravity import STANDARD_GRAVITY
 from .blocks import Block
 from .stillness import Cells
 
-# Share of faulty samples below which the fault is a glitch, and above which it concerns them all.
+# Share of faulty samples below which the fault is a glitch, and above which all samples are taken
+# to be faulty.
 _SOME, _MOST = 0.01, 0.5
 # Ratio of |a| at rest to gravity: range if the samples contain gravity, upper limit if gravity is
 # subtracted from them.
@@ -34,7 +35,7 @@ class CauseCounter:
         self._is_imu |= imu is not None
         if covariance is not None:
             self._n_absent += int(np.count_nonzero(covariance[:, 0] == -1.0))
-        if len(self._stamps_ns) < 2:  # two stamps show that not all are equal
+        if len(self._stamps_ns) < 2:  # two different stamps show that the clock runs
             self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
 
     def cause(self, cells: Cells, still_sd: float) -> str:

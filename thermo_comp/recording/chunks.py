@@ -30,11 +30,11 @@ from ..typing import Bytes, Ints
 from .serialized import Messages, gather, number_at
 
 PREFIX = struct.Struct('<BQ')  # opcode and length in front of each record
-HEAD_BYTES = 160  # bytes of a chunk's record that contain its head
+HEAD_BYTES = 160  # the head of a chunk's record lies in these first bytes
 _CHUNK_HEAD = struct.Struct('<BQQQQII')
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_ROW_BYTES = 16  # log time and offset of one message, 8 bytes each
-#: Bytes of a message record before its serialized message; the same without the prefix.
+#: Bytes of a message record before its serialized message, with and without `PREFIX`.
 MESSAGE_HEAD_BYTES = 31
 _MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size
 MESSAGE = int(Opcode.MESSAGE)
@@ -83,7 +83,7 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 class Span:
     """
     A part of a file: a chunk, a chunk without end ('torn'), or messages outside chunks ('loose').
-    `position` and `length` [bytes] exclude the message indexes after it; `size` is that of its
+    `position` and `length` [bytes] exclude the message indexes after it; `size` is the size of the
     decompressed content [bytes].
     """
 
@@ -167,7 +167,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
         is_sound = opcode == Opcode.MESSAGE_INDEX and content == length + 6
         if not is_sound or length % _INDEX_ROW_BYTES or begin + length > len(index):
             return None
-        # An impossible offset becomes negative.
+        # An offset above 2^63 becomes negative, and is refused below.
         columns.append(np.frombuffer(index, '<i8', length // 8, begin)[1::2])
         begin += length
     at = np.sort(np.concatenate(columns), kind='stable') if columns else np.empty(0, np.int64)
@@ -175,7 +175,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
     if begin != len(index) or not is_inside:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
-    # The numbers are unsigned on purpose: a length that is too small wraps around to a huge
+    # Record lengths are unsigned on purpose: a length that is too small wraps around to a huge
     # number.
     length = number_at(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
     if int(np.max(length)) > len(data) or (number_at(head, 0, 'u1') != MESSAGE).any():
@@ -247,7 +247,7 @@ def expand(packed: Path, target: Path) -> str | None:
 def inflate(
     compression: str, packed: Any, limit: int, step: int = _STEP_BYTES, *, is_torn: bool = False
 ) -> Bytes:
-    """Decompress bytes, of a torn piece the readable part; DamagedError beyond the limit."""
+    """Decompress bytes, or the readable part of a torn piece; DamagedError beyond the limit."""
     if not compression:
         return np.asarray(packed)
     pieces: list[bytes] = []

@@ -94,7 +94,7 @@ class Field:
 
     @property
     def has_stamp(self) -> bool:
-        """Whether the messages have a header, or a special header that contains one."""
+        """Whether the messages have a std_msgs/Header, alone or inside a special header."""
         return bool(self._header)
 
     @property

@@ -24,7 +24,7 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # lost if the process is killed [bytes]: half a minute at 100 Hz
+_CHUNK_BYTES = 1 << 17  # a killed process loses a chunk: half a minute at 100 Hz
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: Hidden name of a bag that is being written: its number and the process number.
@@ -123,7 +123,7 @@ class PositionBags:
         check_output(folder / f'{self._number:02d}.mcap', MCAP)
         self._writer: BagWriter | None = None
         self._held: list[Block] = []
-        self.written: list[Path] = []  # bags begun so far
+        self.written: list[Path] = []  # files of the bags begun so far
 
     def add(self, block: Block, info: RecordingInfo | None) -> None:
         """Take a block with its serialized messages, and the description of its bag."""

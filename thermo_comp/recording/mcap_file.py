@@ -60,7 +60,7 @@ _SPAN_FIELDS = attrgetter(
     *('chunk_start_offset', 'chunk_length', 'message_index_length'),
     *('uncompressed_size', 'message_start_time', 'message_end_time'),
 )
-_new_stream: Any = ReadDataStream  # versions of mcap differ in its type hints
+_new_stream: Any = ReadDataStream  # type hints differ between mcap's versions
 
 
 class McapFile(BagFile):
@@ -90,7 +90,7 @@ class McapFile(BagFile):
         return loaded
 
     def _load(self, channels: Collection[int], span: Span) -> Messages:
-        """Read a span; other records than messages were read when the file was opened."""
+        """Read the messages of a span; all other records were read when the file was opened."""
         return load(self._read_at, span, lambda *_: None).of_channels(channels).in_order()
 
     def _read_at(self, at: int, n_bytes: int) -> bytes:
@@ -112,7 +112,7 @@ class McapFile(BagFile):
             schema = self._schemas.get(channel.schema_id)
             kind = schema.name if schema else 'no type'
             package, _, name = kind.partition('/')
-            if name and '/' not in name:  # as ROS 1 names its types
+            if name and '/' not in name:  # ROS 1 writes package/Type
                 kind = f'{package}/msg/{name}'
             topic = Topic(channel.topic, kind, channel.message_encoding, self._counts[number])
             self.topics[number] = topic

@@ -42,7 +42,7 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
 #: Topics of which a late subscriber gets the last message; a namespace may precede the name.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
-# Versions of mcap differ in its type hints.
+# Type hints differ between versions of the `mcap` library.
 _new_builder: Callable[[], Any] = RecordBuilder
 #: Head of a message record: opcode, length, channel, sequence, log time, publish time.
 _RECORD_HEAD = np.dtype('u1, <u8, <u2, <u4, <i8, <i8')
@@ -85,7 +85,7 @@ class McapOutput:
         self._tail: list[Messages] = []
         self._at = 0
         self._stream = path.open('xb', buffering=0)
-        self.close = self._stream.close  # without finishing the file
+        self.close = self._stream.close  # closes the file unfinished
         self._put(MAGIC)
         self._put_record(records.Header('ros2', f'thermo_comp {__version__}'))
         if metadata:

@@ -104,7 +104,7 @@ def unused_thermometers(reader: RecordingReader) -> list[str]:
     paths = {role: field.path for role, field in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}
     for name, (kind, count) in sorted(reader.info.topics.items()):
-        # A message of one bare number needs no name of a field.
+        # A message that holds a single number needs no field name.
         if not count or not used.isdisjoint({(name, None), (name, PLAIN.get(kind))}):
             continue
         if kind == TEMPERATURE or (kind in PLAIN and 'temp' in name.lower()):
@@ -123,7 +123,8 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         cells, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        # Readings are kept in memory: a thermal test has few readings compared with its samples.
+        # All temperature readings fit into memory, because a test has far fewer readings than
+        # samples.
         readings: dict[str, list[Readings]] = {}
         clock = _Clock()
         for block in reader.blocks():
@@ -184,7 +185,7 @@ class _Clock:
     n: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    newest_ns: int = 0  # since the last restart
+    newest_ns: int = 0  # newest stamp since the last restart of the clock
     step_ns: float = 0.0
     n_backwards: int = 0  # number of stamps that do not rise above all before
     n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`

@@ -58,7 +58,7 @@ class RecordingReader(ExitStack):
     The roles in `require` must be in the bag. `info` describes the bag; after all blocks are read,
     `info.truncated` names the missing messages. `topics` are the bag's names by role, `fields` the
     fields read from messages with more content, `definitions` encoding and text of message types.
-    Raises RecordingError if it is not a bag or damaged, or a topic is missing or ambiguous.
+    Raises RecordingError if the file is no bag, is damaged, or a topic is missing or ambiguous.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class RecordingReader(ExitStack):
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
             bare = [role for role, field in self.fields.items() if not field.has_stamp]
-            note = f'{", ".join(bare)} without a stamp: counts from the sample before it'
+            note = f'{", ".join(bare)} without a stamp: dated by the sample before each reading'
             chosen = '; '.join(filter(None, (selected.chosen, note if bare else '')))
             self.info = replace(self.info, input=selected.input, chosen=chosen or None)
         except BaseException as error:
@@ -88,7 +88,7 @@ class RecordingReader(ExitStack):
         #: Time from the bag's first sample to the begin of the part [s]; set when that sample is
         #: read.
         self.since_s = 0.0
-        self.apart = ''  # warning about a thermometer with another clock, so far
+        self.apart = ''  # warning, if any so far, about a thermometer on another clock
 
     def _fields(self, selected: Selected) -> Iterator[tuple[Role, Field]]:
         for role, path in selected.fields.items():
@@ -189,7 +189,7 @@ class RecordingReader(ExitStack):
     def _read(
         self, names: Collection[str], encodings: Collection[str]
     ) -> Iterator[tuple[Path, Mapping[int, Topic], Messages]]:
-        """Read the messages of topics by file: path, its channels, messages."""
+        """Read serialized messages of topics: yield path, channels and messages of each file."""
         if not self._files:
             raise RecordingError('the recording is closed', self.info.path)
         for file in self._files:
@@ -203,7 +203,7 @@ class RecordingReader(ExitStack):
                     yield file.path, channels, messages
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
-        """Read the bag without the jumps of its clock, for uses that need a grid over time."""
+        """Read the bag with shortened jumps of its clock, for uses that need a grid over time."""
         if self._part.is_stamped:
             return without_jumps(self.blocks(), self.info.path)
         return self._cut(without_jumps(self._blocks(), self.info.path))

@@ -7,8 +7,8 @@ Two tests are relative to the quiet level of the bag: the variance inside a cell
 handling) and the step between adjacent cells (a turn, a knock). A step starts a new interval,
 because a tilt of one microradian is already one micro-g. Temperature tilts a unit at rest, too: a
 steady change over the cells around, slower than the Earth rotates, is a drift and not a step. Two
-tests are absolute, because a flight also has a quietest tenth: a sensor at rest scatters by no
-more than its noise, and does not rotate.
+tests have absolute limits, because the quietest tenth of a flight is no rest: a sensor at rest
+scatters by no more than its noise, and does not rotate.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from .colour import roughest_at_rest, spread_of_variances
 #: Largest ratio of a cell's variance (n >= 30 samples) at rest to the quiet level: noise exceeds 4
 #: with a probability below 1e-11, and vibration that must be cut out is far above.
 VARIANCE_RATIO = 4.0
-#: Largest scatter at rest [g]: above that of the noisiest sensors, below that of most flights.
+#: Largest scatter at rest [g]: above the scatter of the noisiest sensors, below the scatter in
+#: most flights.
 STILL_SD = 0.05
 # Largest scatter of a gyroscope within a cell at rest, and largest distance of a cell's mean from
 # its level [rad/s]; the level drifts with temperature and is averaged over this time [s].
@@ -33,14 +34,14 @@ _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # In a rotation the rate is compared with its median over this time [s].
 _ROTATION_S = 10.0
-# Steps are judged against their own robust spread; 8 sd never happens in a bag of noise.
+# Size of a step that ends a rest, in robust sd of all steps; noise alone does not reach it.
 _STEP_SDS = 8.0
 # Number of steps whose median is the drift, and the largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
 # Samples searched for a quantum, and smallest number of different steps that prove it.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # possible lengths of a cell of slow samples, in windows
-_LONGEST_CELL_NS = 86400e9  # a longer cell comes from wrong stamps
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that a cell of slow samples may last
+_LONGEST_CELL_NS = 86400e9  # a longer cell is due to wrong stamps [ns]
 MIN_SAMPLES = 30  # smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: the square of a larger one may overflow
 _WORD = 32768.0  # the middle of unsigned 16-bit words
@@ -99,10 +100,11 @@ class CellAccumulator:
         self._asked_cell_s, self._window_s, self._full_scale = cell_s, window_s, full_scale
         self._cell_ns = self._start_ns = 0
         self._last_ns: int | None = None
-        self._last = np.zeros((0, 3))  # the sample before
+        self._last = np.zeros((0, 3))  # last sample of the previous block
         self._shift = np.zeros(3)
         # Row of a cell: its number, number of samples, and sums of times, samples and their
-        # squares; change from the cell before; sum of squared changes. The last cell is open.
+        # squares; change from the cell before; sum of squared changes. The last cell may get
+        # further samples.
         self._sums: list[Floats] = [np.empty((0, 15))]
         self._n_dropped = self._n_saturated = self._n_looked_at = 0
         self._is_integer, self._is_negative = True, False
@@ -145,9 +147,9 @@ class CellAccumulator:
         self._sums = [self._sums[0][n:]]
 
     def finish(self) -> Cells:
-        """Return all cells so far, including the open one."""
+        """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # the next call then joins only new sums
+        self._sums = [sums]  # joined once, for the next call
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)
@@ -343,7 +345,7 @@ def _one_g(cells: Cells) -> float:
 
 
 def is_under(cells: Cells, still_sd: float) -> Bools:
-    """Whether a cell scatters by no more than a sensor at rest, or by rounding."""
+    """Whether the scatter of a cell is at most that of a sensor at rest, or of rounding."""
     ceiling = np.maximum((still_sd * _one_g(cells)) ** 2, cells.quantum**2)
     return np.asarray((cells.variance <= ceiling).all(axis=1))
 
@@ -364,7 +366,7 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, believable: Bools) -> Floats:
-    """Return the drift in the step after each cell, the median around it, shape (n - 1, 3)."""
+    """Return the drift between successive cells, a median over neighbours, shape (n - 1, 3)."""
     both = believable[1:] & believable[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2

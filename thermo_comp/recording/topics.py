@@ -24,8 +24,8 @@ from .blocks import Input, Role
 PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {key: topic.type for key, topic in INPUTS.items()}
-#: Name of a driver's topic in REP 145 and of the node's output; the bag's other topics show which
-#: of both.
+#: Name of a driver's topic in REP 145 and of the node's output; the bag's other topics show
+#: whether driver or node has published it.
 _RAW = IMU_OUT.name
 #: Words in the names of vector topics that are not a specific force.
 _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
@@ -84,8 +84,8 @@ class Topics:
     """
     Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
     A name matches with or without its leading slash and, if only one topic fits, with any
-    namespace. Without a usual name imu/data_raw is used, or else the bag's only topic of the
-    type, preferably an Imu. Further thermometers are named, or found as ``temperature/<name>``
+    namespace. If no topic has a usual name, imu/data_raw is used, or else the bag's only topic of
+    the type, preferably an Imu. Further thermometers are named, or found as ``temperature/<name>``
     in the board's namespace. A thermometer may be a field of any message, ``TOPIC:FIELD``, as for
     ``ros2 topic echo --field``.
     """
@@ -207,7 +207,7 @@ def select_topics(
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
             raise _missing(present, {key: getattr(topics, key) for key in wanted}, corrected)
-    among = ["driver's", 'only']  # chosen by the name that drivers use, or as the only one
+    among = ["driver's", 'only']  # chosen by the usual name, or as the only topic of its type
     chosen = [
         choice_note(
             name_of[role], key, getattr(topics, key), among[not is_called(name_of[role], _RAW)]
@@ -285,7 +285,7 @@ def _said_corrected(name: str) -> str:
 
 
 def _said_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
-    """Note that several topics may be the board's thermometer, so none is read; '' if none is."""
+    """Say which topics may be the board's thermometer, none of which is read; '' without any."""
     names = [
         shown(name)
         for name, (kind, count) in present.items()
@@ -300,7 +300,7 @@ def _said_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
 def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
-    """Find the further thermometers: those named, and those beside the board's or the case's."""
+    """Find further thermometers: named topics, and topics beside the board's or the case's."""
     both = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))

@@ -52,9 +52,9 @@ def decode_blocks(
     messages: Messages, feeds: Collection[Feed], roles: Iterable[Role], *, keep_raw: bool = False
 ) -> list[Block]:
     """
-    Decode messages in their order; a block ends where the frame changes. `roles` are those of the
-    whole bag. The reading of a field is kept as a Temperature. Raises RecordingError, without a
-    path, if the bytes of a message do not fit its type.
+    Decode messages in their order; a block ends where the frame changes. `roles` lists the inputs
+    found in the whole bag. The reading of a field is kept as a Temperature. Raises RecordingError,
+    without a path, if the bytes of a message do not fit its type.
     """
     roles = tuple(dict.fromkeys((*ROLES, *roles)))
     topics = {feed.role: feed.topic for feed in feeds}
@@ -77,7 +77,7 @@ def decode_blocks(
         except RecordingError as error:
             raise RecordingError(error.message, key=shown(topics[role].name)) from error
         if role == 'accel':
-            # Fast test for a constant frame.
+            # Test quickly whether frame_id is constant.
             text = frame.tobytes()
             is_one = text == text[: frame.itemsize] * len(frame)
             changes = [] if is_one else rank[1:][frame[1:] != frame[:-1]].tolist()
@@ -125,7 +125,7 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
         raise _misfit(kind)
     width = int(size[0]) if (size == size[0]).all() else HEAD_BYTES
     rows = gather(messages.data, messages.start, width)
-    # Usually all have the same length, byte order and frame length.
+    # Usually all messages have the same length, byte order and length of frame_id.
     for key in (size, number_at(rows, 0, 'u2'), number_at(rows, 12, 'u4')):
         if (key != key[0]).any():
             columns = np.empty(n, np.int64), np.empty((n, n_numbers)), np.empty(n, object)
@@ -191,7 +191,7 @@ def as_cdr(messages: Messages, kind: str) -> Messages:
     convert = typestore().ros1_to_cdr
     try:
         pieces = [bytes(convert(message, kind)) for message in messages]
-    except Exception as error:  # damaged bytes surface there as nearly any exception type
+    except Exception as error:  # rosbags raises nearly any exception on damaged bytes
         raise _misfit(kind) from error
     return Messages.of(pieces, messages.channel, messages.log_ns)
 

@@ -28,7 +28,7 @@ from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
 from .serialized import Messages
 from .wire import encode_stamped
 
-STAMP_END_NS = 2**31 * 10**9  # ROS stamps are from 0 to below this [ns]
+STAMP_END_NS = 2**31 * 10**9  # upper limit of ROS stamps, exclusive [ns]
 _AUTO_FLUSH_BYTES = 1 << 26
 #: Format of a table by its suffix.
 TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}
@@ -131,7 +131,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         messages: Sequence[bytes] | Messages,
         definition: tuple[str, str] | None = None,
     ) -> None:
-        """Write serialized (CDR) messages; without a `definition` the type must be in Jazzy."""
+        """Write serialized (CDR) messages; a type that is not in Jazzy needs its `definition`."""
         times = _as_times('log_ns', log_ns, len(messages))
         if not isinstance(messages, Messages):
             messages = Messages.of(messages, np.zeros(len(messages)), times)
@@ -256,8 +256,9 @@ def table_writer(
 ) -> Iterator[WriteRows]:
     """
     Write a table in the format of its suffix (`TABLES`, else CSV); the file appears when complete.
-    Yields a function that takes columns by name, shape (n,), the same names every time; CSV drops
-    the metadata. OutputError if the table may not or cannot be written, or pyarrow is missing.
+    Yields a function that takes columns by name, shape (n,), with the same names in each call; CSV
+    drops the metadata. OutputError if the table may not or cannot be written, or pyarrow is
+    missing.
     """
     kind = TABLES.get(Path(path).suffix, CSV)
     with drafted(path, kind, overwrite=overwrite) as partial, ExitStack() as stack:

@@ -153,7 +153,7 @@ class Evidence:
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions, with the attitudes by the best correction of `forces`."""
+        """The still positions, with attitudes computed from the best correction of `forces`."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()
@@ -176,7 +176,7 @@ class Evidence:
 
     @property
     def positions_text(self) -> str:
-        """Count the distinct directions, and the rests if these are more than the directions."""
+        """Count the distinct directions, and the rests if there are more rests than directions."""
         n_rests = len(self.positions)
         n = len(distinct_directions(np.array([rest.up for rest in self.positions]).reshape(-1, 3)))
         text = counted(n, 'position')
@@ -194,7 +194,7 @@ class Evidence:
 
 
 def given(value: _T | None) -> _T:
-    """Return a value that is not None: a figure is drawn only if its data exist."""
+    """Return a value that is not None, because a figure is drawn only if its data exist."""
     if value is None:
         raise ValueError('`evidence` lacks the data of this figure')
     return value

@@ -196,7 +196,7 @@ def _symmetric(axes: Axes, residual: Floats) -> None:
 
 
 def draw_every_position(evidence: Evidence) -> Figure:
-    """Draw |f| - g over time in every position, or in those with the largest residuals."""
+    """Draw |f| - g over time in every position, or in the positions with the largest residuals."""
     windows = given(evidence.windows)
     judged, residual = list(evidence.residuals.items())[-1]
     worst = sorted(evidence.positions, key=lambda place: -place.residual_rms[judged])[:_MOST]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the figures of a calibration over temperature, and those of a fleet."""
+"""Owns the figures of a calibration over temperature, and the figures of a fleet."""
 
 from collections.abc import Mapping, Sequence
 

@@ -77,7 +77,7 @@ def number(value: float, digits: int = 3) -> str:
     if size > 8:
         return f'{value:.{digits - 1}e}'
     decimals = min(digits - 1 - size, digits)
-    # Adding 0.0 turns -0.0 into 0.0.
+    # Adding 0.0 turns a negative zero into 0.0.
     return minus(f'{round(value, decimals) + 0.0:.{max(decimals, 0)}f}')
 
 
@@ -97,7 +97,7 @@ def rounded(value: float, expanded: float) -> tuple[str, str]:
     if not 0.0 < expanded < math.inf:
         return number(value, 6), '–'
     place = 1 - math.floor(math.log10(expanded))
-    if round(expanded, place) >= 10.0 ** (2 - place):  # 0.0996 is 0.10
+    if round(expanded, place) >= 10.0 ** (2 - place):  # 0.0996 rounds to 0.10
         place -= 1
     texts = (f'{round(x, place) + 0.0:.{max(place, 0)}f}' for x in (value, expanded))
     return minus(next(texts)), next(texts)

@@ -20,7 +20,7 @@ from sensor_msgs.msg import Imu, Temperature
 
 #: Compensates a sample: stamp and three components in, force and covariance out; None = dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
-#: Corrects the angular rate of the same sample: stamp and rate in, rate and variances out.
+#: Corrects the angular rate of a sample: stamp and rate in, rate and variances out.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 
 #: Longest message read [bytes]; an Imu with the longest frame name is shorter.
@@ -32,8 +32,8 @@ _HEADER = struct.Struct('<4siI4x')
 # linear acceleration 3 + 9 follow.
 _PASSED = 8 * 25
 _NO_GYRO = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
-#: Offset of the angular rate in the `_PASSED` bytes; formats of the rate with the first element
-#: of its covariance, and with all of them.
+#: Offset of the angular rate in the `_PASSED` bytes; formats of the rate with the first element of
+#: its covariance, and with all elements.
 _RATE_AT = 8 * 13
 _RATE_IN, _RATE_OUT = struct.Struct('<4d'), struct.Struct('<12d')
 _CELSIUS = struct.Struct('<d')
@@ -149,7 +149,7 @@ def _plain(data: bytes, size: int, message_type: Any) -> tuple[bytes, int]:
     """Return a message in plain form, by rclpy if needed, and the offset of its values or 0."""
     start = _values_at(data, size)
     if not start and len(data) <= _LONGEST_MESSAGE:
-        # RuntimeError: rclpy cannot read it. ValueError: a name is not UTF-8.
+        # RuntimeError: rclpy cannot read the message. ValueError: a frame name is not UTF-8.
         with suppress(RuntimeError, ValueError):
             data = serialize_message(deserialize_message(data, message_type))
             start = _values_at(data, size)

@@ -30,10 +30,10 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-IDLE_S = 5.0  # time without samples after which readings take effect without them [s]
+IDLE_S = 5.0  # after this silence of the samples readings are applied [s]
 #: Lead of the readings' stamps over the samples' [s] above which the clocks differ.
 AHEAD_S = 5.0
-#: Samples have stopped when the next sample is late by both limits: cycles, and [s].
+#: Delay of the next sample, in cycles and in s, beyond both of which the samples have stopped.
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Largest error of |f| at rest, in its standard deviations.
 GRAVITY_SIGMAS = 5.0
@@ -122,7 +122,8 @@ class Reporter:
         self._publisher.publish(array)
         if message.level != self._level:
             self._level, log = message.level, self._node.get_logger()
-            # rclpy fixes the severity of a place of call, so each severity has its own call.
+            # rclpy allows one severity per call in the source, so each severity needs a separate
+            # call.
             if message.level == DiagnosticStatus.OK:
                 log.info(message.message)
             elif message.level == DiagnosticStatus.WARN:
@@ -131,7 +132,7 @@ class Reporter:
                 log.error(message.message)
 
     def _force_excess(self, calibration: Calibration) -> float:
-        """Return how far |f| of the last sample is above the fit's largest [m/s^2], or 0."""
+        """Return by how much the last sample's |f| exceeds the largest |f| of the fit [m/s^2]."""
         last = self._relay.running.converter.last_result
         if last is None or calibration.nonlinearity is None:
             return 0.0
@@ -158,7 +159,7 @@ class Reporter:
                 text = f'{n_publishers} publishers on {topic}'
                 yield _ERROR, f'{text}, the topic is not used until only one of them sends'
             elif n_publishers > 1:
-                # The middleware lists a killed publisher until its lease ends.
+                # The middleware lists a killed publisher until the lease of the publisher ends.
                 yield _WARN, f'{n_publishers} publishers on {topic}, of which one sends'
             elif not n_publishers and (mismatch := _mismatch(self._node, source.subscription)):
                 level = _ERROR if name in ('sample', 'board') else _WARN

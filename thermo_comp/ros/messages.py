@@ -75,7 +75,7 @@ class LiveField:
         try:
             message = deserialize_message(data, self.kind)
             header = getattr(message, 'header', None)
-            # Some types have a special header that contains the usual one.
+            # Some types have a special header that contains a std_msgs/Header.
             stamp = getattr(getattr(header, 'header', header), 'stamp', None)
             value = self._value(message)
         except (RuntimeError, ValueError, IndexError):

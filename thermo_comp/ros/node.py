@@ -82,7 +82,7 @@ class CompensationNode:
         self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
         self._loop.call_every(config.diagnostics_period, self._report)
         topics = [self.node.resolve_topic_name(sample.name) for sample in SAMPLES.values()]
-        # Accept QoS overrides also of the input that is not open: it may be opened later.
+        # Accept QoS overrides of both inputs: the input that is not in use may be opened later.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
         for name in overrides(self.node):
             if not (self.node.has_parameter(name) or name.startswith(known)):
@@ -123,7 +123,7 @@ class CompensationNode:
         return self._relay.running.compensator
 
     def _prepare(self, changes: list[Parameter]) -> tuple[LoadedCalibration, Model] | None:
-        """Read, try and build the calibration of a change, in parallel to the samples."""
+        """Read, try and build the calibration of a parameter change, parallel to the samples."""
         names = [change.value for change in changes if change.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
@@ -133,7 +133,7 @@ class CompensationNode:
     def _set(
         self, changes: list[Parameter], new: tuple[LoadedCalibration, Model] | None
     ) -> SetParametersResult:
-        """Apply a change as a whole between two samples, or change nothing."""
+        """Apply a parameter change as a whole between two samples, or change nothing."""
         before = after = self._relay.running
         loaded, model = new or (before.loaded, before.compensator.thermal.model)
         config = parameters.updated(before.config, changes)
@@ -150,7 +150,7 @@ class CompensationNode:
             if new:
                 self._say_calibration()
             self._loop.call_soon(partial(self._relay.release, before.samples))
-            # Up to this line a failure changes nothing.
+            # A failure before this line restores the previous calibration.
             return result  # noqa: TRY300
         except BaseException:
             self._run_with(before)

@@ -3,10 +3,10 @@
 """
 Owns the node's parameters: their table, and the services that set them.
 
-The table is `NodeConfig`. The node runs with one immutable `NodeConfig`; a change makes a new one
-or is refused as a whole. A thread waits while a file is read; the loop then replaces one
-reference. Requests are answered in order of arrival, but a request without a file does not wait
-for files.
+The table of the parameters is `NodeConfig`. The node runs with one immutable `NodeConfig`; a
+change makes a new one or is refused as a whole. A thread waits while a file is read; the loop then
+replaces the reference to the `NodeConfig`. Requests are answered in order of arrival, but a
+request without a file does not wait for files.
 """
 
 import math
@@ -136,7 +136,7 @@ _TABLE: Mapping[str, Field[Any]] = {entry.name: entry for entry in fields(NodeCo
 
 
 class ParameterError(ThermoCompError):
-    """A value that the node refuses; the message names parameter, rule and value."""
+    """The node refuses a parameter value; the message names parameter, rule and value."""
 
 
 def declare(node: Node) -> NodeConfig:
@@ -147,7 +147,7 @@ def declare(node: Node) -> NodeConfig:
     if len(inputs) == 1:
         given['input'] = inputs[0]
     for name, entry in _TABLE.items():
-        # The value is checked here, because rclpy refuses an integer for a float.
+        # Check the value here and not in rclpy, which refuses an integer for a float.
         values[name] = _checked(name, given.get(name, entry.default))
         node.declare_parameter(name, values[name], descriptor(name), ignore_override=True)
     return NodeConfig(**values)
@@ -233,7 +233,7 @@ class ParameterRequests:
     ) -> None:
         self._loop, self._prepare, self._apply = loop, prepare, apply
         self._n_waiting = 0
-        # A request without a file does not wait for files.
+        # Two threads: a request without a file does not wait for files.
         self._slow, self._quick = (ThreadPoolExecutor(1, 'parameters') for _ in range(2))
         for service in loop.node.services:
             if service.srv_type in (srv.SetParameters, srv.SetParametersAtomically):
@@ -242,7 +242,7 @@ class ParameterRequests:
                 loop.handlers[service] = partial(_reply, service)
 
     def close(self) -> None:
-        """Wait for the running preparation; apply nothing any more."""
+        """Wait for the request that is being prepared; apply no more values."""
         for pool in (self._slow, self._quick):
             pool.shutdown(cancel_futures=True)
 
@@ -256,7 +256,7 @@ class ParameterRequests:
             answer(kind.Response(results=results) if is_each else kind.Response(result=results[0]))
 
         def end(prepared: Future[Any]) -> None:
-            """Apply a group in the loop's thread; after the last group send the answer."""
+            """Apply a group of parameters in the loop's thread; answer after the last group."""
             try:
                 self._set(prepared, results)
             finally:

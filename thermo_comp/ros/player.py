@@ -47,7 +47,7 @@ CLOCK_PERIOD = 0.01  # wall time between two messages on `/clock` [s]
 ACKNOWLEDGEMENT_NAP = 0.0005
 #: Time for subscribers to discover the player if the middleware does not report it [s].
 SETTLING = 0.3
-PATIENCE = 30.0  # how long a subscriber may leave a window unacknowledged [s]
+PATIENCE = 30.0  # how long a subscriber may leave messages unacknowledged [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +173,7 @@ class Player:
 
     def _await_acknowledgement(self, role: Role) -> None:
         publisher = self._publishers[role]
-        # Polled: waiting inside rclpy would block this process's other threads.
+        # Poll for acknowledgements: waiting inside rclpy would block the other threads.
         is_done = partial(publisher.wait_for_all_acked, Duration())
         if not wait_until(is_done, PATIENCE, ACKNOWLEDGEMENT_NAP):
             name = publisher.topic_name

@@ -4,8 +4,8 @@
 Owns the set-up of a process before its first node: handling of signals, Fast DDS profile.
 
 The middleware's signal handlers shut the context down while it is in use, which sometimes ends in
-a segmentation fault. With this module a thread asks the loop to stop, which shuts everything down
-in order.
+a segmentation fault. With this module a thread asks the loop to stop, and the loop shuts
+everything down in order.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PROFILE = Path(__file__).with_name('fastdds_profile.xml')
 
 
 def use_profile() -> None:
-    """Set the node's profile for this process, unless a profile is set; before any context."""
+    """Set the node's Fast DDS profile, unless a profile is set; call it before ROS starts."""
     # The profile saves a quarter of the CPU time with reliable subscribers (docs/benchmarks.md).
     if VARIABLE not in os.environ and not Path(LOCAL_PROFILE).is_file():
         os.environ[VARIABLE] = str(PROFILE)
@@ -39,8 +39,8 @@ class SignalWatch:
     If the process has not ended `ending_s` [s] after the call, it is ended.
     """
 
-    # The call comes from another thread: while the main thread waits in the middleware, the
-    # interpreter runs no signal handlers.
+    # Another thread makes the call: while the main thread waits in the middleware, the interpreter
+    # runs no signal handlers.
 
     def __init__(self, ending_s: float | None = None) -> None:
         self._ending_s = ending_s
@@ -67,7 +67,7 @@ class SignalWatch:
         os.close(self._reader)
 
     def on_signal(self, stop: Callable[[], None]) -> None:
-        """Set the function to call, once or twice; a past signal calls it at once."""
+        """Set the function that a signal calls; a signal that has arrived calls it at once."""
         self._stop = stop
         if self._is_over:
             stop()
@@ -77,7 +77,7 @@ class SignalWatch:
             self._is_over = True
             self._stop()
             if not select.select([self._reader], [], [], self._ending_s)[0]:
-                # The orderly end has hung for `ending_s`.
+                # The process has not ended by itself within `ending_s`.
                 os._exit(0)
             number = os.read(self._reader, 1)
             if number:

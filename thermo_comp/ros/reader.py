@@ -81,7 +81,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
 
 
 def read_within(name: str, directory: str, limit_s: float = LIMIT_S) -> LoadedCalibration:
-    """Do `read` in a thread; CalibrationError if the file hangs."""
+    """Run `read` in a thread; CalibrationError if the file hangs."""
     answer: Future[LoadedCalibration] = Future()
 
     def run() -> None:
@@ -90,7 +90,7 @@ def read_within(name: str, directory: str, limit_s: float = LIMIT_S) -> LoadedCa
         except Exception as error:  # noqa: BLE001 - raised by `result`
             answer.set_exception(error)
 
-    # A daemon: if the file hangs, the end of the process does not wait for it.
+    # A daemon thread, so that the process can end while a file hangs.
     threading.Thread(target=run, name='first reading', daemon=True).start()
     if not wait([answer], limit_s).done:
         raise _hanging(name, limit_s)
@@ -110,7 +110,7 @@ class Reader:
         self._process: subprocess.Popen[bytes] | None = None
 
     def read(self, name: str, directory: str) -> LoadedCalibration:
-        """Do the function `read` in the process, within the time limit."""
+        """Run the function `read` in the process, within the time limit."""
         try:
             if self._process is None:
                 self._begin()
@@ -150,7 +150,7 @@ class Reader:
         process, self._process = self._process, None
         if process is not None:
             process.kill()
-            # A process held by a dead file system ends when the file system releases it.
+            # A process that hangs in a dead file system ends when the file system releases it.
             with suppress(subprocess.TimeoutExpired):
                 process.wait(_ENDING_S)
             self._pipe.close()

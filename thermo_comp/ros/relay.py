@@ -3,9 +3,8 @@
 """
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
-Messages do not identify their publisher. While a topic has more than one publisher it is ignored,
-and so is the first batch afterwards, which may still be from the publisher that left
-(`waitloop.Sources`).
+Messages do not identify their publisher. A topic with more than one publisher is ignored, as is
+the first batch afterwards, which may be from the publisher that left (`waitloop.Sources`).
 """
 
 from bisect import bisect_left, bisect_right
@@ -79,7 +78,7 @@ class Relay:
             for flag, pack in FLAGS.items()
         ]
         self.rests = RestKeeper(config.rest_log) if config.rest_log else None
-        #: Samples that the rest log has not summed yet; None without one.
+        #: Samples that the rest log has not summed yet; None without a rest log.
         self.waiting: list[bytes] | None = [] if self.rests else None
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
@@ -132,7 +131,7 @@ class Relay:
 
     @property
     def inputs(self) -> dict[str, RawSubscription]:
-        """The samples, then the readings, by their names in the diagnostics."""
+        """Subscriptions by their names in the diagnostics: samples first, then thermometers."""
         return {'sample': self.samples, **self.thermometers}
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
@@ -147,7 +146,7 @@ class Relay:
         )
 
     def successor(self, loaded: LoadedCalibration, model: Model, config: NodeConfig) -> Running:
-        """Build the next `Running`; the present one does not change."""
+        """Build the next `Running`; the present `Running` does not change."""
         now, settings = self.running, config.compensator_config()
         compensator, converter, samples = now.compensator, now.converter, now.samples
         if model is not compensator.thermal.model or settings != compensator.config:
@@ -197,7 +196,7 @@ class Relay:
         compensator = self.running.compensator
         last_ns = compensator.now_ns
         if last_ns is not None:
-            # No real stamp is later than the last sample by more than the silence.
+            # The clock went on for at most `silence_ns` since the last sample was stamped.
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:
@@ -223,7 +222,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay up to the last reading received before the last sample; return later samples."""
+        """Relay samples and readings by arrival; return the samples after the last reading."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))

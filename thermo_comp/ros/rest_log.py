@@ -28,7 +28,7 @@ from .reader import LoadedCalibration
 
 #: Messages that are summed at a time, unless a report comes first.
 BLOCK = 1024
-#: Largest size of the file of a day, and of the folder [bytes]: 10 MB a month at most.
+#: Largest size of the file of a day, and of the folder [bytes]; a month takes 10 MB at most.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 #: Files of a day that are not larger than this [bytes] are not thinned to bound the folder.
 _FLOOR = 16_000
@@ -57,7 +57,7 @@ class RestLog:
             raise OutputError('parameter `rest_log`: the folder is closed to the node', folder)
         self.n_rests = self.n_days = self.n_lost = 0
         self.reason = ''
-        self._is_torn = True  # the last line may be incomplete
+        self._is_torn = True  # the file's last line may be incomplete
         self._start = b''
         self._day = ''
         self._lines: Queue[tuple[str, bytes, bytes] | None] = Queue(_WAITING)
@@ -65,7 +65,7 @@ class RestLog:
         self._thread.start()
 
     def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
-        """Queue the line of a rest, and the line of the start of the node before it."""
+        """Queue the line of a rest, preceded by the line of the node's start if necessary."""
         day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
         try:
             self._lines.put_nowait((str(day), start, rest))
@@ -160,9 +160,7 @@ class RestKeeper:
         if not len(stamps):
             return
         if stamps[-1] < self._last_ns - _JUMP_NS:
-            self._last_ns = (
-                0  # a new recording, in which only its own samples out of order are left out
-            )
+            self._last_ns = 0  # a new recording begins, with earlier stamps
         if stamps[0] <= self._last_ns or (np.diff(stamps) <= 0).any():
             before = np.maximum.accumulate(np.concatenate(([self._last_ns], stamps[:-1])))
             samples, stamps = samples[stamps > before], stamps[stamps > before]
@@ -209,7 +207,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of messages in plain form and of the last one's size."""
+    """Read stamps [ns] and samples of messages in plain form that are as long as the last."""
     size = len(messages[-1]) if messages else 0
     # Shorter messages than those with an empty frame_id are malformed.
     if size < _SHORTEST[is_imu]:

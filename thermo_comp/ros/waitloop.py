@@ -145,7 +145,7 @@ class RawSubscription:
         self.interval_ns = (self._newest_ns - before_ns) // len(messages)
         before, self._sequence = self._sequence, numbers[-1]
         if before is not None and self._sequence is not None:
-            # max: the numbers of another publisher can be smaller.
+            # Another publisher can have a smaller sequence number.
             self.n_lost += max(0, self._sequence - before - len(messages))
         return messages, received_ns, numbers
 
@@ -153,8 +153,8 @@ class RawSubscription:
 class WaitLoop:
     """Runs a node without an executor; raw subscriptions are left to the caller."""
 
-    # Messages of a best-effort subscription gather for `rest_s` [s] after each wake-up if they are
-    # frequent enough: four within three such pauses, so that no message waits alone.
+    # Messages of a best-effort subscription gather for `rest_s` [s] after each wake-up if there
+    # are four messages or more within three pauses, so that no message waits alone.
     def __init__(self, node: Node, rest_s: float = 0.0) -> None:
         self.node = node
         self._rest_ns = int(rest_s * 1e9)
@@ -174,7 +174,7 @@ class WaitLoop:
         self, message_type: Any, topic: str, qos: QoSProfile, *, is_hot: bool = True
     ) -> RawSubscription:
         """Subscribe in serialized form; the first hot subscription wakes the loop at once."""
-        # The callback is never called: only an executor would call it.
+        # rclpy needs a callback for each subscription, but without an executor never calls it.
         create = partial(self.node.create_subscription, callback=lambda _: None, raw=True)
         subscription = _opened(create, message_type, topic, qos)
         self._raw.append(RawSubscription(subscription, is_hot))
@@ -198,7 +198,7 @@ class WaitLoop:
             self._guard.trigger()
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call back with a period [s], replacing the last such call; cheaper than a timer."""
+        """Call a function periodically [s], replacing the previous one; cheaper than a timer."""
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
         self._callback = callback
@@ -247,7 +247,7 @@ class WaitLoop:
                     continue
                 now = now_ns()
                 if now >= self._call_ns:
-                    # Missed calls are not repeated.
+                    # Periodic calls that were missed are not repeated.
                     late_ns = (now - self._call_ns) % self._period_ns
                     self._call_ns = now - late_ns + self._period_ns
                     self._guarded(self._callback)
@@ -351,7 +351,8 @@ def own_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
         try:
             yield node
         finally:
-            # Without this call the node's publishers live until the next garbage collection.
+            # Destroy the node now: otherwise its publishers live until the next garbage
+            # collection.
             node.destroy_node()
     finally:
         context.try_shutdown()
