@@ -10,7 +10,9 @@ from builders import ArrayBlock
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitSource, normal_gravity
-from thermo_comp.fitting.reduction import Readings, reduce_source
+from thermo_comp.fitting.raw_checks import judge_bags
+from thermo_comp.fitting.readings import Readings, is_spike
+from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.sensors import learn_detector, learn_thermometer, quantum_of
 from thermo_comp.recording.stillness import CellAccumulator
 from thermo_comp.simulation.campaign import positions
@@ -145,6 +147,23 @@ def test_bad_samples_are_counted_and_left_out(rng):
     bag = reduced([block(accel)])
     assert (bag.n_samples, bag.n_dropped, bag.n_saturated) == (3000, 1, 1)
     assert sum(interval.count.sum() for interval in bag.intervals) == 2998
+
+
+def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
+    # WHY: one -127 degC in 60 readings was learnt as a noise of 14 K, and the fit left 25 times
+    # the error.
+    whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
+    whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
+    whole.board[30::60] = -127.0
+    bag = reduced([whole])
+    assert bag.n_spikes == {'board': 33, 'case': 0}
+    assert bag.board.value.min() > 19.0
+    noise = learn_thermometer([bag.board], ThermometerSettings()).noise_sd_c
+    assert noise == pytest.approx(0.02, rel=0.1)
+    (finding,) = (f for f in judge_bags([bag], FitOptions()) if f.name == 'spikes')
+    assert '33 readings' in finding.message
+    # Slow readings of a fast change are no spikes.
+    assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
 
 
 def test_stamps_that_do_not_rise_are_left_out(rng):

@@ -23,7 +23,7 @@ from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.nonlinearity import NonlinearTerm
-from . import data_checks
+from . import data_checks, raw_checks
 from .alternatives import model_of, regressed, windows_of
 from .assembly import build_calibration
 from .beginning import Problem, first_guess
@@ -282,10 +282,10 @@ def _judged(
         name = bags[has_board.index(False)].source.name
         raise FitError(f'{name}: no board temperature, which the other bags have')
     serial = check_serial([bag.source for bag in bags], options)
-    findings = enforce(data_checks.judge_prior(serial, options.prior), options)
-    findings += enforce(data_checks.judge_bags(bags, options), options)
+    findings = enforce(raw_checks.judge_prior(serial, options.prior), options)
+    findings += enforce(raw_checks.judge_bags(bags, options), options)
     kept, copies = without_copies(bags)
-    return kept, findings + data_checks.judge_copies(copies)
+    return kept, findings + raw_checks.judge_copies(copies)
 
 
 def _unusable(error: ValueError) -> FitError:

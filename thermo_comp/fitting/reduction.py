@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -27,23 +27,14 @@ from ..recording import stillness
 from ..recording.blocks import RecordingInfo
 from ..recording.causes import CauseCounter
 from ..recording.stillness import CellAccumulator, Cells
-from ..thermal.thermometer import COLDEST, HOTTEST
-from ..typing import Floats, Ints
+from ..thermal.thermometer import HOTTEST
+from ..typing import Floats
 from .coverage import best_rests, directions, distinct_directions, rough_centre
+from .readings import Readings, is_spike, thinned
 from .sources import FitSource, angular_velocity
 
 #: Default length of a window of the fit [s].
 WINDOW_S = 10.0
-
-
-class Readings(NamedTuple):
-    """
-    One thermometer's readings over a bag: rising stamps [ns] and temperatures [degC], shape (n,);
-    without arguments, no readings.
-    """
-
-    stamp_ns: Ints = np.empty(0, np.int64)
-    value: Floats = np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -85,6 +76,7 @@ class ReducedBag:
     since_s: start of the part of the bag that was read [s]
     restless: reason why the bag has no rests
     angular_rate: part of the bag that has finite angular rates
+    n_spikes: number of readings of each thermometer that are spikes, see `readings`
     """
 
     source: FitSource
@@ -106,6 +98,7 @@ class ReducedBag:
     since_s: float = 0.0
     restless: str = ''
     angular_rate: Literal['none', 'part', 'whole'] = 'none'
+    n_spikes: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def board(self) -> Readings:
@@ -124,6 +117,7 @@ class _Pass:
 
     cells: statistics of the samples
     temperatures: readings of each thermometer
+    n_spikes: number of readings of each thermometer that are spikes, see `readings`
     causes: counters of causes that can explain the lack of a rest
     has_rate: whether all blocks have a finite angular rate
     """
@@ -131,6 +125,7 @@ class _Pass:
     def __init__(self, source: FitSource, accumulator: CellAccumulator) -> None:
         readings: dict[str, list[Readings]] = {}
         n_impossible: Counter[str] = Counter()
+        self.n_spikes: Counter[str] = Counter()
         self.causes = CauseCounter()
         self.n_samples, self.has_rate = 0, True
         for block in source.blocks():
@@ -142,7 +137,9 @@ class _Pass:
             for name, (reading_ns, celsius, _) in block.temperatures.items():
                 earlier = readings.setdefault(name, [Readings()])
                 n_impossible[name] += int(np.count_nonzero(np.abs(celsius) > HOTTEST))
-                new = _thinned(reading_ns, celsius, earlier[-1].stamp_ns[-1:])
+                spikes = is_spike(celsius)
+                self.n_spikes[name] += int(np.count_nonzero(spikes))
+                new = thinned(reading_ns[~spikes], celsius[~spikes], earlier[-1].stamp_ns[-1:])
                 if len(new.stamp_ns):
                     earlier.append(new)
             self.n_samples += len(block.accel_stamp_ns)
@@ -226,6 +223,7 @@ def _bag(
             for edges, size in zip(ranges, sizes, strict=True)
         ),
         temperatures=reading.temperatures,
+        n_spikes=reading.n_spikes,
         n_samples=reading.n_samples,
         n_dropped=cells.n_dropped,
         n_saturated=cells.n_saturated,
@@ -367,25 +365,3 @@ def _windows(
         sample_sd=np.sqrt(np.median(cells.variance[rows], axis=0)),
         angular_rate=means(cells.rate) if has_rate else None,
     )
-
-
-def _thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
-    """
-    Keep plausible readings with rising stamps; average readings that are less than 0.2 s apart.
-
-    No thermometer is faster than 0.2 s, and the recursion over all readings, in Python, is slow.
-    """
-    stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
-    before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
-    use = (value >= COLDEST) & (value <= HOTTEST)
-    use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
-    stamp_ns, value = stamp_ns[use], value[use]
-    span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
-    size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
-    n = len(stamp_ns) // size * size if size > 1 else 0
-    if n:
-        first = stamp_ns[0]
-        middle = np.mean((stamp_ns[:n] - first).reshape(-1, size), axis=1)
-        stamp_ns = first + middle.astype(np.int64)
-        value = np.mean(value[:n].reshape(-1, size), axis=1)
-    return Readings(stamp_ns, value)

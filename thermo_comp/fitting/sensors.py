@@ -19,7 +19,8 @@ import numpy as np
 from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, ThermometerSettings
 from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats
-from .reduction import Readings, ReducedBag
+from .readings import Readings
+from .reduction import ReducedBag
 
 # Interval of the grid of rates [s], and number of intervals on each side in a central difference.
 _BIN_S, _BINS_PER_SIDE = 10.0, 6

@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the checks of the raw data of a fit: serial numbers, samples and readings.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ..recording.overview import KELVINS
+from ..text import counted
+from ..unit.calibration import POPULATION, Calibration
+from ..unit.gravity import STANDARD_GRAVITY
+from .data_checks import Finding, advice
+from .jumps import Jump, find_jumps
+from .options import FitOptions
+from .reduction import ReducedBag
+
+
+def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
+    """
+    Refuse a prior of another unit: the small uncertainties of a unit do not apply to another.
+    """
+    if prior is None or prior.provenance.model == POPULATION:
+        return
+    if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:
+        yield Finding(
+            'prior',
+            'refusal',
+            f'the prior is the calibration of unit {prior.unit.serial}, the bags are of {serial}: '
+            'make a prior of their type from three units or more with thermo_comp prior',
+        )
+
+
+def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
+    """Check the raw data: saturation, motion, numbers that are no counts, jumps, angular rates."""
+    part = sum(bag.n_saturated for bag in bags) / max(sum(bag.n_samples for bag in bags), 1)
+    if part > 0.001:
+        yield Finding(
+            'saturation',
+            'refusal' if part > 0.05 else 'advice',
+            f'{100.0 * part:.2f} % of the samples are at the full scale: an axis sees more than '
+            'it can measure, or --full-scale is wrong',
+        )
+    part = sum(bag.n_dropped for bag in bags) / max(sum(bag.n_samples for bag in bags), 1)
+    if part > 0.01:
+        yield advice(
+            'dropped',
+            f'{100.0 * part:.0f} % of the samples are not finite, or have a stamp that does not '
+            'rise, and are left out: was a clock set back?',
+        )
+    still = sum(bag.n_still_cells for bag in bags) / max(sum(bag.n_cells for bag in bags), 1)
+    if still < 0.5:
+        yield advice(
+            'motion',
+            f'the unit was still for only {100.0 * still:.0f} % of the time; vibration or '
+            'handling in the other time was cut out',
+        )
+    if not any(interval.sample_sd.any() for bag in bags for interval in bag.intervals):
+        text = 'at rest all samples are equal: does the sensor repeat one reading?'
+        yield advice('stuck', text)
+    if dead := '; '.join(_dead_axes(bags)):
+        text = f'{dead}: the axis is dead there, leave out a bag with a dead axis'
+        yield Finding('stuck', 'refusal', text)
+    size = _typical_size(bags)
+    yield from _judge_thermometers(bags)
+    yield from _judge_units(bags, size, options)
+    jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
+    if jumps:
+        per_mg = 1e-3 * (STANDARD_GRAVITY if options.input == 'm/s^2' else size)
+        jumped = '; '.join(
+            f'{bag.source.name}: {describe(event, per_mg, bag.since_s)}' for bag, event in jumps
+        )
+        text = f'{jumped}: leave out a bag with a jump, or end before the jump with --to'
+        yield Finding('jump', 'refusal', text)
+    if not all(bag.angular_rate == bags[0].angular_rate != 'part' for bag in bags):
+        names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
+        text = f'{names}: not every sample has an angular rate, so no gyroscope was fitted'
+        yield advice('rate', text)
+
+
+def _typical_size(bags: Sequence[ReducedBag]) -> float:
+    """Return the median norm of the mean readings at rest [input units]."""
+    means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
+    return float(np.median(np.linalg.norm(means, axis=1)))
+
+
+def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
+    """Check the readings of the thermometers."""
+    n_spikes: Counter[str] = Counter()
+    for bag in bags:
+        n_spikes.update(bag.n_spikes)
+    for name, n in sorted(n_spikes.items()):
+        if n:
+            yield advice(
+                'spikes',
+                f'temperature/{name}: {counted(n, "reading")} more than 10 K from the readings '
+                'before and after, left out: does the thermometer lose contact?',
+            )
+    for name in sorted({name for bag in bags for name in bag.temperatures}):
+        read = [b.temperatures[name].value for b in bags if name in b.temperatures]
+        celsius = np.concatenate(read)
+        if len(celsius) and KELVINS[0] < np.median(celsius) < KELVINS[1]:
+            reads = f'temperature/{name} reads {np.min(celsius):.4g} .. {np.max(celsius):.4g} degC'
+            yield advice('kelvins', f'{reads}: that looks like kelvins')
+
+
+def _judge_units(
+    bags: Sequence[ReducedBag], size: float, options: FitOptions
+) -> Iterator[Finding]:
+    """Check whether samples with this norm at rest are counts; `size`: [input units]."""
+    if options.input == 'counts' and not all(bag.is_integer for bag in bags):
+        for unit, one_g in (('m/s^2', STANDARD_GRAVITY), ('g', 1.0)):
+            if abs(size / one_g - 1.0) < 0.1:
+                yield Finding(
+                    'units',
+                    'refusal',
+                    f'the samples have norm {size:.3g} and are no whole numbers: they look like '
+                    f'{unit}, not counts; record them as sensor_msgs/Imu in m/s^2',
+                )
+                break
+        else:
+            yield advice(
+                'compensated',
+                'the samples are no whole numbers: scaled or compensated before they were '
+                'recorded? A calibration made from scaled samples is valid for that scaling only',
+            )
+
+
+def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[str]:
+    """Describe axes that are constant throughout a rest, but not in most of the rests."""
+    rests = [(bag.source.name, rest) for bag in bags for rest in bag.intervals]
+    alive = np.array([rest.sample_sd > 0.0 for _, rest in rests])
+    usual = 2 * alive.sum(axis=0) >= len(rests)
+    for (name, rest), is_alive in zip(rests, alive, strict=True):
+        is_dead = ~is_alive & usual & (np.ptp(rest.mean, axis=0) == 0.0)
+        # The samples of a working axis show noise or drift within a thousand samples.
+        for axis in np.flatnonzero(is_dead & (rest.count.sum() >= 1000)):
+            hours = (rest.end_ns - rest.start_ns) / 3600e9
+            letter, value = 'xyz'[axis], rest.mean[0, axis]
+            yield f'{name}: {letter} reads {value:g} to the bit for {hours:.2g} h'
+
+
+def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
+    """Describe a jump; `since_s`: start of the part of the bag that was read [s]."""
+    vector = ', '.join(f'{v / per_mg:+.3g}' for v in jump.step)
+    warmed = ''
+    if np.isfinite(jump.temperature_change):
+        warmed = (
+            f', while its temperature changed by {jump.temperature_change:+.2f} ± '
+            f'{jump.temperature_change_sd:.2f} K'
+        )
+    return (
+        f'at {jump.time + since_s:.1f} s the sensor jumped by {jump.along / per_mg:+.3g} mg along '
+        f'gravity ({vector}) within {jump.duration_s:.2g} s, without motion{warmed}: not a '
+        'function of temperature'
+    )
+
+
+def judge_copies(names: Sequence[str]) -> list[Finding]:
+    """Report the thermometers that repeat the board's readings."""
+    return [
+        advice('copy', f'temperature/{name} repeats the readings of the board: it is left out')
+        for name in names
+    ]
