@@ -14,7 +14,14 @@ from rosbags.typesys import Stores, get_typestore
 
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.fitting.sources import digest
-from thermo_comp.fleet.units import FoundUnit, Storage, StoredFile, find_units, group_files
+from thermo_comp.fleet.units import (
+    FoundUnit,
+    Storage,
+    StoredFile,
+    find_units,
+    folders_of_tables,
+    group_files,
+)
 from thermo_comp.fleet.work import process_unit
 from thermo_comp.unit.calibration_file import parse_calibration
 
@@ -120,6 +127,11 @@ class TestDiscovery:
         for name in ('lot-A/u1/1.mcap', 'lot-A/u1/2.mcap', 'lot-B/u2/1.mcap', 'u3/1.mcap'):
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).touch()
+        (tmp_path / 'u4').mkdir()
+        (tmp_path / 'u4' / 'log.csv').touch()
+        (tmp_path / 'u3' / 'truth.csv').touch()
+        (tmp_path / 'out').mkdir()
+        (tmp_path / 'out' / 'fleet.csv').touch()
         (tmp_path / '.hidden').mkdir()
         (tmp_path / '.hidden' / 'x.mcap').touch()
         units = find_units(Storage(str(tmp_path)))
@@ -128,6 +140,8 @@ class TestDiscovery:
             ('lot-B/u2', 'lot-B', 1),
             ('u3', '', 1),
         ]
+        # WHY: a unit of which only tables were recorded was left out without a message.
+        assert folders_of_tables(Storage(str(tmp_path))) == ('u4',)
 
     def test_bags_without_folders_are_sorted_by_serial(self, tmp_path):
         for seed, names in ((1, ['a.mcap', 'd.mcap']), (2, ['b.mcap', 'c.mcap'])):

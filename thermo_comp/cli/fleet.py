@@ -87,7 +87,7 @@ def fleet_fit(
     _tell_result(out, result, with_prior)
     out.end(
         int(not result.is_whole),
-        **picked(result, 'rows n_fitted n_done parquet csv page prior'),
+        **picked(result, 'rows n_fitted n_done parquet csv page prior skipped'),
         **picked(result.summary, 'verdicts outliers drifts'),
     )
 
@@ -112,6 +112,9 @@ def _tell_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
         # The reservations of a calibrated test also name the bags left out.
         text = (row['problem'], row['reservations'] or row['left_out'])
         out.points(f'{row["name"]}: {one}' for one in text if one)
+    out.points(
+        f'{name}: tables, but no bag: thermo_comp convert makes bags' for name in result.skipped
+    )
     out.points(
         f'{one.name}: {one.label} {one.value:.4g} {one.unit}, median {one.middle:.4g}: '
         f'{one.z:+.1f} sd'

@@ -24,7 +24,7 @@ from ..unit.calibration import Calibration
 from ..unit.calibration_file import load_calibration, save_calibration
 from .summary import Summary, summarise
 from .table import FAILED, Row, is_fitted, is_valid, row_of, write_tables
-from .units import FoundUnit, Storage, find_units
+from .units import FoundUnit, Storage, find_units, folders_of_tables
 from .work import FleetOptions, UnitOutcome, connected, run, sha256
 
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
@@ -47,6 +47,7 @@ class FleetResult:
     page: Path
     prior: Path | None
     no_prior: str  # reason if there is no prior
+    skipped: tuple[str, ...] = ()  # folders of tables without a bag
 
     @property
     def n_fitted(self) -> int:
@@ -118,7 +119,10 @@ def fit_fleet(
     content = render_fleet(ordered, summary, results.certificate_of).encode()
     files.write_atomically(page, content, files.PAGE)
     prior_path = None if prior is None else results.folder / PRIOR
-    return FleetResult(ordered, summary, len(done), parquet, csv, page, prior_path, no_prior)
+    skipped = folders_of_tables(storage)
+    return FleetResult(
+        ordered, summary, len(done), parquet, csv, page, prior_path, no_prior, skipped
+    )
 
 
 def _require_packages() -> None:

@@ -132,6 +132,25 @@ def find_units(storage: Storage) -> list[FoundUnit]:
     return [FoundUnit(unit, lot, by_unit[unit, lot]) for unit, lot in sorted(by_unit)]
 
 
+def folders_of_tables(storage: Storage) -> tuple[str, ...]:
+    """Name the folders that hold tables, which `convert` reads, and no bag."""
+    stored = storage.files()
+    with_bags = [f'{_folder(name)}/' for name in group_files(stored)]
+    # A result of an earlier run, fleet.csv, may be in a folder of the fleet.
+    tables = {
+        _folder(file.name)
+        for file in stored
+        if file.name.endswith(('.csv', '.mat')) and not file.name.endswith('/fleet.csv')
+    }
+    return tuple(
+        sorted(
+            name
+            for name in tables
+            if name and not any(f'{name}/'.startswith(b) for b in with_bags)
+        )
+    )
+
+
 def group_files(files: Sequence[StoredFile]) -> Bags:
     """Group the files of a fleet into bags, in the order of their names."""
     by_folder: dict[str, list[StoredFile]] = defaultdict(list)
