@@ -98,6 +98,10 @@ def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, r
     findings = findings_of(noisy, up)
     assert 'swapped' not in findings
     assert 'no ramp' in findings['ramps'].message
+    assert 'soaks at 3 temperatures' in findings['soaks'].message
+    # A slow drift through the whole range is no soak.
+    drift = replace(windows, rate=0.0 * windows.rate)
+    assert 'soaks' not in findings_of(drift, up)
 
 
 def test_a_missing_case_is_said(good):

@@ -35,6 +35,8 @@ POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT = 6, 9
 #: Smallest number of positions whose norms determine the sd of mounting offsets beside the nine
 #: constants.
 POSITIONS_FOR_MOUNTINGS = 12
+#: Smallest number of soak temperatures that determine a cubic, and show whether it fits.
+SOAKS_NEEDED = 5
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,18 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             f'no ramp: the board temperature never changes by {RAMP_K_MIN:g} K/min for long, so '
             'the effect of a ramp is unknown; record ramps between the soaks',
         )
+        steps = np.diff(np.sort(windows.temperature))
+        # Soaks at one temperature of a chamber differ by less than 1 K, or a tenth of the span.
+        is_gap = steps > max(1.0, 0.1 * steps.sum())
+        n = 1 + int(is_gap.sum())
+        # A slow drift through a range is no soak.
+        has_soaks = steps[~is_gap].sum() < n * max(1.0, 0.1 * steps.sum())
+        if has_soaks and n < SOAKS_NEEDED:
+            yield advice(
+                'soaks',
+                f'soaks at {counted(n, "temperature")}: the curve between and beyond them is '
+                f'unknown; {SOAKS_NEEDED} temperatures determine a cubic',
+            )
     elif min(heating, cooling) < 0.1 * max(heating, cooling):
         seen, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')
         yield advice(
