@@ -39,10 +39,6 @@ from .start import within_positions
 from .unknowns import Layout, Prior, State
 from .windows import CURVE, PART
 
-# Largest effect of a column of the curve that the data do not show, relative to that of the seen
-# column of the largest slope: curves over temperature deviate from a line by up to a half.
-_UNSEEN_SHARE = 0.5
-
 
 @dataclass(frozen=True)
 class Claim:
@@ -137,7 +133,8 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
         slopes = np.sqrt(np.mean(np.sum(steepest**2, axis=2), axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.where(is_of_lags, np.minimum(typical, of_curve), typical)
-        unseen = _UNSEEN_SHARE * of_curve
+        # Curves over temperature deviate from their largest slope by up to a half.
+        unseen = 0.5 * of_curve
         typical = np.where(groups == CURVE, np.minimum(typical, unseen), typical)
         sd = np.where(groups == CURVE, np.minimum(sd, unseen), sd)
     # All lags together have at most the effect of one lag: they share its prior variance.

@@ -29,14 +29,9 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest numbers of distinct attitudes: that determine bias and scale factor (six constants),
-#: and that determine the misalignment (three constants) in addition.
-POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT = 6, 9
-#: Smallest number of positions whose norms determine the sd of mounting offsets beside the nine
-#: constants.
-POSITIONS_FOR_MOUNTINGS = 12
-#: Smallest number of soak temperatures that determine a cubic, and show whether it fits.
-SOAKS_NEEDED = 5
+#: Smallest numbers of positions: that determine bias and scale factor (six constants), the
+#: misalignment (three more), and by their norms the sd of mounting offsets.
+POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
 
 
 @dataclass(frozen=True)
@@ -148,11 +143,12 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
         n = 1 + int(is_gap.sum())
         # A slow drift through a range is no soak.
         has_soaks = steps[~is_gap].sum() < n * max(1.0, 0.1 * steps.sum())
-        if has_soaks and n < SOAKS_NEEDED:
+        # Five temperatures determine a cubic, and show whether it fits.
+        if has_soaks and n < 5:
             yield advice(
                 'soaks',
                 f'soaks at {counted(n, "temperature")}: the curve between and beyond them is '
-                f'unknown; {SOAKS_NEEDED} temperatures determine a cubic',
+                f'unknown; five temperatures determine a cubic',
             )
     elif min(heating, cooling) < 0.1 * max(heating, cooling):
         seen, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')

@@ -34,9 +34,6 @@ STUDENT_NU = 4.0
 #: Smallest log Bayes factor of a column that is kept: below 1 the evidence is "not worth more than
 #: a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
 LEAST_GAIN = 1.0
-#: Largest prior sd of an element of the misalignment [rad]: 2 degrees, as of three single sensors
-#: on a printed bracket. Larger misalignments explain the norms of six faces, to second order.
-LARGEST_MISALIGNMENT_SD = 0.03
 
 
 @dataclass(frozen=True)
@@ -105,7 +102,9 @@ def _updated(
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
         new_sd = float(np.sqrt(square / (share * gamma + 1.0)))
-        misalignment_sd = min(new_sd, LARGEST_MISALIGNMENT_SD)
+        # Misalignments above 2 degrees, as of three single sensors on a printed bracket, would
+        # explain the norms of six faces, to second order.
+        misalignment_sd = min(new_sd, 0.03)
     start_share = prior.start_share
     if layout.start.size:
         # The run-time prior counts as one further state; else the states of one bag could make

@@ -30,9 +30,6 @@ from .sources import angular_velocity
 
 # Shortest duration of the readings on either side of a gap that give the level: seconds, samples.
 _MARGIN_S, _MARGIN_SAMPLES = 10.0, 120
-# Longest gap between two rests that are compared: seconds, samples. A slow log has long gaps, as
-# a rest is found to some twenty samples.
-_GAP_S, _GAP_SAMPLES = 30.0, 250
 # Smallest number of samples on either side of a step that is tested.
 _FEWEST_SAMPLES = 8
 # Smallest significant step, in units of its sd; the search over the place of a step reaches about
@@ -69,7 +66,8 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     directions differ by less than 10 degrees.
     """
     cycle_s = bag.cycle_s if np.isfinite(bag.cycle_s) else 0.0
-    longest_ns = 1e9 * max(_GAP_S, _GAP_SAMPLES * cycle_s)
+    # A slow log has long gaps, as the end of a rest is found to some twenty samples.
+    longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
     margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
     means = [
         np.average(interval.mean, axis=0, weights=interval.count) for interval in bag.intervals

@@ -47,11 +47,9 @@ class _Shape(NamedTuple):
     has_stress: bool = False
 
 
-# Smallest number of nodes of the spline of the bias.
-_FEWEST_NODES = 4
 # Shapes tried in this order: a curve of few nodes determines a lag best but has no kinks, so the
 # residual must be noise.
-_SHAPES = (_Shape(_FEWEST_NODES, 1.1), _Shape(60, 1.5), _Shape(60, 1.5, has_stress=True))
+_SHAPES = (_Shape(4, 1.1), _Shape(60, 1.5), _Shape(60, 1.5, has_stress=True))
 
 
 @dataclass(frozen=True)
@@ -104,8 +102,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         # A larger residual has another cause, for example slow noise: the lags are then accepted
         # only if they reduce the RMS residual of each axis to an eighth or less of the residual
         # without a lag.
-        is_last = shape.n_nodes > _FEWEST_NODES
-        if is_last and accepted is None and min(map(subset.reduction, lags, range(3))) >= 8.0:
+        may_exceed_noise = shape is not _SHAPES[0]
+        reduction = min(map(subset.reduction, lags, range(3)))
+        if may_exceed_noise and accepted is None and reduction >= 8.0:
             accepted = parts
     return accepted
 
@@ -285,7 +284,7 @@ class _PartCurves:
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
         # The spline of the bias has a node every 0.6 K or more.
-        n_nodes = int(np.clip(span / 0.6, _FEWEST_NODES, self._shape.n_nodes))
+        n_nodes = int(np.clip(span / 0.6, 4, self._shape.n_nodes))
         inner = np.linspace(low, low + span, n_nodes)
         knots = np.pad(inner, 3, mode='edge')
         bias = BSpline.design_matrix(np.clip(x, low, low + span), knots, 3).toarray()

@@ -112,28 +112,23 @@ def informative_priors(
     def grown(bias_sd: float, scale_sd: float) -> Floats:
         result: Floats = covariance.copy()
         for axis in range(3):
-            for block, sd in (
-                (places.bias[axis], bias_sd * K[axis]),
-                (places.scale[axis], scale_sd),
-            ):
+            blocks = (places.bias[axis], bias_sd * K[axis]), (places.scale[axis], scale_sd)
+            for block, sd in blocks:
                 levels = [block.static, block.dynamic]
                 result[np.ix_(levels, levels)] += sd * sd
         return result
 
     stated = options.ageing_bias, options.ageing_scale
-    # Candidate values of an additional uncorrelated variance, relative to each variance of the
-    # prior.
+    # Candidates of an added uncorrelated variance, relative to each variance of the prior.
     tried = [(grown(*stated), share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
-        # Candidate values of the sd of ageing: of the biases [g], and of the relative scale
-        # factors, 0, 0.01 or 1 times the number for the biases.
+        # Candidates of the sd of ageing: of the biases [g], its multiple for the scale factors.
         tried += [
             (grown(ageing * options.gravity, multiple * ageing), 0.0)
             for multiple in (0.0, 0.01, 1.0)
             for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
-    # The first fit needs a wide prior: under a narrow prior the estimated noise would absorb the
-    # differences.
+    # Under a narrow prior the noise estimated by the first fit would absorb the differences.
     tried.append((tried[-1][0], 1.0))
     layout = regression.layout(regression.windows.parts)
     kinds = regression.forces.kinds if regression.forces else ()
