@@ -105,7 +105,7 @@ def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
     # The run passes 5 .. 35 degC, the tangents of the curves, and the quarter of the span beyond.
-    events = run_of(rng, seconds=50, swing_k=75.0)
+    events = run_of(rng, seconds=50, swing_k=90.0)
     rows = stream(Compensator(unit, UNCHECKED), events)[0]
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
     whole, cut = Compensator(unit, UNCHECKED), Compensator(unit, UNCHECKED)
