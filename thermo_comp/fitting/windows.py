@@ -44,9 +44,8 @@ N_SECTIONS = 6
 @dataclass(frozen=True)
 class Sets:
     """
-    The families of the curves of the two sets.
+    The families of the curves of the two sets; the coefficients of the curves are not used.
 
-    static, dynamic: families of the curves; their coefficients are not used
     is_shared: whether the dynamic curve is the static curve plus a difference, or a separate curve
     """
 
@@ -146,8 +145,7 @@ class ThermalWindows:
 
     model: model of the columns
     data: samples and columns for the regression
-    temperature, rate, weight: board temperature [degC], its rate of change [K/s], weight of the
-        dynamic set, shape (n,)
+    temperature, rate, weight: of the board [degC], its rate [K/s], of the dynamic set, shape (n,)
     gradient: T_case - T_board [K], shape (n,)
     raw: columns of the response without powers of t and ranges, shape (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3); (n, 0) if a bag lacks it

@@ -379,10 +379,7 @@ def _drift(cells: Cells, believable: Bools) -> Floats:
 
 
 def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
-    """
-    Whether cell i + 1 continues cell i, shape (n - 1,): no gap in time, no step of the mean
-    besides the drift.
-    """
+    """Whether cell i + 1 continues cell i, shape (n - 1,): no gap, no step besides the drift."""
     step = np.diff(cells.mean, axis=0) - drift
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():
