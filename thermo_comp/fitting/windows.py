@@ -145,7 +145,7 @@ class ThermalWindows:
 
     model: model of the columns
     data: samples and columns for the regression
-    temperature, rate, weight: of the board [degC], its rate [K/s], of the dynamic set, shape (n,)
+    temperature, rate: of the board [degC, K/s], shape (n,); weight: of the dynamic set, shape (n,)
     gradient: T_case - T_board [K], shape (n,)
     raw: columns of the response without powers of t and ranges, shape (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3); (n, 0) if a bag lacks it
