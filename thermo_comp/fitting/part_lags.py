@@ -102,9 +102,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         # A larger residual has another cause, for example slow noise: the lags are then accepted
         # only if they reduce the RMS residual of each axis to an eighth or less of the residual
         # without a lag.
-        may_exceed_noise = shape is not _SHAPES[0]
-        reduction = min(map(subset.reduction, lags, range(3)))
-        if may_exceed_noise and accepted is None and reduction >= 8.0:
+        if shape is _SHAPES[0] or accepted is not None:
+            continue
+        if min(map(subset.reduction, lags, range(3))) >= 8.0:
             accepted = parts
     return accepted
 
