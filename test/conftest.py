@@ -51,13 +51,14 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 #: The longest test files, in order of duration, with which `make test` begins.
 _LONG = (
-    *('fleet_run', 'cli_help', 'real_data', 'fitting', 'record', 'faults', 'fitting_selection'),
-    *('priors', 'regime', 'docs', 'degenerate', 'gyroscope', 'cli_demo', 'few_positions'),
-    *('report', 'fault_process', 'fault_files', 'attacks', 'allow', 'replay', 'node_defence'),
-    *('drivers', 'fleet_unit', 'node_startup', 'fitting_closing', 'fitting_windows', 'readme'),
-    *('compensator', 'report_certificate', 'acquisition', 'files', 'node_parity', 'middleware'),
-    *('fitting_change', 'fleet_storage', 'player', 'fit_api', 'report_figures', 'correction'),
-    *('node_sources', 'fitting_regression', 'judging_history', 'api', 'third_thermometer'),
+    *('part_lags', 'cli_demo', 'cli_help', 'gyroscope', 'fleet_run', 'faults', 'report'),
+    *('priors', 'fitting', 'fault_process', 'few_positions', 'real_data', 'fit_api', 'record'),
+    *('regime', 'attacks', 'degenerate', 'correction', 'fault_files', 'docs', 'fitting_closing'),
+    *('node_parity', 'fitting_windows', 'api', 'fitting_change', 'judging', 'fitting_selection'),
+    *('judging_history', 'node_defence', 'node_startup', 'fitting_regression'),
+    *('third_thermometer', 'replay', 'allow', 'drivers', 'node_sources', 'player'),
+    *('fitting_nonlinear', 'middleware', 'recording_write', 'compensator', 'ins', 'properties'),
+    *('node_reload', 'field', 'plausibility', 'recording_damage', 'thermometer'),
 )
 
 

@@ -196,19 +196,22 @@ class _PartCurves:
             return lag
         tau_step, second_step, share_step = 0.03, 0.06, 0.02
         steps = tau_step, second_step * bool(lag.second_tau_s), share_step * bool(lag.sensor_share)
-        return self._searched(axis, lag, steps)
+        return self._searched(axis, lag, steps, accuracy=1e-3)
 
     def _better(self, axis: int, simple: Part, other: Part) -> Part:
         """Return the second lag if its RMS residual is 5 % below that of the first lag."""
         is_better = self._square(other, axis) < self._square(simple, axis) / 1.05**2
         return other if is_better else simple
 
-    def _searched(self, axis: int, first: Part, steps: tuple[float, float, float]) -> Part:
+    def _searched(
+        self, axis: int, first: Part, steps: tuple[float, float, float], accuracy: float = 0.01
+    ) -> Part:
         """
         Return the lag of the smallest RMS residual by the simplex method.
 
         `steps`: first steps of the logarithms of the time constants, and of the share of the
         gradient; 0 for a value that remains that of the lag `first`
+        `accuracy`: of these values
         """
         start = np.array([np.log(first.tau_s), np.log(first.second_tau_s or 1.0), first[2]])
         free = np.flatnonzero(steps)
@@ -220,7 +223,10 @@ class _PartCurves:
             return _in_order(float(np.exp(point[0])), second, float(np.clip(point[2], -2.0, 2.0)))
 
         simplex = start[free] + np.vstack((np.zeros(len(free)), np.diag(np.array(steps)[free])))
-        options: Any = {'xatol': 2e-3, 'fatol': 1e-4, 'maxfev': 150, 'initial_simplex': simplex}
+        options: Any = {
+            'xatol': 2.0 * accuracy, 'fatol': 0.1 * accuracy, 'maxfev': 150,
+            'initial_simplex': simplex,
+        }  # fmt: skip
 
         def log_square(values: Floats) -> float:
             return float(np.log(self._square(lag_at(values), axis)))
