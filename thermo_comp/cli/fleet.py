@@ -29,7 +29,7 @@ def fleet_fit(
         'Write no certificates, which halves the work.', False, '--no-certificates'
     ),
     with_prior: bool = option(
-        'Fit units with incomplete data again, with the prior of the others.',
+        'Fit units with incomplete data again, with the prior of the other units.',
         False,
         '--with-prior',
     ),

@@ -31,8 +31,8 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-# |a| of a still sensor in each unit. Cheap sensors are off by a few per cent (bias and scale), a
-# thermal chamber adds some; 20 % exceeds the sum and is far below the ratios between the units.
+# |a| of a still sensor in each unit. The tolerance of 20 % exceeds the errors of bias and scale of
+# cheap sensors, even in a thermal chamber, and is far below the ratios between the units.
 PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].

@@ -104,8 +104,8 @@ def _at_rest(data: Windows) -> Windows:
     """
     Return the windows with columns that are constant in each position.
 
-    A lag of unknown size changes the readings of a soak by as much as the rest of the temperature
-    does. Their drift does not determine the curve, but the norms of the positions do.
+    A lag of unknown size changes the readings of a soak by as much as the remaining drift of the
+    temperature does: the norms of the positions determine the curve, drifts within soaks do not.
     """
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
     return replace(data, columns=means[data.position], start=np.zeros_like(data.start))
@@ -283,7 +283,7 @@ def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibra
     gravity = sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):
-        raise FitError('an axis is exactly zero at rest: is it dead, is it the right topic?')
+        raise FitError('an axis is exactly zero at rest: is the axis dead, or the topic wrong?')
     if len(distinct_directions(means / norms[:, None])) >= POSITIONS_NEEDED:
         known = options.gravity if windows.data.forces is None else gravity
         return constant_calibration(means, known, with_misalignment=False)

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest numbers of positions: that determine bias and scale factor (six constants), the
-#: misalignment (three more), and by their norms the sd of mounting offsets.
+#: Smallest numbers of positions that determine bias and scale factor (six constants), the
+#: misalignment (three more constants), and by their norms the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
 
 
@@ -190,7 +190,7 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a further position if the sd of |f| in some attitude is 3 times that in positions."""
+    """Advise a further position if the largest sd of |f| is 3 times the median of positions."""
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield advice(
             'unseen',

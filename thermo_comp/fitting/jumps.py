@@ -66,7 +66,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     directions differ by less than 10 degrees.
     """
     cycle_s = bag.cycle_s if np.isfinite(bag.cycle_s) else 0.0
-    # A slow log has long gaps, as the end of a rest is found to some twenty samples.
+    # A slow log has long gaps, because the end of a rest is found only to some twenty samples.
     longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
     margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
     means = [
@@ -80,7 +80,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
     near = _near(bag, gaps, [margin_s] * len(gaps))
-    # If the noise is correlated, the level beside a gap is a mean over a longer time.
+    # If the noise is correlated, the level beside a gap is the mean over a time above `margin_s`.
     margins = [_margin(part, quiet_sd) for part in near]
     slow = [place for place, margin in enumerate(margins) if margin > margin_s]
     wider = _near(bag, [gaps[place] for place in slow], [margins[place] for place in slow])
@@ -130,8 +130,7 @@ def _examine(
         return None
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
-    # A shock decays, but a step is also a difference between the quiet samples before and after
-    # it.
+    # A step, unlike a shock, which decays, also changes the mean level of the quiet samples.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
     lasting_sd = quiet_sd * relative_sd * _correlation(residual, quiet_sd)
     step, relative_sd, residual = _step(time, accel, time[at], r)

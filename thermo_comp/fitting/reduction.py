@@ -345,8 +345,7 @@ def _windows(
     offsets = np.arange(0, end - lower, per_window)
     count = cells.count[rows].astype(np.float64)
     total = np.add.reduceat(count, offsets)
-    # The last window is not of full length if the bag ends within it: it has less than 90 % of the
-    # samples.
+    # A last window with less than 90 % of the usual samples is not of full length: the bag ended.
     if n_whole and total[n_whole - 1] < 0.9 * np.median(total):
         n_whole -= 1
 

@@ -249,8 +249,8 @@ class Results:
             texts = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
             return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, texts)))})
         if outcome.calibration:
-            # Write the record last: before, its hash differs from the calibration's, and the unit
-            # counts as missing.
+            # Write the record last: while its hash differs from the calibration's, the unit counts
+            # as missing.
             content = outcome.calibration.encode()
             files.write_atomically(folder / CALIBRATION, content, files.CALIBRATION)
             (folder / CERTIFICATE).unlink(missing_ok=True)

@@ -48,8 +48,8 @@ class ThermometerSurvey:
 @dataclass(frozen=True)
 class Survey:
     """
-    Summary of a recording for a fit. The rate follows from the median interval; still intervals
-    last at least 3 s; findings are obstacles to a fit, with the next step.
+    Summary of a recording for a fit. The rate of samples follows from their median interval; still
+    intervals last at least 3 s; findings are obstacles to a fit, with the user's next step.
     """
 
     info: RecordingInfo

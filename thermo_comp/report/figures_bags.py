@@ -99,7 +99,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
 
 
 def draw_gravity(evidence: Evidence) -> Figure:
-    """Draw |f| over time, before and after, and after in detail (the paper's Fig. 7)."""
+    """Draw |f| over time, raw and corrected, and corrected in detail (the paper's Fig. 7)."""
     residuals = evidence.residuals
     corrected = [rung for rung in residuals if rung != RAW]
     sets = [forces for forces in (list(residuals), corrected) if forces]

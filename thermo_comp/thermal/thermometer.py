@@ -56,9 +56,9 @@ class Thermometer:
     they are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
     `interval_s`: typical interval between readings; `n_in_row`: number of readings since the last
     start; `n_restarts`: number of starts after a gap or a step; `is_ready`: two readings exist, so
-    that a rate is known. `measured` and its
-    variance: the last reading, or for a sensor with cells the equivalent Gaussian measurement
-    (infinite variance: no information). `bending`: probability of the bending mode.
+    that a rate is known. `measured` and its variance: the last reading, or for a sensor with cells
+    the equivalent Gaussian measurement (infinite variance: no information). `bending`: probability
+    of the bending mode.
     """
 
     def __init__(self, settings: ThermometerSettings) -> None:

@@ -286,8 +286,8 @@ class Correction:
             # The posterior holds within the calibrated ranges, so the variance grows with the
             # distance outside.
             v *= (1.0 + (outside + columns_out) ** 2)[:, np.newaxis]
-        doubt = unknown + weight * static_weight + outside * outside
-        if not (is_beyond or doubt.any()):
+        of_gap = unknown + weight * static_weight + outside * outside
+        if not (is_beyond or of_gap.any()):
             return v
         if self.table.differs:
             of_static, of_dynamic = (
@@ -295,8 +295,8 @@ class Correction:
             )
             gap = self._weigh(held * (of_dynamic - of_static), gap)
         held_back = self._weigh(beyond_range * factors[0], np.zeros_like(gap))
-        of_gaps = self._spread(np.array([doubt, np.ones_like(doubt)]), np.array([gap, held_back]))
-        return np.asarray(v + of_gaps)
+        of_gaps = np.array([of_gap, np.ones_like(of_gap)])
+        return np.asarray(v + self._spread(of_gaps, np.array([gap, held_back])))
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """
