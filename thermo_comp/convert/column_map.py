@@ -309,7 +309,7 @@ def _stamp(
     steps = np.diff(times)
     if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
         step, first = float(np.median(steps[steps > 0.0])), float(times[0])
-        # In a slow log of a unit that never turns, the temperature shows that the log took longer.
+        # In a slow log of a unit that never turns, large temperature changes prove a long log.
         shortest_s = span / _FASTEST_K_S
         longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
         # Take the largest unit with a plausible interval of samples: 5 ms is plausible, 5 s is

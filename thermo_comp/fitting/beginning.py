@@ -58,9 +58,9 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
     if options.model == 'golovach' or n_directions < POSITIONS_NEEDED:
-        # P attitudes give 3 P drifts. The unit has 6 unknown drifts (bias and scale of each axis),
-        # the supports have 2 P. Below 6 attitudes a tilt cannot be distinguished from a drift of
-        # the unit. In the paper's model tilts would absorb the errors of its two sets.
+        # P attitudes give 3 P drifts for 6 unknown drifts of the unit (bias and scale of each
+        # axis) and 2 P unknown tilts of supports: below 6 attitudes a tilt cannot be distinguished
+        # from a drift of the unit. In the paper's model tilts would absorb errors of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
     if known is None and _has_soaks_only(windows):
         data = _at_rest(data)
@@ -93,7 +93,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _has_soaks_only(windows: ThermalWindows) -> bool:
-    """Whether no position has more than 1 % of the change of the temperature (RMS)."""
+    """Whether the RMS change of the temperature in a position is below 1 % of that in the test."""
     t, position = windows.temperature, windows.data.position
     within = within_positions(t[:, None], position)[:, 0]
     square = np.bincount(position, within**2) / np.bincount(position)
@@ -258,8 +258,8 @@ def _steepness(windows: ThermalWindows, start: ConstantCalibration, options: Fit
         powers = np.vander(sizes / sizes.max(), 4)
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if _has_soaks_only(windows):
-        # The constants explain a part of the differences: take the RMS change of the norms, per
-        # unit of all slopes, that the constants do not explain.
+        # The constants explain a part of the differences between norms: take the RMS change of the
+        # norms, per unit of all slopes, that the constants do not explain.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants

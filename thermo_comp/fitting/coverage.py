@@ -114,7 +114,7 @@ def rough_centre(means: Floats) -> Floats:
     Return the reading at zero force: 0 if the norms of readings agree, else a sphere's centre.
 
     With offset binary codes the angles between raw vectors are meaningless. `means`: mean
-    readings, shape (n, 3); with fewer than four, or all in a plane, the result is 0.
+    readings, shape (n, 3); with fewer than four readings, or all in a plane, the result is 0.
     """
     zero = np.zeros(3)
     if len(means) < 4:

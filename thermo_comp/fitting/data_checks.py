@@ -190,7 +190,7 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a further position if the largest sd of |f| is 3 times the median of positions."""
+    """Advise a further position if the largest sd of |f| is 3 times the positions' median sd."""
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield advice(
             'unseen',

@@ -123,7 +123,7 @@ def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
 def _examine(
     near: Floats, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
 ) -> Jump | None:
-    """Test the readings beside a gap for a jump; None without one."""
+    """Test the readings beside a gap for a jump; None without a jump."""
     time, accel, gyro = near[:, 0], near[:, 1:4], near[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
     if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
@@ -138,8 +138,8 @@ def _examine(
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = sd * relative_sd * _correlation(residual, sd)
     if r:
-        # At least half of the step must last, and the lasting part must exceed four standard
-        # deviations.
+        # At least half of the step must last, and the lasting part must exceed four of its own
+        # standard deviations.
         is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > 0.5)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -209,8 +209,8 @@ def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[in
     Find the first sample after a step, and the lag-1 correlation of the noise.
 
     The place of the step and the correlation are estimated in turn, three times. Noise with a
-    correlation below 0.4 counts as white. The correlation is at most 0.999; noise of a larger
-    correlation is a random walk.
+    lag-1 correlation below 0.4 counts as white. The correlation is at most 0.999; noise of a
+    larger correlation is a random walk.
     """
     at, r = _place_of_step(time, accel, quiet_sd, 0.0), 0.0
     for _ in range(3):

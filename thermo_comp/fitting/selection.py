@@ -123,7 +123,7 @@ class Growth:
     def extended(
         self, before: Trial, groups: tuple[str, ...] = (), typical: Floats | None = None
     ) -> Trial:
-        """Fit a model with further groups, from the fit of the model before."""
+        """Fit a model with further groups, from the fit of the model without them."""
         typical = before.typical if typical is None else typical
         posterior = before.posterior
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)

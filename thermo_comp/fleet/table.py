@@ -44,7 +44,7 @@ class Column(NamedTuple):
     label: str = ''  # text for a compared quantity, see `_COMPARED`
     unit: str = ''
     by: str = 'value'
-    sd: str = ''  # the column with its standard deviation
+    sd: str = ''  # name of the column with the standard deviation of a compared quantity
 
 
 _BELOW = ((1, 0), (2, 0), (2, 1))

@@ -54,7 +54,7 @@ class FleetOptions:
 
 @dataclass(frozen=True)
 class UnitOutcome:
-    """The result of a unit, small enough to send."""
+    """The result of a unit, small enough to send between processes."""
 
     row: dict[str, Cell]
     hashes: dict[str, str]  # SHA-256 of each bag

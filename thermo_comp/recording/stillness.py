@@ -279,7 +279,7 @@ def still_runs(
     # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
     # variance is a little below its mean; 1.3 covers it for cells of 32 samples.
     noise = np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
-    # A drift of d within a cell has a variance of d^2 / 12; twice that allows for noise.
+    # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
     by_drift = within**2 / 6.0 if len(within) else 0.0
     result = []
@@ -384,7 +384,7 @@ def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():
         return np.zeros(len(step), dtype=bool)
-    # With many short rests most steps are turns: limit the spread.
+    # With many short rests most steps are turns: limit the spread of the steps.
     spread = np.minimum(
         1.4826 * np.median(np.abs(step[both]), axis=0), STILL_SD / _STEP_SDS * _one_g(cells)
     )

@@ -139,8 +139,8 @@ class SensorCheck:
                 self.step = step
                 return False
             if fault is Fault.STEP:
-                # The time was long enough for the change of the reading, but a reading beyond the
-                # noise is a change that no earlier reading predicted.
+                # After a rejected step the estimate starts again if an admitted reading differs
+                # from the expected temperature by more than noise.
                 self.is_revived = abs(step) > self._largest_noise + _SIGMAS * sqrt(variance)
         self.fault = Fault.NONE
         self._n_used += 1

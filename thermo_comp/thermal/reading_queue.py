@@ -12,7 +12,7 @@ from .memory import BOARD_INPUT
 #: thermometer, order of arrival, temperature [degC].
 Entry = tuple[int, bool, str, int, float]
 
-#: Largest number of waiting readings; more mean that readings and samples use different clocks.
+#: Largest number of waiting readings; if more wait, readings and samples use different clocks.
 PENDING_LIMIT: Final = 4096
 #: Largest backward step between consecutive stamps of one sensor [ns]; after a larger step the
 #: earlier readings are taken to be from another clock.
