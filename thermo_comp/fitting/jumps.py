@@ -106,7 +106,7 @@ def _near(
 
 
 def _margin(near: Floats, quiet_sd: Floats) -> float:
-    """Return the duration of the readings beside a gap [s]: 60 time constants of the noise."""
+    """Return the duration of readings beside a gap: 60 time constants of the noise, 10..100 s."""
     time, accel = near[:, 0], near[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S

@@ -315,7 +315,7 @@ def _grown(
 
 
 def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
-    """Mark the chosen model, with its final score, and those within one standard error of it."""
+    """Mark the chosen model, with its final score, and models within one standard error of it."""
     marked = []
     for trial in trials:
         is_chosen = trial.groups == chosen.groups

@@ -24,7 +24,7 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # a killed process loses a chunk: half a minute at 100 Hz
+_CHUNK_BYTES = 1 << 17  # a killed process loses a chunk: some 17 s of counts at 100 Hz
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: Hidden name of a bag that is being written: its number and the process number.

@@ -277,7 +277,7 @@ def still_runs(
     wider = spread_of_variances(cells, plausible, level)
     # A sensor that repeats one number does not show its noise: toggling between two adjacent
     # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
-    # variance is a little below its mean; 1.3 covers it for cells of 32 samples.
+    # variance is below its mean; for cells of 32 samples a factor of 1.3 covers the difference.
     noise = np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
