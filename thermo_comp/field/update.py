@@ -300,5 +300,5 @@ def what_moved(result: Update) -> list[str]:
             'with an aged uncertainty; rests in other attitudes would determine them'
         )
     if result.n_outliers:
-        lines.append(f'{result.n_outliers} rests contradict all others and are left out')
+        lines.append(f'{result.n_outliers} rests contradict all other rests and are left out')
     return lines

@@ -276,7 +276,7 @@ def judge_result(
         why = ': no temperature drift above the noise; already compensated?'
         yield advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and has_temperature:
-        why = 'each position is predicted badly by the others; record more positions'
+        why = 'each position is predicted badly by the other positions; record more positions'
         yield advice('left out', f'{text}: left-out positions exceed the raw error: {why}')
     else:
         yield Finding('residual', 'good', text)

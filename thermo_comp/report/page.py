@@ -288,7 +288,7 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             else 'The area of a red ring is proportional to the residual of this position.'
             if evidence.residuals
             else '',
-            'Red cross: the direction with the largest standard deviation of |f|, which is given; '
+            'Red cross: the direction with the largest standard deviation of |f|, with its value; '
             'a position in this direction would improve the calibration most.'
             if evidence.least_known
             else '',
